@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import nn
 
@@ -38,3 +39,20 @@ def test_a_cut_that_does_not_reach_the_output_has_no_field() -> None:
         lambda net, x: (net.cut(x), net.head(x))[1], cut=conv(3, 4), head=nn.Sequential(conv(3, 1))
     )
     assert field(network, "cut") == InfluentialField((0, 0), (0, 0))
+
+
+@pytest.mark.parametrize(("enough", "tried"), [(None, 3), (1, 1), (2, 3), (3, 1)])
+def test_points_are_tried_until_the_narrower_side_is_enough_or_far_from_it(
+    enough: float | None, tried: int
+) -> None:
+    network = nn.Sequential(conv(3, 4), nn.Conv2d(4, 1, (3, 1), padding=(1, 0)))
+    calls = list[object]()
+
+    def counted(output: object) -> torch.Tensor:
+        calls.append(output)
+        return depth_of(output)
+
+    with Split(network, "0") as split:
+        found = influential_field(split, split.front(image(32, 32)), counted, enough)
+    assert found == InfluentialField((3, 1), (5, 1))
+    assert len(calls) == 1 + tried

@@ -187,3 +187,68 @@ def test_single_wild_values_do_not_make_two_files_differ() -> None:
     sparse = np.full((5, 5), 2, np.float32)
     wild = np.where(np.eye(5) > 0, np.float32(1e5), sparse)
     assert check_same_scale(sparse, wild, {}) == []
+
+
+def shared(count: int, total: int) -> np.ndarray:
+    """A scan of which so many points are at one place."""
+    return np.where(np.arange(total)[:, None] < count, 3.0, SCAN[:total])
+
+
+@pytest.mark.parametrize(
+    ("scan", "dropped"),
+    [
+        (shared(5, 1000), 5),
+        (shared(4, 1000), 0),  # less than 0.5 %
+        (shared(3, 100), 3),
+        (shared(2, 100), 0),
+        (shared(3, 10), 3),
+        (shared(3, 9), 0),  # too few to tell
+        (np.vstack([SCAN, [[1e-3, 0, 0]]]), 0),
+        (np.vstack([SCAN, [[0.99e-3, 0, 0]]]), 1),
+        (np.vstack([SCAN, [[1e5, 0, 0]]]), 0),
+        (np.vstack([SCAN, [[0, -1.01e5, 0]]]), 1),
+        (np.where(np.arange(3000).reshape(-1, 3) % 30 < 1, np.nan, SCAN), 100),
+    ],
+)
+def test_a_point_is_no_return_from_each_limit_on(scan: np.ndarray, dropped: int) -> None:
+    points, counts, _ = scan_returns("a.npy", scan)
+    assert (len(scan) - len(points), sum(counts.values())) == (dropped, dropped)
+
+
+@pytest.mark.parametrize(
+    ("rest", "far", "count", "unknown"),
+    [
+        (20.0, 40.1, 10, 10),
+        (20.0, 39.9, 10, 0),  # a hall
+        (30.0, 45.1, 10, 10),
+        (30.0, 44.9, 10, 0),  # less than 1.5 times the rest
+        (30.0, 45.1, 4, 0),  # of 1,000, less than 0.5 %
+        (20.0, 10_100.0, 1, 1),
+        (20.0, 9_900.0, 1, 0),  # less than 1000 times the median
+    ],
+)
+def test_depths_are_unknown_from_each_limit_on(
+    rest: float, far: float, count: int, unknown: int
+) -> None:
+    depth = np.append(np.linspace(0, rest, 1001 - count)[1:], [far] * count)
+    assert np.flatnonzero(far_values(depth)[0]).tolist() == list(range(1000 - unknown, 1000))
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.66, 0.67, 1.49, 1.51, 7])
+@pytest.mark.parametrize("known", [9, 10])
+def test_two_files_differ_by_a_factor_of_more_than_one_and_a_half(
+    factor: float, known: int
+) -> None:
+    sparse = np.where(np.arange(2000).reshape(40, 50) < known, MAP, np.float32(0))
+    differs = known == 10 and not 1 / 1.5 <= factor <= 1.5
+    assert len(check_same_scale(sparse, np.float32(factor) * MAP, {})) == differs
+
+
+@pytest.mark.parametrize("median", [99, 100])
+def test_whole_numbers_of_a_float_file_are_codes_from_a_median_of_100_on(median: int) -> None:
+    depth = np.arange(2.0 * median + 1)
+    if median < 100:
+        assert divisor_to_metres(depth, FLOAT, "x", "--depth-scale", None) == (1, [])
+    else:
+        with pytest.raises(InputError):
+            divisor_to_metres(depth, FLOAT, "x", "--depth-scale", None)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import check_direction, read_scan_points
 from pnpdepth_cli.errors import UsageError
@@ -141,6 +141,39 @@ def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
         of_bag.write_text(of_bag.read_text().replace("240.0", "900.0"))
         notes = read_scan_points(scan, ScanOptions(calib=of_bag), SIZE).notes
         assert any("within 15°" in note for note in notes)
+
+
+QUARTER = np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # the camera looks along the scan's x
+CYCLE = np.roll(np.eye(3), 1, axis=1)  # so, too; the inverse looks along y, x is down
+
+
+@pytest.mark.parametrize(
+    ("turn", "inside", "inverted", "notes"),
+    [
+        (QUARTER, 100, 299, 0),
+        (QUARTER, 100, 300, 1),  # three times as many
+        (QUARTER, 15, 300, 1),
+        (QUARTER, 14, 300, None),  # less than a twentieth
+        (QUARTER, 0, 2, 0),
+        (CYCLE, 100, 201, 1),  # the scan is thin along x, which is the inverse's y
+        (CYCLE, 100, 199, 0),
+    ],
+)
+def test_the_direction_is_judged_by_the_points_in_the_image_and_what_is_upright(
+    turn: NDArray[np.float64], inside: int, inverted: int, notes: int | None
+) -> None:
+    ahead, ahead_inverted = turn[2], turn.T[2]
+    beside = np.repeat(
+        [[0, 0, 1], [0, 0, -1]] if turn is CYCLE else [[0, 1, 0], [0, -1, 0]], 500, 0
+    )
+    along = np.repeat([ahead, ahead_inverted], [inside, inverted], axis=0)
+    scan = 5 * np.concatenate([along, beside])
+    camera, pose = Camera(intrinsics=K), Extrinsics(turn, np.zeros(3))
+    if notes is None:
+        with pytest.raises(UsageError):
+            check_direction(scan, camera, pose, SIZE)
+    else:
+        assert len(check_direction(scan, camera, pose, SIZE)) == notes
 
 
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])

@@ -17,7 +17,7 @@ from pnpdepth_cli.frames import adapt
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import prepare
 from tests.core.networks import Net, conv
-from tests.frames.scenes import frame_in_memory
+from tests.frames.scenes import SIZE, frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)
 Pair = tuple[NDArray[np.float32], pnp.SparsePoints]
@@ -102,26 +102,42 @@ def test_a_network_without_points_and_a_frame_of_one_point_are_refused(
         refiner.refine(*FRAMES[0])
 
 
-def test_an_update_is_adams_on_the_loss_at_points_hidden_from_the_input(
+def test_updates_are_adams_on_the_loss_at_points_hidden_from_the_input(
     network: pnp.Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapt, "STEPS", 1)
+    monkeypatch.setattr(adapt, "STEPS", 6)
     learnt = adapt.learn(network, named(range(8)), seed=3)
-    # frames 1, 3, 5 and 7 are for validation
-    generator = torch.Generator().manual_seed(3)
-    number = (0, 2, 4, 6)[torch.randperm(4, generator=generator)[0]]
-    prepared = prepare(network, frame_in_memory(seed=number))
-    points = prepared.points
-    hidden = torch.randperm(len(points), generator=generator) % 2 == 0
     module = copy.deepcopy(network.module).requires_grad_()
-    output = network.depth_of(module(*prepared.arguments_for(points.select(~hidden))))
-    asked = points.select(hidden)
-    (asked.sample(output).log() - asked.depth.log()).abs().mean().backward()
+    adam = torch.optim.Adam(module.parameters(), 0.0, eps=adapt.EPSILON)
+    generator = torch.Generator().manual_seed(3)
+    order = torch.randperm(4, generator=generator)
+    for step in range(6):  # four on one frame and two on another one, whose halves are hidden
+        if step % 4 == 0:  # frames 1, 3, 5 and 7 are for validation
+            prepared = prepare(network, frame_in_memory(seed=2 * int(order[step // 4])))
+            points = prepared.points
+        if step % 2 == 0:
+            parity = torch.randperm(len(points), generator=generator) % 2
+        hidden = parity == step % 2
+        output = network.depth_of(module(*prepared.arguments_for(points.select(~hidden))))
+        asked = points.select(hidden)
+        adam.zero_grad()
+        (asked.sample(output).log() - asked.depth.log()).abs().mean().backward()
+        adam.param_groups[0]["lr"] = adapt.LR * (1 + np.cos(np.pi * step / 6)) / 2
+        adam.step()
     for name, parameter in module.named_parameters():
-        gradient = parameter.grad
-        step = 0 if gradient is None else gradient / (gradient.abs() + adapt.EPSILON)
-        expected = parameter.detach() - adapt.LR * step
-        torch.testing.assert_close(learnt.weights[name], expected, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(learnt.weights[name], parameter.detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_two_points_of_a_frame_are_enough(network: pnp.Network) -> None:
+    learnt = adapt.learn(network, ((str(seed), frame_in_memory(2, seed)) for seed in range(8)))
+    assert np.isfinite(learnt.after).all()
+
+
+def test_few_frames_and_dense_points_teach_too_little() -> None:
+    dense = SIZE[0] * SIZE[1] // 100  # 10 pixels apart
+    cases = [(7, 60), (8, 60), (8, dense), (8, dense + 1)]
+    why = [adapt.too_little(count, frame_in_memory(points)) for count, points in cases]
+    assert [each is None for each in why] == [False, True, True, False]
 
 
 def test_the_loss_of_each_validation_frame_is_compared_and_has_to_fall_beyond_chance() -> None:
@@ -133,6 +149,7 @@ def test_the_loss_of_each_validation_frame_is_compared_and_has_to_fall_beyond_ch
     chance = adapt.Learnt(weights={}, before=before, after=after[::-1])
     assert ttest_rel(np.log(after), np.log(before), alternative="less").pvalue < adapt.SIGNIFICANT
     assert [each.is_better for each in (fallen, risen, chance)] == [True, False, False]
+    assert f"{6.7 / 8 - 1:+.1%}" in str(fallen)
 
 
 def test_the_image_encoder_does_not_learn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,9 +29,10 @@ from pnpdepth_cli.frames.fuse import (
 )
 from pnpdepth_cli.frames.open_network import Member, OpenNetwork
 from pnpdepth_cli.frames.refined import Prediction, Refined
+from pnpdepth_cli.frames.resolve import resolve_member
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import ClosedSettings
+from pnpdepth_cli.settings import ClosedSettings, Settings
 from tests.core.split.test_split import state_of
 from tests.frames.scenes import (
     SIZE,
@@ -100,11 +101,6 @@ def split_of(depth: Tensor) -> ValidatedFrame:
     return ValidatedFrame(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
 
 
-def split_of_frame(count: int) -> ValidatedFrame:
-    """A frame of so many points with and without its validation points."""
-    return split_frame(frame_in_memory(count), depth_of_scene(), 0)
-
-
 def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
     frame = with_gt(frame_in_memory(60))
     result = refined(frame, member(Brightness, settings=UPDATES))
@@ -154,22 +150,46 @@ def test_a_useless_network_has_no_part_which_is_said() -> None:
     )
     assert useless.weights["noise"] < 0.01
     assert np.allclose(useless.after, alone.after, rtol=1e-4)
-    assert [note for note in useless.notes if note.startswith("noise has no part")]
+    (note,) = [note for note in useless.notes if note.startswith("noise has no part")]
+    checked = useless.validation
+    assert checked is not None
+    for stage in ("propagated", "alone"):
+        off = (checked.predicted[stage] - checked.points.depth).abs().numpy()
+        assert f"{np.average(off, weights=checked.weights.numpy()):.4f}" in note
     assert not [note for note in alone.notes if "no part" in note]
 
 
-def test_trust_grows_with_what_a_network_explains() -> None:
-    frame = frame_in_memory(200)
+@pytest.mark.parametrize(("known", "noise"), [(4, 0.1), (5, 0.1), (40, 0.18), (40, 0.3), (40, 9)])
+def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise: float) -> None:
+    frame, rng = frame_in_memory(60), np.random.default_rng(known)
+    pixels = tuple(frame.points.xy.long().numpy().T[::-1, :known])
+    y = frame.points.depth.double().log().numpy()[:known]
+    x = 0.3 * y + noise * 0.3 * rng.normal(size=known)
+    predicted = torch.zeros(SIZE, dtype=torch.float64)
+    predicted[pixels] = torch.from_numpy(x).exp()
+    shown = replace(predicted_by(member(Brightness), frame), before=predicted)
+    one = replace(expert("net", torch.ones(60)), whole=shown)
     split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
-    depth, noise = depth_of_scene(), torch.rand(SIZE, generator=torch.Generator().manual_seed(2))
-    found = []
-    for share in (0.0, 0.6, 1.0):  # of noise in the depth
-        predicted = torch.exp(depth.log() * (1 - share) + 0.6 * share * noise)
-        shown = replace(predicted_by(member(Brightness), frame), before=predicted)
-        one = replace(expert("net", torch.ones(200)), whole=shown)
-        found.append(trust(one, split, expert("compact", torch.ones(200))))
-    assert found[0] == pytest.approx(1)
-    assert found[0] > found[1] > found[2] == 0
+    press = total = 0.0
+    for left_out in range(known):
+        rest = np.arange(known) != left_out
+        line = np.polyfit(x[rest], y[rest], 1)
+        press += (y[left_out] - np.polyval(line, x[left_out])) ** 2
+        total += (y[left_out] - y[rest].mean()) ** 2
+    rises = np.polyfit(x, y, 1)[0] > 0 and known >= MIN_POINTS
+    expected = np.clip((1 - press / total - 0.25) / 0.5, 0, 1) if rises else 0
+    assert trust(one, split, expert("compact", torch.ones(60))) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
+    rng = np.random.default_rng(0)
+    (truth, at, other), shares = rng.uniform(1, 4, (3, 50)), rng.uniform(size=50)
+    split = replace(split_of(torch.from_numpy(truth)), weights=torch.from_numpy(shares))
+    gains = np.abs(np.log(other / truth)) - np.abs(np.log(at / truth))
+    mean = np.average(gains, weights=shares)
+    error = np.sqrt((shares**2 * (gains - mean) ** 2).sum()) / shares.sum()
+    found = split.gain(torch.from_numpy(at), torch.from_numpy(other))
+    assert found == pytest.approx(mean / error)
 
 
 def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation_points() -> None:
@@ -198,16 +218,17 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
     experts = [
         expert(str(k), at, w) for k, (at, w) in enumerate(zip(noisy, (0.2, 0.3, 0.5), strict=True))
     ]
-    split = split_of(truth)
+    shares = rng.uniform(0.1, 1, 300)
+    split = replace(split_of(truth), weights=torch.from_numpy(shares))
     found = np.array(list(fit_weights(experts, split).values()))
     logs = np.stack([at.log().numpy() for at in noisy], axis=1)
     prior, y = np.array([0.2, 0.3, 0.5]), truth.log().numpy()
     first = y - logs @ prior
-    scale = 1.25 * np.abs(first).mean()
+    scale = 1.25 * np.average(np.abs(first), weights=shares)
 
     def loss(weights: np.ndarray) -> float:
         size = np.abs(y - logs @ weights)
-        huber = np.where(size < scale, size**2, 2 * scale * size - scale**2).sum()
+        huber = shares @ np.where(size < scale, size**2, 2 * scale * size - scale**2)
         return float(huber + fuse.STRENGTH * scale**2 * ((weights - prior) ** 2).sum())
 
     for _ in range(200):  # no other weights near by, or anywhere, are better
@@ -313,12 +334,20 @@ def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: boo
     assert any("outliers: " in note for note in result.notes) == weighs
 
 
-def test_validation_points_are_a_fifth_and_the_others_are_kept() -> None:
-    split = split_of_frame(60)
-    parts = (split.kept.points, split.points)
-    assert [len(part) for part in parts] == [60 - 60 // FOLDS, 60 // FOLDS]
-    rows = {tuple(xy) for xy in split.whole.points.xy.tolist()}
-    assert {tuple(xy) for part in parts for xy in part.xy.tolist()} == rows
+@pytest.mark.parametrize("count", [60, 5500])
+def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> None:
+    frame, judged = frame_in_memory(count), depth_of_scene()
+    judged[:, 100:] = 0
+    split = split_frame(frame, judged, 0)
+    kept, held, whole = (
+        {tuple(xy) for xy in points.xy.tolist()}
+        for points in (split.kept.points, split.points, frame.points)
+    )
+    assert len(kept) == count - count // FOLDS
+    assert len(held) == min(count // FOLDS, 1000)
+    assert kept | held <= whole
+    assert not kept & held
+    assert torch.equal(split.weights != 0, split.points.xy[:, 0] < 100)  # where a depth is known
 
 
 @pytest.mark.parametrize("count", [1, MIN_POINTS - 1, MIN_POINTS, 7])
@@ -399,3 +428,37 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
     assert clean.outliers is None
     assert len(clean.points) == 60
+
+
+@pytest.mark.parametrize("of_points", [True, False])
+def test_the_loss_without_updates_is_that_of_the_points_where_the_depth_is_finite(
+    of_points: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, build = frame_in_memory(60), Nearest if of_points else Brightness
+    sky = torch.where(torch.arange(SIZE[0])[:, None] < 30, torch.inf, 1.5 * depth_of_scene())
+    monkeypatch.setattr(build, "forward", lambda *_: sky[None, None])
+    rows = frame.points.xy[:, 1].numpy()
+    settings = ClosedSettings(iterations=0, align="none", loss="l2")
+    with OpenNetwork(member(build, settings=settings)) as network:
+        found = network.refine(frame)
+    expected = np.square(0.5 * frame.points.depth.numpy()[rows >= 30]).mean()
+    assert found.losses == (pytest.approx(expected),)
+    assert found.step == 0
+    assert torch.equal(found.after, sky.where(sky.isfinite(), 0))
+
+
+@pytest.mark.parametrize(
+    ("build", "is_default", "expected"),
+    [
+        (Brightness, False, (9, "none")),
+        (Brightness, True, (5, "auto")),
+        (Nearest, False, (9, "none")),
+        (Nearest, True, (0, "none")),
+    ],
+)
+def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone(
+    build: type[Brightness | Nearest], is_default: bool, expected: tuple[int, str]
+) -> None:
+    asked, network = Settings(iterations=9, align="none", layer="layer"), member(build).network
+    found = resolve_member(network, frame_in_memory(), asked, is_default=is_default).settings
+    assert (found.iterations, found.align) == expected

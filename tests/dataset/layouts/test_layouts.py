@@ -207,6 +207,7 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
         ("rgb.txt", "1.0"),
         ("rgb.txt", "1.0 rgb/a\0.png"),
         ("associations.txt", "0 rgb/0.png 0"),
+        ("associations.txt", "0 rgb/0.png nan depth/0.png"),
         ("associations.txt", "0 rgb/0.png 0 rgb/1.png"),
     ],
 )
