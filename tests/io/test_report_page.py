@@ -104,6 +104,8 @@ def requested(page: webdriver.Chrome) -> list[str]:
 def test_it_opens_from_disk_without_an_error_or_a_network_and_loads_views_when_asked(
     page: webdriver.Chrome,
 ) -> None:
+    eager = "document.querySelectorAll('img').forEach(each => { each.loading = 'eager' })"
+    page.execute_script(eager)  # those below the window, too
     wait(page, lambda: loaded(page, "img"))
     before = requested(page)
     open_view(page)
