@@ -59,7 +59,7 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     experts, warnings = add_blind_expert(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts, split)
-    fused = weighted_mean([(e.dense, w) for e in experts if (w := weights[e.name]) > 0])
+    fused = weighted_mean([(e.dense(), w) for e in experts if (w := weights[e.name]) > 0])
     # Points far from the depth of a network that weighs them are outliers, too.
     if judge.member.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.before, inliers.points))
@@ -67,7 +67,7 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     depth = _propagate(fused, inliers, split)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts, split, weights)
-    depth = _with_shares(depth, {e.name: e.dense for e in experts if e.of_scanner}, shares)
+    depth = _with_shares(depth, {e.name: e.dense() for e in experts if e.of_scanner}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
     return make_refined(
         frame,

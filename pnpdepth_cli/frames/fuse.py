@@ -11,7 +11,7 @@ All predict twice: from all points, and the validation points from the others.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,7 +135,8 @@ class Expert:
     name: str
     weight: float = 0.0  # prior weight; with 0 it has no part
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
-    dense: Tensor  # (H, W) metres, 0 = unknown: from all points, the residual not propagated
+    dense: Callable[[], Tensor]
+    """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
     whole: Prediction | None = None  # a network's, from all points
     kept: Prediction | None = None  # a network's, from the others; the same without validation
     network: OpenNetwork | None = None  # that predicts. None: linear interpolation
@@ -186,9 +187,9 @@ def predictions(
             with_prior.append(replace(informed, weight=WITH_PRIOR * share))
     # The rest of the prior weights is that of the network without a prior.
     rest = 1 - sum(expert.weight for expert in (*experts, *with_prior))
-    # Linear interpolation predicts.
+    # Linear interpolation predicts; its dense depth, which takes long, only where it has a part.
     at = linear(split.kept.points, split.points.xy) if len(split.points) else torch.empty(0)
-    dense = linear(split.whole.points)
+    dense = functools.partial(linear, split.whole.points)
     interpolation = Expert(name=LINEAR, weight=WITHOUT_IMAGE, at=at, dense=dense)
     return [*experts, *with_prior, replace(alone, weight=rest), interpolation]
 
@@ -318,7 +319,7 @@ def scanner_shares(
         return {}
     limit = split.error(weighted_mean([(each.at, weights[each.name]) for each in experts]))
     points = split.whole.points
-    error = {e.name: (points.sample(e.dense) - points.depth).abs().mean() for e in own}
+    error = {e.name: (points.sample(e.dense()) - points.depth).abs().mean() for e in own}
     fit = [name for name in error if float(error[name]) <= limit]
     return {name: OWN_SCANNER / len(fit) for name in fit}
 
@@ -385,7 +386,7 @@ def _expert(
     return Expert(
         name=name,
         at=at,
-        dense=own.after,
+        dense=lambda: own.after,
         whole=own,
         kept=again,
         network=network,
