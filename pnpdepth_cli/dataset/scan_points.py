@@ -33,6 +33,7 @@ from pnpdepth_cli.sensors.projection import (
     edge_agreement,
     edge_ranks,
     near_jumps,
+    points_in_image,
     project_velodyne,
 )
 
@@ -234,10 +235,7 @@ def check_direction(
         UsageError: The pose puts next to none of the points into the image.
     """
     poses = (scanner, scanner.inverse())
-    inside, inverted = (
-        int(np.count_nonzero(in_frame(pixels_of(camera, xyz[xyz[:, 2] > 0]), size)))
-        for xyz in (pose.apply(scan) for pose in poses)
-    )
+    inside, inverted = (len(points_in_image(pose.apply(scan), camera, size)[0]) for pose in poses)
     upright, upright_inverted = (_is_upright(scan, pose.rotation) for pose in poses)
     far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1)
     if upright or inverted <= inside or not (far_more or upright_inverted):

@@ -31,9 +31,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.points import in_frame
-from pnpdepth_cli.sensors.lens import pixels_of, rays_of, unproject
+from pnpdepth_cli.sensors.lens import rays_of, unproject
 from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
+from pnpdepth_cli.sensors.projection import points_in_image
 
 # Differences of log depth to a measured point that agree and that contradict. The first was chosen
 # on frames 2 and 4 of a KITTI drive, the second and `_CLOSE` on its frames 0, 2, 4 and 6.
@@ -103,7 +103,7 @@ def accumulate(points: Points, neighbours: Sequence[NeighbourScan], camera: Came
 
 def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: int) -> Points:
     """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
-    xyz, xy = _in_image(xyz, camera, known.size)
+    xyz, xy = points_in_image(xyz, camera, known.size)
     depth = xyz[:, 2]
     agrees = _agrees(xy, depth, surface)
     xy, depth = xy[agrees], depth[agrees]
@@ -113,14 +113,6 @@ def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: in
         xy=np.concatenate([known.xy, xy[free].astype(np.float32)]),
         depth=np.concatenate([known.depth, depth[free].astype(np.float32)]),
     )
-
-
-def _in_image(xyz: Floats, camera: Camera, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """The points (M, 3) that the camera sees, and their pixel coordinates."""
-    xyz = xyz[xyz[:, 2] > 0]
-    xy = pixels_of(camera, xyz)
-    inside = in_frame(xy, size)
-    return xyz[inside], xy[inside]
 
 
 def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
@@ -175,7 +167,7 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
 
 def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
     """The points in the image with a plane beside them, and the index of that plane."""
-    moved, xy = _in_image(moved, camera, surface.points.size)
+    moved, xy = points_in_image(moved, camera, surface.points.size)
     reach = _REACH * _spacing_px(surface.points)
     distance, index = surface.tree.query(xy, distance_upper_bound=reach)
     near = np.isfinite(distance)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import NoPointsError
+from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import (
@@ -96,6 +97,17 @@ def project_velodyne(
             " and a quaternion has w last"
         )
     return drops.points(seen, xy, size)
+
+
+def points_in_image(xyz: Floats, camera: Camera, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Returns the points (M, 3) in the camera's coordinates that it sees, and their pixels (M, 2).
+
+    The size (H, W) is the image's.
+    """
+    xyz = xyz[xyz[:, 2] > 0]
+    xy = pixels_of(camera, xyz)
+    inside = in_frame(xy, size)
+    return xyz[inside], xy[inside]
 
 
 def edge_agreement(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
