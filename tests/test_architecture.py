@@ -139,7 +139,7 @@ def test_help_imports_neither_torch_nor_numpy_nor_rich() -> None:
         ("pnpdepth_cli, pnpdepth_cli.points, pnpdepth_cli.measures", "torch numpy"),
         ("pnpdepth_cli.models.definition", "torch"),
         ("pnpdepth_cli.io.depth, pnpdepth_cli.io.rgb", "OpenEXR PIL torch scipy"),
-        ("pnpdepth_cli.io.visualisation, pnpdepth_cli.io.text_files", "OpenEXR PIL torch scipy"),
+        ("pnpdepth_cli.io.visualisation, pnpdepth_cli.io.file_bytes", "OpenEXR PIL torch scipy"),
     ],
 )
 def test_an_import_is_light(module: str, heavy: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.text_files import write_csv
+from pnpdepth_cli.io.file_bytes import write_csv
 from pnpdepth_cli.measures import Measure
 
 Style = Literal["", "bold", "dim", "good", "bad"]

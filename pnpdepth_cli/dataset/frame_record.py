@@ -19,8 +19,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, what_applies
-from pnpdepth_cli.io.file_bytes import Fingerprint, one_line
-from pnpdepth_cli.io.text_files import plain, read_json, write_json
+from pnpdepth_cli.io.file_bytes import Fingerprint, one_line, plain, read_json, write_json
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 

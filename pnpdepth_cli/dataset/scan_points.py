@@ -21,9 +21,9 @@ from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
-from pnpdepth_cli.io.extrinsics import read_extrinsics
 from pnpdepth_cli.io.file_bytes import sha256_of
 from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import in_frame

@@ -12,7 +12,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io.file_bytes import one_line
 
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}(\.[A-Za-z0-9]+)?")
 _FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -119,7 +118,7 @@ def remove_leftovers(folder: Path) -> int:
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
     """Returns the error that says why; a StorageError where no other file name would help."""
-    reason = one_line(error.strerror or error).lower()
+    reason = " ".join(str(error.strerror or error).split()).lower()
     kind = OutputError if error.errno in _OF_THE_NAME else StorageError
     room = "make room, or " if error.errno in _FULL else ""
     return kind(f"{path} cannot be written ({reason}); {room}choose another output folder")

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.extrinsics import check_pose, numbers_in, pose_of_matrix
-from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, read_text
-from pnpdepth_cli.io.text_files import parse_yaml, read_json
+from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, parse_yaml, read_json, read_text
+from pnpdepth_cli.io.poses import check_pose, numbers_in, pose_of_matrix
 
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.extrinsics import rotation_of
 from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
@@ -28,6 +27,7 @@ from pnpdepth_cli.io.file_bytes import (
     read_bytes,
     size_of_regular_file,
 )
+from pnpdepth_cli.io.poses import rotation_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes
+from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_rows
 from pnpdepth_cli.io.formats import (
     KITTI_SCALE,
     LARGEST_CODE,
@@ -29,7 +29,6 @@ from pnpdepth_cli.io.formats import (
     images,
     kind_of,
 )
-from pnpdepth_cli.io.text_files import PIXELS, read_rows
 from pnpdepth_cli.points import SparsePoints
 
 TABLE: dict[str, DepthFormat] = {

@@ -22,8 +22,8 @@ from markupsafe import Markup
 from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_folder, cannot_write
-from pnpdepth_cli.io.figure import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
-from pnpdepth_cli.io.text_files import plain, read_json, write_json
+from pnpdepth_cli.io.file_bytes import plain, read_json, write_json
+from pnpdepth_cli.io.visualisation import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
 from pnpdepth_cli.measures import Measure
 
 PAGE = "index.html"

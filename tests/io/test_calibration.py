@@ -12,7 +12,7 @@ import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
-from pnpdepth_cli.io.extrinsics import read_extrinsics
+from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.sensors.lens import pixels_of
 
 pytest.importorskip("yaml")

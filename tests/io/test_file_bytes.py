@@ -1,16 +1,77 @@
-"""A file is known by its digest."""
+"""JSON is read as it was written; CSV; and a file is known by its digest."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, sha256_of
+from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.io.file_bytes import (
+    fingerprint,
+    is_unchanged,
+    read_json,
+    sha256_of,
+    write_csv,
+    write_json,
+)
+
+
+@dataclass
+class Point:
+    x: float
+
+
+def test_what_is_written_is_read_back_in_the_same_order(tmp_path: Path) -> None:
+    inner = {"z": [None, True, -1.5e-300, 10**30], "ä": {}, "": '\u2028 "\\\n\0 \U0001f600'}
+    mapping = {"é-_": [inner, [], [[1]]], "a": inner, "0": 0.1 + 0.2}
+    write_json(tmp_path / "record.json", mapping)
+    again = read_json(tmp_path / "record.json")
+    assert again == mapping
+    assert [list(again), list(again["a"])] == [list(mapping), list(inner)]
+
+
+def test_numpy_values_paths_and_dataclasses_become_plain_and_nan_null(tmp_path: Path) -> None:
+    content = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "t": (1, 2)}
+    write_json(tmp_path / "r.json", content | {"d": Point(x=float("inf"))})
+    plain = {"n": 3, "x": [0.5, None], "p": "a/b", "t": [1, 2], "d": {"x": None}}
+    assert read_json(tmp_path / "r.json") == plain
+
+
+def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    write_json(path, {"name": "Tübingen", "δ1": 0.5})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert path.read_text("utf-8") == '{\n  "name": "Tübingen",\n  "δ1": 0.5\n}\n'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"[" * 100_000, None),
+        b'{"a": 1%s}' % (b"0" * 400),
+    ],
+)
+def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "r.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError if content is None else FileFormatError, match=r"r\.json") as no:
+        read_json(path)
+    assert "\n" not in str(no.value)
+
+
+def test_a_csv_has_lines_that_end_in_a_newline_and_none_is_empty() -> None:
+    file = io.StringIO()
+    write_csv(file, ["name", "x"], [["a,b", -1.5], ["c", None]])
+    assert file.getvalue() == 'name,x\n"a,b",-1.5\nc,\n'
 
 
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:

@@ -20,11 +20,10 @@ from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
-from pnpdepth_cli.io.file_bytes import sha256_of
+from pnpdepth_cli.io.file_bytes import read_json, sha256_of
 from pnpdepth_cli.io.formats.images import check_tags
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.io.text_files import read_json
 from tests.models.weights.files import little
 
 

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.figure import UNKNOWN, depth_scale
 from pnpdepth_cli.io.visualisation import (
+    UNKNOWN,
+    depth_scale,
     improvement,
     preview,
 )

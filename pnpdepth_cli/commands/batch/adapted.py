@@ -20,8 +20,7 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.file_bytes import fingerprint
-from pnpdepth_cli.io.text_files import read_json, write_json
+from pnpdepth_cli.io.file_bytes import fingerprint, read_json, write_json
 
 if TYPE_CHECKING:
     from pnpdepth_cli.frames.frame import Frame

@@ -25,8 +25,7 @@ from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import LOCKS, cannot_write, make_folder, remove_leftovers
-from pnpdepth_cli.io.file_bytes import Fingerprint, is_unchanged, sha256_of
-from pnpdepth_cli.io.text_files import parse_json, plain
+from pnpdepth_cli.io.file_bytes import Fingerprint, is_unchanged, parse_json, plain, sha256_of
 from pnpdepth_cli.models.definition import file_and_part
 
 _OWN_SUMMARY = b'{\n  "command": "batch"'

@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table, write_text
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.io.text_files import write_json
+from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
 from pnpdepth_cli.stages import AFTER, BASES, GT
 

@@ -26,8 +26,7 @@ from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.text_files import plain, read_json
+from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT

@@ -25,9 +25,8 @@ from pnpdepth_cli.commands.tables import Table, count_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import scale_warning
-from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.io.file_bytes import one_line, plain
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.text_files import plain
 from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, frame_means
 from pnpdepth_cli.points import METRES
 

@@ -13,8 +13,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_n
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.text_files import read_json
+from pnpdepth_cli.io.file_bytes import one_line, read_json
 from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)

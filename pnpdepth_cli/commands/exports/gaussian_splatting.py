@@ -25,8 +25,8 @@ from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
-from pnpdepth_cli.io.text_files import write_json
 
 _CODES = 2**16
 _OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"

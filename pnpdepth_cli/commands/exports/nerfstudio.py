@@ -18,9 +18,9 @@ import numpy as np
 from pnpdepth_cli.commands.exports import Export, ExportFrame, copied_images
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.scans import write_cloud
-from pnpdepth_cli.io.text_files import write_json
 
 _CODES_PER_UNIT = 1000.0
 _START = "start.ply"

@@ -19,10 +19,9 @@ from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.depth import metres, write_depth
-from pnpdepth_cli.io.figure import depth_scale
+from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
-from pnpdepth_cli.io.text_files import write_json
-from pnpdepth_cli.io.visualisation import improvement, preview, write_mask
+from pnpdepth_cli.io.visualisation import depth_scale, improvement, preview, write_mask
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels

@@ -51,10 +51,10 @@ from pnpdepth_cli.io.bags.messages import (
 )
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.io.file_bytes import plain, read_json, write_json
 from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan, write_cloud
-from pnpdepth_cli.io.text_files import plain, read_json, write_json
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.pixels import describe_dropped
 

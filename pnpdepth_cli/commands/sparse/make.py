@@ -27,9 +27,9 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
+from pnpdepth_cli.io.file_bytes import plain, write_json
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.text_files import plain, write_json
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image

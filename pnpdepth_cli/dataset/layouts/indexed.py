@@ -43,10 +43,8 @@ from pnpdepth_cli.dataset.frame_files import (
 from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
-from pnpdepth_cli.io.extrinsics import rotation_of
-from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes
-from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory
-from pnpdepth_cli.io.text_files import read_json
+from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes, read_json
+from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory, rotation_of
 
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"

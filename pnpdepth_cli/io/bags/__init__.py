@@ -23,8 +23,7 @@ from typing import Any, BinaryIO
 
 from pnpdepth_cli.budget import budget
 from pnpdepth_cli.errors import FileFormatError, UsageError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes, size_of_regular_file
-from pnpdepth_cli.io.text_files import parse_yaml
+from pnpdepth_cli.io.file_bytes import one_line, parse_yaml, read_bytes, size_of_regular_file
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

@@ -20,11 +20,10 @@ from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag, Message
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.depth import known_metres
-from pnpdepth_cli.io.extrinsics import pose_of_quaternion
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.formats import format_of_content
 from pnpdepth_cli.io.formats.images import PNG
-from pnpdepth_cli.io.poses import Trajectory, trajectory_of
+from pnpdepth_cli.io.poses import Trajectory, pose_of_quaternion, trajectory_of
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Data types of sensor_msgs/PointField."""

@@ -27,7 +27,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.io.text_files import plain
+from pnpdepth_cli.io.file_bytes import plain
 from tests.commands.batches import (
     NAMES,
     RecordingListener,

@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
-from pnpdepth_cli.io.text_files import write_json
+from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.measures import MEASURES
 
 

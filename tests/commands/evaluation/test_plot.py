@@ -12,7 +12,7 @@ from pnpdepth_cli.commands.evaluation.compare import compare
 from pnpdepth_cli.commands.evaluation.plot import plot_comparison
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.io.text_files import write_json
+from pnpdepth_cli.io.file_bytes import write_json
 
 
 def batch(folder: Path, mae: float, **varied: str) -> str:

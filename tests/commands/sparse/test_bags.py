@@ -24,10 +24,10 @@ from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageE
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.file_bytes import read_json
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.io.text_files import read_json
 from pnpdepth_cli.sensors.pixels import Points
 from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, depth_m, write_bag
 from tests.commands.frames import frame_on_disk
