@@ -71,13 +71,9 @@ class DivergedError(PnpDepthError):
 
 
 class DeviceError(PnpDepthError):
-    """The device is absent or out of memory."""
+    """The device or the cluster is absent, or out of memory."""
 
     exit_code = 6
-
-
-class ClusterError(DeviceError):
-    """The Ray cluster cannot be used."""
 
 
 class FramesFailedError(PnpDepthError):

@@ -7,8 +7,8 @@ A network's definition, the command line, the Python API and the records have th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import Field, asdict, dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import Any
 
@@ -16,55 +16,28 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 
 LARGEST_SEED = 2**32 - 1
-_KEY = "option"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Option:
-    """A field that the user can set, and what the command line says of it."""
-
-    help: str
-    flag: str = ""
-    """Spelling on the command line. By default the field's name with dashes, such as `--lr`."""
-    choices: Collection[str] | None = None
-    metavar: str | None = None
-    least: int | None = None
-    most: int | None = None
-    parse: Callable[[str], Any] | None = None
-    """Converts the text of the command line. None: by the field's type."""
-    value_if_bare: str | None = None
-    """Value of the option where none follows. None: one has to."""
-    show_default: bool = False
-    name: str = ""
-    """Name of the field."""
-    type: str = ""
-    """Type of the value as it is written, without "| None"; of several, the last."""
-    default: Any = None
 
 
 def option(default: Any, help: str, **details: Any) -> Any:
     """Returns a dataclass field that the user can set.
 
     Args:
-        default: Default of the field. `MISSING`: the user has to give it.
+        default: Default of the field.
         help: Help text of the command line.
-        **details: Other fields of `Option`.
+        **details: Arguments of the option in click, such as its metavar; and `flag`, its spelling
+            where that is not the field's name, `choices`, `least` and `most` of a whole number.
     """
-    return field(default=default, metadata={_KEY: Option(help=help, **details)})
+    return field(default=default, metadata={"help": help, **details})
 
 
-def options_of(group: type) -> Iterator[Option]:
-    """Yields the fields of a dataclass that were made by `option`, in their order."""
-    for each in fields(group):
-        if _KEY in each.metadata:
-            declared = each.metadata[_KEY]
-            yield replace(
-                declared,
-                flag=declared.flag or f"--{each.name.replace('_', '-')}",
-                name=each.name,
-                type=str(each.type).removesuffix(" | None").rpartition(" | ")[2],
-                default=each.default,
-            )
+def options_of(group: type) -> list[Field[Any]]:
+    """Returns the fields of a dataclass that were made by `option`, in their order."""
+    return [each for each in fields(group) if each.metadata]
+
+
+def flag_of(each: Field[Any]) -> str:
+    """Returns how the command line spells a field, such as `--lr`."""
+    return str(each.metadata.get("flag", f"--{each.name.replace('_', '-')}"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,12 +96,14 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value in self.given().items():
-            names = _NAMES.get(name)
-            valid, wanted = _CHECKS.get(name, (lambda _: True, ""))
-            if names is not None:
-                wanted = f"one of {', '.join(names)}"
-            if not valid(value) or (names and not (isinstance(value, str) and value in names)):
-                raise UsageError(f"{name.replace('_', '-')} must be {wanted}, got {value!r}")
+            if name in _NAMES:
+                valid = isinstance(value, str) and value in _NAMES[name]
+                wanted = f"one of {', '.join(_NAMES[name])}"
+            else:
+                is_valid, wanted = _CHECKS[name]
+                valid = is_valid(value)
+            if not valid:
+                raise UsageError(f"{name} must be {wanted}, got {value!r}")
         if self.lr is not None and not str(self.lr).strip().endswith("%"):
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 
@@ -136,8 +111,7 @@ class Settings:
     def fixed_by(self) -> str:
         """What fixes the method, as the user gives it; empty for the default one."""
         given = self.given()
-        flags = {each.name: each.name for each in fields(self)}
-        flags |= {each.name: each.flag for each in options_of(Settings)}
+        flags = {each.name: flag_of(each) if each.metadata else each.name for each in fields(self)}
         flags["method"] = f"--method {self.method}"
         not_fixed = {"seed"} if self.is_paper else {"seed", "method"}
         return " ".join(flags[name] for name in given if name not in not_fixed)
@@ -147,18 +121,10 @@ class Settings:
         """Whether the method is the paper's."""
         return self.method == "paper"
 
-    def with_paper(self) -> Settings:
-        """Returns these settings; with the paper's method, its settings where these are open."""
-        return self.over(PAPER) if self.is_paper else self
-
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in values.items() if value != _OPEN[name]}
-
-    def opened(self, *names: str) -> Settings:
-        """Returns these settings with the fields of these names open."""
-        return Settings(**{k: v for k, v in self.given().items() if k not in names})
 
     def over(self, others: Settings) -> Settings:
         """Returns these settings, and the others' where these are open."""
@@ -189,11 +155,11 @@ class ClosedSettings:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, Real) and not isinstance(value, bool) and 0 <= float(value) < math.inf
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and _is_number(value)
 
 
 def _is_step(value: object) -> bool:
@@ -204,13 +170,15 @@ def _is_step(value: object) -> bool:
 
 
 _NAMES: Mapping[str, Collection[str]] = {"schedule": choices.SCHEDULES} | {
-    each.name: each.choices for each in options_of(Settings) if each.choices is not None
+    each.name: each.metadata["choices"]
+    for each in options_of(Settings)
+    if "choices" in each.metadata
 }
-_CHECKS: Mapping[str, tuple[Callable[[Any], bool], str]] = {
+_CHECKS: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),
     "iterations": (_is_whole, "a whole number >= 0"),
     "lr": (_is_step, "a step size above 0, or a text such as '3%'"),
-    "blur": (lambda value: _is_number(value) and value >= 0, ">= 0"),
+    "blur": (_is_number, ">= 0"),
     "seed": (_is_whole, "a whole number >= 0"),
 }
 """Whether a value of the field is valid, and what it must be."""

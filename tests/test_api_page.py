@@ -20,7 +20,7 @@ BEGIN = "<!-- signatures, written by `python -m tests.test_api_page` -->\n"
 END = "<!-- end of the signatures -->\n"
 FOR_THE_PROGRAM = {
     "Scores": {"to_json"},
-    "Settings": {"fixed_by", "with_paper", "is_paper", "given", "opened", "over", "closed"},
+    "Settings": {"fixed_by", "is_paper", "given", "over", "closed"},
     "SparsePoints": {
         *("cropped", "joined", "resized", "sample", "scatter", "select", "tensors"),
     },

@@ -23,10 +23,6 @@ def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     assert Settings(iterations=3, blur=0.0).given() == {"iterations": 3, "blur": 0.0}
     user, network = Settings(lr="3%", blur=0.0), Settings(lr=0.5, blur=2.0, loss="l2")
     assert user.over(network) == Settings(lr="3%", blur=0.0, loss="l2")
-    assert user.over(network).opened("blur") == Settings(lr="3%", loss="l2")
-    paper = Settings(method="paper", iterations=2).with_paper()
-    assert paper == Settings(method="paper", iterations=2).over(PAPER)
-    assert Settings(iterations=2).with_paper() == Settings(iterations=2)
 
 
 @pytest.mark.parametrize(

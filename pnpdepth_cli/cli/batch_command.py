@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
-from pnpdepth_cli.cli import grouped_help, options
+from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, progress_bar, say
-from pnpdepth_cli.cli.vary import Combination, combinations_of
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
     HoldOut,
@@ -25,18 +27,24 @@ from pnpdepth_cli.commands.refinement.refine_request import (
     parse_sample,
 )
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
-from pnpdepth_cli.errors import FramesFailedError, StorageError
+from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.summary import BatchSummary
 
+DEFAULT = "default"
+"""A value that leaves the option out."""
+_GROUPS = ("Network", "Method", "Sequences")
+"""Groups of the help whose options can be varied, besides --sample."""
+_NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
+"""Characters that a folder's name cannot have, on some system."""
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
 
 @click.command(
     short_help="Refine all frames of a folder or a list.",
-    cls=grouped_help.GroupedCommand,
+    cls=options.GroupedCommand,
     common=frozenset(
         {
             *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--method"),
@@ -95,8 +103,8 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
     all frames; the record NAME.json beside a result says how it was made.
     """
     requests = [
-        _request_of(values | combination.values, combination)
-        for combination in combinations_of(context, vary)
+        _request_of(values | varied, folder, texts)
+        for folder, (texts, varied) in _combinations(context, vary).items()
     ]
     summaries = []
     with _finishing_on_interrupt() as pressed:
@@ -119,24 +127,21 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
         )
 
 
-def _request_of(values: dict[str, Any], combination: Combination) -> BatchRequest:
-    """Returns the request of these options and varied ones, with the frames of a bag unpacked."""
+def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> BatchRequest:
+    """Returns the request of these options, some varied, with the frames of a bag unpacked.
+
+    The folder, below the output, is that of the results.
+    """
     from pnpdepth_cli.commands.batch.find_frames import unpack
 
     own = options.take_options(BatchRequest, values)
     own |= {name: values.pop(name) for name in ("source", "output")}
     text = values.pop("sample")
     sample = None if text is None else parse_sample(text)
-    request = BatchRequest(refine=options.request_of(values, sample=sample), **own)
+    request = BatchRequest(refine=options.request_of(values, sample=sample), varied=varied, **own)
     request = unpack(request, say)
-    if not combination.texts:
-        return request
-    return replace(
-        request,
-        varied=combination.texts,
-        output=request.output / combination.folder,
-        html=request.html and request.html / combination.folder,
-    )
+    html = request.html and request.html / folder
+    return replace(request, output=request.output / folder, html=html)
 
 
 def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSummary, bool]:
@@ -181,3 +186,55 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _combinations(
+    context: click.Context, varied: Sequence[str]
+) -> dict[str, tuple[dict[str, str], dict[str, Any]]]:
+    """The combinations of the values of all `--vary`; the last one's change fastest.
+
+    Args:
+        context: The parsed options of the command.
+        varied: Texts such as `lr=1%,3%`.
+
+    Returns:
+        By the folder of the results, such as `lr=1%,iterations=5`: the values as the user wrote
+        them, by the option's name without dashes; and by the name of the command's parameter,
+        without those left out.
+
+    Raises:
+        UsageError: An option cannot be varied, is given besides, or two folders have one name.
+        click.UsageError: A value is none of the option's.
+    """
+    varying = [_option(context, text.partition("=")[0]) for text in varied]
+    axes = [text.partition("=")[2].split(",") for text in varied]
+    if any("" in axis for axis in axes):
+        raise UsageError("--vary must be NAME=VALUE,VALUE with no value empty")
+    combinations, chosen = {}, list(itertools.product(*axes))
+    for words in chosen:
+        texts, values = dict[str, str](), dict[str, Any]()
+        for option, word in zip(varying, words, strict=True):
+            texts[option.opts[-1].removeprefix("--")] = word
+            if word != DEFAULT:
+                taken = (word,) if option.multiple else word
+                values[str(option.name)] = option.type_cast_value(context, taken)
+        folder = ",".join(f"{n}={_NOT_IN_NAMES.sub('-', text)}" for n, text in texts.items())
+        combinations[folder] = texts, values
+    if len(combinations) < len(chosen) or len({*varying}) < len(varying):
+        raise UsageError("--vary: an option or a value comes twice; leave one out")
+    return combinations
+
+
+def _option(context: click.Context, name: str) -> click.Option:
+    """The option that can be varied by this name."""
+    command = context.command
+    assert isinstance(command, options.GroupedCommand)
+    flags = ["--sample", *(flag for group in _GROUPS for flag in command.groups[group])]
+    if f"--{name}" not in flags:
+        known = ", ".join(flag.removeprefix("--") for flag in flags)
+        raise UsageError(f"--vary {name}: choose from {known}")
+    option = next(each for each in command.params if each.opts[-1] == f"--{name}")
+    assert isinstance(option, click.Option)
+    if context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE:
+        raise UsageError(f"--{name} is varied; leave it out besides")
+    return option

@@ -45,8 +45,8 @@ COMMANDS = {
     "simulate": "sparse_commands:simulate",
     "cloud": "result_commands:cloud",
     "export": "result_commands:export",
-    "eval": "eval_command:evaluate",
-    "compare": "compare_command:compare",
+    "eval": "score_commands:evaluate",
+    "compare": "score_commands:compare",
     "doctor": "models_command:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""

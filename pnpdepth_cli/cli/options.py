@@ -1,9 +1,10 @@
-"""Options that several commands share, each defined once."""
+"""Options that several commands share, each defined once, and help that shows them in groups."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import MISSING
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import Field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +18,24 @@ from pnpdepth_cli.commands.refinement.refine_request import (
     RefineRequest,
 )
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
-from pnpdepth_cli.settings import Option, Settings, options_of
+from pnpdepth_cli.settings import Settings, flag_of, options_of
 
 FILE = click.Path(path_type=Path)
+_NAME_COLUMN = 22
+_HELP = ("--help", "--help-all")
+_SHOW_ALL = "pnpdepth.help_all"
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
 
 
-def click_option(declared: Option) -> Decorator:
-    """Returns the click option of a field of a request."""
-    details: dict[str, Any] = {"type": _type_of(declared)}
+def click_option(declared: Field[Any]) -> Decorator:
+    """Returns the click option of a field that `pnpdepth_cli.settings.option` made."""
+    details = {"type": _type_of(declared), "default": declared.default, **declared.metadata}
+    for ours in ("flag", "choices", "least", "most"):
+        details.pop(ours, None)
     if declared.type == "bool":
-        details = {"is_flag": True}
-    elif declared.value_if_bare is not None:
-        details |= {"is_flag": False, "flag_value": declared.value_if_bare}
-    if declared.default is MISSING:
-        details["required"] = True
-    else:
-        details["default"] = declared.default
-    return click.option(
-        declared.flag,
-        declared.name,
-        metavar=declared.metavar,
-        help=declared.help,
-        show_default=declared.show_default,
-        **details,
-    )
+        details["is_flag"] = True
+    return click.option(flag_of(declared), declared.name, **details)
 
 
 class _Names(click.Choice):  # type: ignore[type-arg]
@@ -57,16 +50,17 @@ class _Names(click.Choice):  # type: ignore[type-arg]
         return value if is_file else super().convert(value, param, ctx)
 
 
-def _type_of(declared: Option) -> Any:
-    if declared.choices is not None:
-        return _Names(declared.choices)
-    if declared.parse is not None:
-        return declared.parse
-    if declared.least is not None or declared.most is not None:
-        return click.IntRange(declared.least, declared.most)
+def _type_of(declared: Field[Any]) -> Any:
+    limits = declared.metadata.get("least"), declared.metadata.get("most")
+    if "choices" in declared.metadata:
+        return _Names(declared.metadata["choices"])
+    if limits != (None, None):
+        return click.IntRange(*limits)
     pairs = {"tuple[float, float]": (float, float), "tuple[int, int]": (int, int)}
     plain = {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}
-    return (pairs | plain)[declared.type]
+    # Of several types the last, as in `float | str | None`.
+    named = str(declared.type).removesuffix(" | None").rpartition(" | ")[2]
+    return (pairs | plain).get(named)
 
 
 def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator:
@@ -78,8 +72,8 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
     """
 
     def decorate(command: Command) -> Command:
-        wanted = [each for group in groups for each in options_of(group)]
-        for each in reversed(wanted):
+        declared = [each for group in groups for each in options_of(group)]
+        for each in reversed(declared):
             command = command if each.name in without else click_option(each)(command)
         return command
 
@@ -100,25 +94,27 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
     return decorate
 
 
-def _declared(group: type, name: str) -> Option:
-    return next(each for each in options_of(group) if each.name == name)
-
-
-_MODEL = _declared(NetworkChoice, "model")
+_DECLARED = {
+    each.name: each
+    for group in (BatchRequest, OutputOptions, Settings, ReadOptions, NetworkChoice)
+    for each in options_of(group)
+}
+_MODEL = _DECLARED["model"]
 model = click_option(_MODEL)
 models = click.option(
     "--model",
     "model",
     multiple=True,
     default=(_MODEL.default,),
-    metavar=_MODEL.metavar,
-    help=f"{_MODEL.help} Given several times, all are fused.  [default: {_MODEL.default}]",
+    metavar=_MODEL.metadata["metavar"],
+    help=f"{_MODEL.metadata['help']} Given several times, all are fused."
+    f"  [default: {_MODEL.default}]",
 )
-checkpoint = click_option(_declared(NetworkChoice, "checkpoint"))
-depth_scale = click_option(_declared(ReadOptions, "depth_scale"))
-pose_kind = click_option(_declared(BatchRequest, "pose_kind"))
-seed = click_option(_declared(Settings, "seed"))
-overwrite = click_option(_declared(OutputOptions, "overwrite"))
+checkpoint = click_option(_DECLARED["checkpoint"])
+depth_scale = click_option(_DECLARED["depth_scale"])
+pose_kind = click_option(_DECLARED["pose_kind"])
+seed = click_option(_DECLARED["seed"])
+overwrite = click_option(_DECLARED["overwrite"])
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 sparse_output = click.option(
     "-o",
@@ -146,3 +142,62 @@ def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
     first, *more = values.pop("model")
     models = {"model": first, "more_models": tuple(more)}
     return RefineRequest().with_fields(scan=scan, **models, **values, **others)
+
+
+class GroupedCommand(click.Command):
+    """A command whose help lists its options in groups: `--help` the common ones, `--help-all` all.
+
+    Plain click, because cloup and rich-click double the time of `pnpdepth --help`, and neither has
+    a short and a long form of the help.
+
+    Args:
+        groups: Members of each group by its title, in the order of the help. A member is the long
+            name of an option, or a dataclass of a request, which stands for those of its options
+            that are named nowhere else. What the command does not have is skipped.
+        common: Long names of the options that `--help` shows.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        groups: Mapping[str, tuple[str | type, ...]],
+        common: frozenset[str],
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        named = {member for members in groups.values() for member in members}
+
+        def flags(member: str | type) -> list[str]:
+            if isinstance(member, str):
+                return [member]
+            return [flag for flag in map(flag_of, options_of(member)) if flag not in named]
+
+        self.groups = {title: [*chain(*map(flags, of))] for title, of in groups.items()}
+        self.common = {*common, *_HELP}
+        self.params.append(
+            click.Option(
+                ["--help-all"],
+                is_flag=True,
+                is_eager=True,
+                expose_value=False,
+                callback=_show_all,
+                help="Show all options and exit.",
+            )
+        )
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Writes one section per group."""
+        options = {o.opts[-1]: o for o in self.get_params(ctx) if isinstance(o, click.Option)}
+        shown = options if ctx.meta.get(_SHOW_ALL) else self.common & {*options}
+        for title, names in {**self.groups, "Help": _HELP}.items():
+            records = [options[name].get_help_record(ctx) for name in names if name in shown]
+            if rows := [record for record in records if record is not None]:
+                with formatter.section(title):
+                    formatter.write_dl(rows, col_max=_NAME_COLUMN)
+
+
+def _show_all(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    if value and not context.resilient_parsing:
+        context.meta[_SHOW_ALL] = True
+        click.echo(context.get_help(), color=context.color)
+        context.exit()

@@ -74,14 +74,9 @@ class TableFiles:
         return Path("-") in texts
 
 
-class _Console(Console):
-    def on_broken_pipe(self) -> None:
-        raise  # Rich would exit with code 1
-
-
 def print_table(table: Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
-    console = _Console(stderr=err, highlight=False)
+    console = Console(stderr=err, highlight=False)
     if not console.is_terminal:
         console.width = _WIDE
     title = escape(printable(table.title))

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.cli import grouped_help, options
+from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json
 from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -16,7 +16,7 @@ from pnpdepth_cli.settings import Settings
 
 @click.command(
     short_help="Refine the depth of one image.",
-    cls=grouped_help.GroupedCommand,
+    cls=options.GroupedCommand,
     common=frozenset(
         {
             *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),

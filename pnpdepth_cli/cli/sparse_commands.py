@@ -7,20 +7,23 @@ from typing import Any
 
 import click
 
+from pnpdepth_cli.choices import SENSORS
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import say
-from pnpdepth_cli.commands.requests import (
-    FramesRequest,
-    ProjectRequest,
-    SampleRequest,
-    SimulateRequest,
-)
+from pnpdepth_cli.commands.refinement.refine_request import parse_sample
+from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.read_options import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")
 @click.argument("scan", type=options.FILE)
-@options.options_of_groups(ScanOptions, ProjectRequest)
+@options.options_of_groups(ScanOptions)
+@click.option(
+    "--image",
+    type=options.FILE,
+    required=True,
+    help="Camera image: gives the size, and is drawn on.",
+)
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
@@ -39,12 +42,20 @@ def project(**values: Any) -> None:
     from pnpdepth_cli.commands.sparse.make import project_scan
 
     scan_options = ScanOptions(**options.take_options(ScanOptions, values))
-    print_sparse(project_scan(ProjectRequest(options=scan_options, **values)))
+    print_sparse(project_scan(options=scan_options, **values))
 
 
 @click.command(short_help="Sample sparse depth from dense depth.")
 @click.argument("depth", type=options.FILE)
-@options.options_of_groups(SampleRequest)
+@click.option(
+    "--count",
+    "pattern",
+    type=parse_sample,
+    required=True,
+    metavar="[PATTERN:]N|P%",
+    help="Number of points (of lines for `lines`), or % of known pixels.",
+)
+@click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
 @options.depth_scale
 @options.sparse_output
@@ -68,17 +79,42 @@ def sample(**values: Any) -> None:
     from pnpdepth_cli.cli.printing import print_sparse
     from pnpdepth_cli.commands.sparse.make import sample_depth
 
-    print_sparse(sample_depth(SampleRequest(**values)))
+    print_sparse(sample_depth(**values))
 
 
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
 @click.argument("depth", type=options.FILE)
-@options.options_of_groups(SimulateRequest)
+@click.option(
+    "--sensor",
+    type=click.Choice(SENSORS),
+    help="LiDAR by its data sheet, or as the paper has it.",
+)
+@click.option(
+    "--beams",
+    type=click.IntRange(1, 4096),
+    metavar="N",
+    help="Beams of another LiDAR, evenly spaced, without noise.",
+)
+@click.option(
+    "--vertical-fov",
+    type=(float, float),
+    metavar="TOP BOTTOM",
+    help="Elevations of its uppermost and lowest beam, degrees.",
+)
+@click.option(
+    "--calib",
+    type=options.FILE,
+    required=True,
+    metavar="FILE|FOLDER",
+    help="Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
+)
 @options.seed
 @options.depth_scale
 @options.sparse_output
 @options.overwrite
-def simulate(**values: Any) -> None:
+def simulate(
+    sensor: str | None, beams: int | None, vertical_fov: tuple[float, float] | None, **values: Any
+) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -87,9 +123,9 @@ def simulate(**values: Any) -> None:
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import simulate_scan
+    from pnpdepth_cli.commands.sparse.make import lidar_of, simulate_scan
 
-    print_sparse(simulate_scan(SimulateRequest(**values)))
+    print_sparse(simulate_scan(sensor=lidar_of(sensor, beams, vertical_fov), **values))
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")

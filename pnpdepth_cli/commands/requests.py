@@ -1,4 +1,4 @@
-"""What the user asks of clouds, bags and sparse depth, and which files that may replace.
+"""What the user asks of clouds and bags, and which files that may replace.
 
 Imports neither numpy nor torch.
 """
@@ -7,14 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.choices import SENSORS
-from pnpdepth_cli.commands.refinement.refine_request import parse_sample
-from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.settings import option
 
 
@@ -107,65 +103,3 @@ class FramesRequest:
             raise UsageError("--between {} {} has no frame; give FIRST LAST".format(*self.between))
         if not self.tolerance >= 0:
             raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SparseRequest:
-    """Where sparse depth is written, with a JSON beside it that says what it was made from."""
-
-    output: Path
-    """File of the sparse depth; the suffix is one of `SPARSE_SUFFIXES`."""
-    depth_scale: float | None = None
-    """Integers per metre of what it is made from."""
-    overwrite: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProjectRequest(SparseRequest):
-    """Which scan to project into which image."""
-
-    scan: Path
-    options: ScanOptions
-    """The calibration."""
-    image: Path = option(MISSING, "Camera image: gives the size, and is drawn on.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampleRequest(SparseRequest):
-    """Which pixels of a dense depth map to sample."""
-
-    depth: Path
-    count: SamplePattern = option(
-        MISSING,
-        "Number of points (of lines for `lines`), or % of known pixels.",
-        metavar="[PATTERN:]N|P%",
-        parse=parse_sample,
-    )
-    image: Path | None = option(None, "Image for `features`.")
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulateRequest(SparseRequest):
-    """Which LiDAR to simulate in the scene of a dense depth map."""
-
-    depth: Path
-    sensor: str | None = option(
-        None, "LiDAR by its data sheet, or as the paper has it.", choices=SENSORS
-    )
-    beams: int | None = option(
-        None,
-        "Beams of another LiDAR, evenly spaced, without noise.",
-        metavar="N",
-        least=1,
-        most=4096,
-    )
-    vertical_fov: tuple[float, float] | None = option(
-        None, "Elevations of its uppermost and lowest beam, degrees.", metavar="TOP BOTTOM"
-    )
-    calib: Path = option(
-        MISSING,
-        "Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
-        metavar="FILE|FOLDER",
-    )
-    seed: int = 0

@@ -22,7 +22,7 @@ from pnpdepth_cli.models.definition import (
 )
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import METRES
-from pnpdepth_cli.settings import ClosedSettings, Settings
+from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -125,9 +125,10 @@ def resolve_settings(
         UsageError: The settings contradict each other.
     """
     defaults = definition.defaults
-    settings = settings.with_paper()
+    if settings.is_paper:
+        settings = settings.over(PAPER)
     if settings.update not in (None, defaults.closed().update):
-        defaults = defaults.opened("lr", "schedule", "blur")
+        defaults = replace(defaults, lr=None, schedule=None, blur=None)
     alignment = definition.default_alignment
     if not metric and alignment == "none" and definition.input_kind == "rgb":
         alignment = "scale"

@@ -8,7 +8,7 @@ from pnpdepth_cli.cli.batch_command import batch
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
-from pnpdepth_cli.settings import PAPER, Settings, options_of
+from pnpdepth_cli.settings import PAPER, Settings, flag_of, options_of
 from tests.core.networks import UNet
 
 METHOD = Settings()
@@ -35,4 +35,4 @@ def test_every_field_belongs_to_one_group_and_its_option_is_one_of_batch() -> No
     assert len(names) == len(set(names))
     spelled = {name for option in batch.params for name in option.opts}
     for group in groups:
-        assert {each.flag for each in options_of(type(group))} <= spelled
+        assert {*map(flag_of, options_of(type(group)))} <= spelled

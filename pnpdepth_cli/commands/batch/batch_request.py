@@ -74,10 +74,10 @@ class BatchRequest:
         None,
         "Measures of the tables, in this order, such as rmse,mae,delta1.",
         metavar="KEY,…",
-        parse=parse_keys,
+        type=parse_keys,
     )
     shard: tuple[int, int] | None = option(
-        None, "Every N-th frame, starting at the I-th.", metavar="I/N", parse=parse_shard
+        None, "Every N-th frame, starting at the I-th.", metavar="I/N", type=parse_shard
     )
     adapt: bool = option(
         False,
@@ -110,8 +110,9 @@ class BatchRequest:
         "Run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. Without an address, on all"
         " cores of this machine, with --device cuda on all GPUs. Needs the extra ray.",
         metavar="[ADDRESS]",
-        parse=parse_address,
-        value_if_bare=LOCAL,
+        type=parse_address,
+        is_flag=False,
+        flag_value=LOCAL,
     )
     varied: Mapping[str, str] = field(default_factory=dict)
     """Options that a study varies, and their values here, as the user wrote them."""

@@ -21,7 +21,7 @@ from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.batch.running import open_method, refine_frames
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import ClusterError, UsageError
+from pnpdepth_cli.errors import DeviceError, UsageError
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.file_bytes import one_line
 
@@ -57,7 +57,7 @@ class Worker:
             worked: Whether a frame was refined with these settings before.
 
         Raises:
-            ClusterError: This node does not see the driver's files.
+            DeviceError: This node does not see the driver's files.
             PnpDepthError: As `refine_frames`.
         """
         if self.method is None:
@@ -75,7 +75,7 @@ class Worker:
         for path in (self.folder / request.source, self.folder / request.output):
             if not path.exists():
                 node = socket.gethostname()
-                raise ClusterError(f"node {node} does not see {path}; all nodes must share it")
+                raise DeviceError(f"node {node} does not see {path}; all nodes must share it")
         os.chdir(self.folder)
         torch.set_num_threads(self.threads)
         cv2.setNumThreads(self.threads)
@@ -105,7 +105,7 @@ def refine_on_workers(
         stopped: True if no further frame is to be begun.
 
     Raises:
-        ClusterError: The cluster cannot be used.
+        DeviceError: The cluster cannot be used.
         PnpDepthError: What ends a batch in one process, such as a full disk.
     """
     with _connected(records.request.ray or LOCAL) as ray:
@@ -138,7 +138,7 @@ def refine_on_workers(
             except ray.exceptions.RayError as error:
                 reason, deaths = one_line(error), deaths + 1
                 if deaths == _DEATHS and not worked:
-                    raise ClusterError(f"Ray workers die: {reason}") from None
+                    raise DeviceError(f"Ray workers die: {reason}") from None
                 say(f"warning: a worker died ({reason})")
                 worker, tries = start(), tries + (len(part) == 1)
                 waiting.extend(([frame], tries) for frame in part if tries < _TRIES)
@@ -159,7 +159,7 @@ def _plan(
     gpus = network.device == "cuda"
     devices = int(total.get("GPU" if gpus else "CPU", 0))
     if not devices:
-        raise ClusterError(f"the Ray cluster has no device {network.device}; change --device")
+        raise DeviceError(f"the Ray cluster has no device {network.device}; change --device")
     cores = max(1, int(total["CPU"] // devices)) if gpus else 1
     actor = ray.remote(Worker).options(
         num_cpus=cores, num_gpus=int(gpus), scheduling_strategy="SPREAD"
@@ -177,7 +177,7 @@ def _plan(
 
 @contextmanager
 def _connected(address: str) -> Iterator[ModuleType]:
-    """Yields Ray, connected. UsageError if it is not installed, ClusterError without a cluster."""
+    """Yields Ray, connected. UsageError if it is not installed, DeviceError without a cluster."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray is imported and by its processes
     try:
         import ray
@@ -189,7 +189,7 @@ def _connected(address: str) -> Iterator[ModuleType]:
             socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (Exception, SystemExit) as error:
-        raise ClusterError(
+        raise DeviceError(
             f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"
             " it with `ray start --head`, or leave the address out"
         ) from None

@@ -77,7 +77,7 @@ class EvalRequest:
         "Measures of the tables, in this order, such as rmse,mae,delta1. Only if named, for dense"
         f" ground truth: {', '.join(choices.MEASURES)}.",
         metavar="KEY,…",
-        parse=parse_keys,
+        type=parse_keys,
     )
 
     def __post_init__(self) -> None:

@@ -11,19 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.commands.requests import (
-    ProjectRequest,
-    SampleRequest,
-    SimulateRequest,
-    SparseRequest,
-    check_outputs,
-)
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.dataset.arrays import record_of
 from pnpdepth_cli.dataset.frame_camera import check_size
 from pnpdepth_cli.dataset.plausible import plausible_map
+from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
-from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.file_record import FileRecord, SamplePattern
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
@@ -45,24 +40,26 @@ class SparseSummary(NamedTuple):
     files: Sequence[Path]
 
 
-def _overlay(request: SparseRequest) -> Path:
+def _overlay(output: Path) -> Path:
     """The image with the points, of a scan that is projected."""
-    return request.output.with_name(f"{request.output.stem}_overlay.png")
+    return output.with_name(f"{output.stem}_overlay.png")
 
 
-def _check(request: SparseRequest, inputs: Iterable[Path | None], *, drawn: bool = False) -> None:
+def _check(
+    output: Path, inputs: Iterable[Path | None], overwrite: bool, *, drawn: bool = False
+) -> None:
     """Raises OutputError for files that cannot be written, or that replace an input."""
-    if request.output.suffix.lower() not in SPARSE_SUFFIXES:
+    if output.suffix.lower() not in SPARSE_SUFFIXES:
         raise OutputError(
-            f"{request.output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
+            f"{output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
         )
-    written = [request.output, request.output.with_suffix(".json"), *[_overlay(request)] * drawn]
-    check_outputs(written, [path for path in inputs if path], overwrite=request.overwrite)
+    written = [output, output.with_suffix(".json"), *[_overlay(output)] * drawn]
+    check_outputs(written, [path for path in inputs if path], overwrite=overwrite)
 
 
 def _write(
     command: str,
-    request: SparseRequest,
+    output: Path,
     points: Points,
     settings: Mapping[str, object],
     inputs: Mapping[str, FileRecord],
@@ -72,13 +69,13 @@ def _write(
 ) -> SparseSummary:
     """Writes the sparse depth, its record, and with an image (H, W, 3) in 0..1 the overlay."""
     # The points, as a map or a list, and over the image.
-    make_folder(request.output.parent)
-    image, record = as_depth_image(points), request.output.with_suffix(".json")
-    write_sparse(request.output, points.xy, points.depth, image)
+    make_folder(output.parent)
+    image, record = as_depth_image(points), output.with_suffix(".json")
+    write_sparse(output, points.xy, points.depth, image)
     if rgb is not None:
-        overlay(rgb, points.xy, points.depth, _overlay(request))
-    drawn = None if rgb is None else _overlay(request)
-    outputs = {"sparse": request.output, "overlay": drawn, "record": record}
+        overlay(rgb, points.xy, points.depth, _overlay(output))
+    drawn = None if rgb is None else _overlay(output)
+    outputs = {"sparse": output, "overlay": drawn, "record": record}
     # The record.
     content = {
         "command": command,
@@ -100,23 +97,38 @@ def _write(
     return SparseSummary(points, notes, [path for path in outputs.values() if path])
 
 
-def project_scan(request: ProjectRequest) -> SparseSummary:
-    """Writes the scan's points that the camera sees; returns what was written."""
-    scan, options, image = request.scan, request.options, request.image
-    _check(request, (scan, image, options.calib, options.extrinsics), drawn=True)
+def project_scan(
+    scan: Path,
+    image: Path,
+    output: Path,
+    options: ScanOptions,
+    *,
+    depth_scale: float | None = None,
+    overwrite: bool = False,
+) -> SparseSummary:
+    """Writes the scan's points that the camera of the image sees; returns what was written."""
+    _check(output, (scan, image, options.calib, options.extrinsics), overwrite, drawn=True)
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
-    projected = read_scan_points(scan, options, size, image, scale=request.depth_scale)
+    projected = read_scan_points(scan, options, size, image, scale=depth_scale)
     inputs = {"image": record_of(image), "scan": projected.record}
     settings = plain(asdict(options))
-    return _write("project", request, projected.points, settings, inputs, projected.notes, rgb=rgb)
+    return _write("project", output, projected.points, settings, inputs, projected.notes, rgb=rgb)
 
 
-def sample_depth(request: SampleRequest) -> SparseSummary:
+def sample_depth(
+    depth: Path,
+    output: Path,
+    pattern: SamplePattern,
+    *,
+    image: Path | None = None,
+    seed: int = 0,
+    depth_scale: float | None = None,
+    overwrite: bool = False,
+) -> SparseSummary:
     """Writes points of a dense depth map; returns what was written."""
-    depth, image, pattern, seed = request.depth, request.image, request.count, request.seed
-    _check(request, (depth, image))
-    dense, notes = _dense(depth, request.depth_scale)
+    _check(output, (depth, image), overwrite)
+    dense, notes = _dense(depth, depth_scale)
     rgb, inputs = None, {"depth": record_of(depth)}
     if image is not None:
         rgb, inputs["image"] = read_rgb(image).values, record_of(image)
@@ -126,14 +138,22 @@ def sample_depth(request: SampleRequest) -> SparseSummary:
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
     settings = {"pattern": asdict(pattern), "seed": seed}
-    return _write("sample", request, points, settings, inputs, notes)
+    return _write("sample", output, points, settings, inputs, notes)
 
 
-def simulate_scan(request: SimulateRequest) -> SparseSummary:
+def simulate_scan(
+    depth: Path,
+    calib: Path,
+    output: Path,
+    sensor: Lidar,
+    *,
+    seed: int = 0,
+    depth_scale: float | None = None,
+    overwrite: bool = False,
+) -> SparseSummary:
     """Writes the points of a sensor at the camera's place; returns what was written."""
-    depth, calib, seed, sensor = request.depth, request.calib, request.seed, _sensor(request)
-    _check(request, (depth, calib))
-    dense, notes = _dense(depth, request.depth_scale)
+    _check(output, (depth, calib), overwrite)
+    dense, notes = _dense(depth, depth_scale)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     points = simulate_lidar(dense, calibration.camera, sensor, seed)
@@ -141,7 +161,7 @@ def simulate_scan(request: SimulateRequest) -> SparseSummary:
     settings = {"sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
-    return _write("simulate", request, points, settings, inputs, notes)
+    return _write("simulate", output, points, settings, inputs, notes)
 
 
 def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:
@@ -151,9 +171,14 @@ def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[s
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]
 
 
-def _sensor(request: SimulateRequest) -> Lidar:
-    """The sensor of this name, or one of so many beams between two elevations, degrees."""
-    name, beams, vertical_fov = request.sensor, request.beams, request.vertical_fov
+def lidar_of(
+    name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
+) -> Lidar:
+    """Returns the sensor of this name, or one of so many beams between two elevations, degrees.
+
+    Raises:
+        UsageError: Neither or both are given.
+    """
     if name is not None and beams is None and vertical_fov is None:
         return LIDARS[name]
     if name is not None or beams is None or vertical_fov is None:

@@ -16,7 +16,7 @@ import pytest
 from pnpdepth_cli.commands.batch.batch_request import parse_address
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import ClusterError, ModelError, UsageError
+from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
@@ -104,7 +104,7 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
 @pytest.mark.slow
 @on_a_cluster
 def test_what_is_wrong_with_all_frames_ends_the_batch(cluster: Any, root: Path) -> None:
-    with pytest.raises(ClusterError, match="device cuda"):
+    with pytest.raises(DeviceError, match="device cuda"):
         batch(root, ray=cluster.address, refine={"device": "cuda"})
     with pytest.raises(ModelError, match="nowhere"):
         batch(root, ray=cluster.address, refine={"layer": "nowhere"})
@@ -132,7 +132,7 @@ def test_an_address_where_nothing_answers_is_an_error_at_once(scheme: str, root:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"{scheme}127.0.0.1:{free.getsockname()[1]}"
-        with pytest.raises(ClusterError, match=address):
+        with pytest.raises(DeviceError, match=address):
             batch(root, ray=address)
 
 

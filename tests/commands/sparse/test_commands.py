@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.requests import ProjectRequest, SampleRequest, SimulateRequest
 from pnpdepth_cli.commands.sparse.make import (
     SparseSummary,
+    lidar_of,
     project_scan,
     sample_depth,
     simulate_scan,
@@ -44,7 +44,7 @@ def recorded(summary: SparseSummary) -> dict[str, Any]:
 def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:
     files = {"scan": frame.scan, "image": frame.image, "output": frame.folder / output}
     options = {"options": ScanOptions(calib=frame.calib)}
-    return recorded(project_scan(ProjectRequest(**(files | options | more))))
+    return recorded(project_scan(**(files | options | more)))
 
 
 @pytest.mark.parametrize("suffix", [".csv", *DEPTH_SUFFIXES])
@@ -118,7 +118,7 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
 def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
     pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
     files = {"depth": frame.gt, "output": frame.folder / output}
-    return recorded(sample_depth(SampleRequest(count=SamplePattern(**pattern), **files, **more)))
+    return recorded(sample_depth(pattern=SamplePattern(**pattern), **files, **more))
 
 
 def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
@@ -140,14 +140,8 @@ def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
 
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
-    request = SimulateRequest(
-        depth=frame.gt,
-        calib=frame.calib,
-        output=frame.folder / "out.csv",
-        beams=21,
-        vertical_fov=(20, -20),
-    )
-    record = recorded(simulate_scan(request))
+    sensor = lidar_of(None, beams=21, vertical_fov=(20, -20))
+    record = recorded(simulate_scan(frame.gt, frame.calib, frame.folder / "out.csv", sensor))
     got = read_sparse(frame.folder / "out.csv", size=(60, 100))[0]
     np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
     assert record["sensor"]["name"] == "21 beams"
