@@ -102,7 +102,7 @@ def _from_file(spec: str) -> ModelDefinition | None:
     if file.endswith(".py"):
         return _python_definition(Path(file), part)
     if file.endswith(".onnx"):
-        from pnpdepth_cli.models.onnx.onnx_file import onnx_definition
+        from pnpdepth_cli.models.onnx import onnx_definition
 
         return onnx_definition(Path(file), part)
     if spec.endswith(".pt2"):

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, fx
+from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.core.user_code import describe
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
-from pnpdepth_cli.models.steps import Step, Steps, Unsupported, Value, hold
+from pnpdepth_cli.models.file_graph import FileGraph, Operation
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
 from pnpdepth_cli.models.weights.torch_file import refuse_inflated
 
@@ -34,80 +35,7 @@ _DTYPES = {
 }  # fmt: skip
 _MEMORY_FORMATS = {1: torch.contiguous_format, 2: torch.channels_last, 4: torch.preserve_format}
 _STRIDED = 7
-
-
-class ExportedOperation(nn.Module):
-    """One operation of the exported graph."""
-
-    def __init__(self, operation: Callable[..., object]) -> None:
-        super().__init__()
-        self._operation = operation
-
-    def forward(self, *args: object, **kwargs: object) -> object:
-        """Returns the operation's result."""
-        try:
-            return self._operation(*args, **kwargs)
-        except Unsupported as error:
-            raise ModelError(f"the exported program calls {self._operation} for {error}") from None
-
-
-class ExportedGraph(nn.Module):
-    """The graph of an exported program as a module; every operation is a submodule.
-
-    Args:
-        program: The content of models/model.json.
-        tensors: Weights, buffers and constants by name.
-    """
-
-    def __init__(self, program: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        module = program["graph_module"]
-        self.held: dict[str, str] = {}  # the attribute for a value of the graph
-        self.inputs: list[str] = []
-        for spec in module["signature"]["input_specs"]:
-            ((kind, value),) = dict(spec).items()
-            if kind == "user_input":
-                self.inputs.append(value["arg"]["as_tensor"]["name"])
-            elif kind in ("parameter", "buffer", "tensor_constant"):
-                self.held[value["arg"]["name"]] = attribute = f"tensor{len(self.held)}"
-                hold(self, attribute, tensors[value[f"{kind}_name"]])
-            else:
-                raise BrokenFileError(f"its input is a {str(kind)[:40]!r}")
-        self._outputs = [
-            spec["user_output"]["arg"]["as_tensor"]["name"]
-            for spec in module["signature"]["output_specs"]
-            if "user_output" in spec
-        ]
-        steps = [
-            self._step(node["target"], node["inputs"], node["outputs"])
-            for node in module["graph"]["nodes"]
-            if node["outputs"]  # the others only check what the exporter saw
-        ]
-        self._steps = Steps(steps, self._outputs, kind="operation")
-
-    def forward(self, *inputs: Tensor) -> object:
-        """Returns the output, or a tuple of several."""
-        values: dict[str, object] = dict(zip(self.inputs, inputs, strict=True))
-        values |= {name: getattr(self, attribute) for name, attribute in self.held.items()}
-        self._steps.run(values, tuple(each.shape for each in inputs))
-        outputs = tuple(values[name] for name in self._outputs)
-        return outputs if len(outputs) > 1 else outputs[0]
-
-    def _step(self, target: str, inputs: list[Any], outputs: list[Any]) -> Step:
-        run, inputs = ExportedOperation(_function(target)), [dict(one) for one in inputs]
-        named = [one for output in outputs for one in _outputs_in(output)]
-        alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
-        name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
-        while hasattr(self, name):  # as a node named `to`, a method of every module
-            name += "_"
-        self._modules[name] = run
-        return Step(
-            run=run,
-            arguments=[_argument(one["arg"]) for one in inputs if one.get("kind") != 2],
-            keywords={one["name"]: _argument(one["arg"]) for one in inputs if one.get("kind") == 2},
-            outputs=str(named[0]) if alone else named,
-            name=target,
-        )
+_KEYWORD = 2
 
 
 def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
@@ -125,7 +53,7 @@ def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
     check_network_file(file, "exported program", ModelError)
     try:
         program, tensors = _read(file)
-        graph = ExportedGraph(program, tensors)
+        graph = _graph(program, tensors)
         values = program["graph_module"]["graph"]["tensor_values"]
         sizes = [values[name]["sizes"] for name in graph.inputs]
         shapes = [[dict(side).get("as_int", "?") for side in size] for size in sizes]
@@ -137,7 +65,7 @@ def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
         ) from None
     return graph_definition(
         shapes, file, stated,
-        summary="torch.export archive", build=lambda: ExportedGraph(program, tensors),
+        summary="torch.export archive", build=lambda: _graph(program, tensors),
     )  # fmt: skip
 
 
@@ -160,6 +88,43 @@ def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     return program, tensors
 
 
+def _graph(program: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FileGraph:
+    """The program of models/model.json as a module, whose submodules are its nodes."""
+    graph, module = FileGraph(), program["graph_module"]
+    for spec in module["signature"]["input_specs"]:
+        ((kind, value),) = dict(spec).items()
+        if kind == "user_input":
+            graph.add_input(value["arg"]["as_tensor"]["name"])
+        elif kind in ("parameter", "buffer", "tensor_constant"):
+            graph.add_tensor(value["arg"]["name"], tensors[value[f"{kind}_name"]])
+        else:
+            raise BrokenFileError(f"its input is a {str(kind)[:40]!r}")
+    for node in module["graph"]["nodes"]:
+        if node["outputs"]:  # the others only check what the exporter saw
+            _add_node(graph, node["target"], node["inputs"], node["outputs"])
+    outputs = [spec.get("user_output") for spec in module["signature"]["output_specs"]]
+    graph.set_outputs([value["arg"]["as_tensor"]["name"] for value in outputs if value])
+    return graph
+
+
+def _add_node(
+    graph: FileGraph, target: str, inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]
+) -> None:
+    positional: list[Argument] = []
+    keywords: dict[str, Argument] = {}
+    for one in inputs:
+        value = _argument(one["arg"], graph.values)
+        if one.get("kind") == _KEYWORD:
+            keywords[one["name"]] = value
+        else:
+            positional.append(value)
+    named = [name for output in outputs for name in _outputs_in(output)]
+    alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
+    name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
+    operation = Operation(f"exported program: {target}", _function(target))
+    graph.add_operation(name, operation, positional, keywords, str(named[0]) if alone else named)
+
+
 def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
     dtype = _DTYPES[meta["dtype"]]
     flat = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
@@ -179,22 +144,23 @@ def _function(target: str) -> Callable[..., object]:
     raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
 
 
-def _argument(stated: Mapping[str, Any]) -> Any:
-    """An argument of a call, with `Value` for what the graph computes."""
+def _argument(stated: Mapping[str, Any], values: Mapping[str, fx.Node]) -> Argument:
+    """An argument of a call, with the nodes of what the graph computes."""
     ((kind, value),) = dict(stated).items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
             return None
         case "tensor" if "name" in value:
-            return Value(value["name"])
+            return values[value["name"]]
         case "float" if not isinstance(value, Mapping):
             return float(value)  # JSON has a text for an infinite one
         case "tensor" | "int" | "float" | "bool" | "string":
-            return _argument(value) if isinstance(value, Mapping) else value
+            return _argument(value, values) if isinstance(value, Mapping) else value
         case "tensors" | "ints" | "floats" | "bools":
             kind = kind.removesuffix("s")
             whole = [isinstance(one, Mapping) and "name" not in one for one in value]
-            return [_argument(v if w else {kind: v}) for v, w in zip(value, whole, strict=True)]
+            each = [one if w else {kind: one} for one, w in zip(value, whole, strict=True)]
+            return [_argument(one, values) for one in each]
         case "scalar_type":
             return _DTYPES[value]
         case "memory_format":

@@ -88,7 +88,7 @@ definition = {function}(
 @pytest.mark.parametrize(
     ("suffix", "module", "function"),
     [
-        (".onnx", "onnx.onnx_file", "onnx_definition"),
+        (".onnx", "onnx", "onnx_definition"),
         (".pt2", "torch_export", "exported_definition"),
     ],
 )

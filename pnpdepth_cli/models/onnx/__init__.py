@@ -1,88 +1,221 @@
-"""ONNX files as networks; here the table of the operators that depth networks use.
+"""An ONNX file as a definition. On the first image, onnxruntime checks what torch computes.
 
-The functions register themselves with `@operator`, each as the standard defines it
-(https://onnx.ai/onnx/operators). Every version of an operator from opset 7 on is covered: an
-attribute that later became an input is read as either.
+`net.onnx`, or `net.onnx:OUTPUT` if the graph has several outputs. Needs `pip install
+pnpdepth[onnx]`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import functools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-Inputs = list[Tensor]
-"""The inputs of a node in order; `optional` reads those that may be absent or None."""
+from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.core.user_code import describe, wrap_user_errors
+from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.definition import (
+    ASSUMED_MULTIPLE,
+    ModelDefinition,
+    Multiple,
+    graph_definition,
+)
+from pnpdepth_cli.models.file_graph import FileGraph
+from pnpdepth_cli.models.onnx.graph import onnx_graph, opset_of
 
-Operator = Callable[["Node", Inputs], "Tensor | tuple[Tensor, ...]"]
+if TYPE_CHECKING:
+    from onnx import ModelProto, ValueInfoProto
 
-OPERATORS: dict[str, Operator] = {}
+_OPSETS = range(7, 25)  # onnxruntime runs none that is older
+_MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
+_SHARED = 2  # tensors that may have the same bytes of a file beside the model
 
-HOST_INPUTS: dict[str, tuple[int, ...]] = {}
-"""Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
-
-
-ONLY: dict[str, int | str] = {
-    "antialias": 0,
-    "batch_dims": 0,
-    "detect_negative": 1,
-    "detect_positive": 1,
-    "exclude_outside": 0,
-    "keep_aspect_ratio_policy": "stretch",
-    "noop_with_empty_axes": 0,
-    "reduction": "none",
-    "training_mode": 0,
-}
-"""Attributes that must have this value, the standard's default, if they are there."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Node:
-    """A node of the graph; its name is unique there, and `outputs` counts those that are used."""
-
-    name: str
-    op: str
-    opset: int
-    outputs: int = 1
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Returns an attribute, or the standard's default for it."""
-        return self.attributes.get(name, default)
+MISMATCH = 1e-3
+"""The largest deviation from onnxruntime's output, relative to that output's range."""
 
 
-def operator(*names: str, host: tuple[int, ...] = ()) -> Callable[[Operator], Operator]:
-    """Registers the decorated function for these operators; `host` is as in `HOST_INPUTS`."""
+def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
+    """Returns the definition of an ONNX depth network.
 
-    def enter(function: Operator) -> Operator:
-        for name in names:
-            OPERATORS[name], HOST_INPUTS[name] = function, host
-        return function
+    Args:
+        file: The .onnx file; it takes one rgb image 1×3×H×W or 1×H×W×3, unless another
+            `input_kind` is stated.
+        output: Name of the graph's output that is the depth; None if it has only one.
+        **stated: Fields of `ModelDefinition` that a definition file states of it.
 
-    return enter
+    Raises:
+        ModelError: The file cannot be read, or the network cannot be run.
+    """
+    model = _read(file)
+    constants = {tensor.name for tensor in model.graph.initializer}
+    inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
+    is_part = _prune(model, _choose_output(model, output, file))
+    # onnxruntime must not run what is pruned. From the file, it reads weights that lie beside it.
+    source = model.SerializeToString() if is_part else str(file)
+    return graph_definition(
+        list(inputs.values()), file, stated,
+        size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
+        build=lambda: onnx_graph(model, file),
+        summary=f"ONNX, opset {opset_of(model)}, from {model.producer_name or 'no name'}",
+        output=_as_map,
+        verify=functools.partial(_compare, source, file),
+    )  # fmt: skip
 
 
-def register(functions: Mapping[str, Operator], host: tuple[int, ...] = ()) -> None:
-    """Registers operators whose function is one expression; `host` is as in `HOST_INPUTS`."""
-    for name, function in functions.items():
-        operator(name, host=host)(function)
+def _read(file: Path) -> ModelProto:
+    """The onnx.ModelProto with its weights, of an opset that is covered."""
+    # The file, and the packages that read it.
+    if not file.is_file():
+        raise ModelError(f"ONNX file {file} does not exist")
+    size = file.stat().st_size
+    check_claim(f"ONNX file {file} has {size:,} bytes", size, _MAX_BYTES, error=ModelError)
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401
+        from google.protobuf.message import DecodeError
+    except ImportError as error:
+        raise ModelError(
+            f"{file} is an ONNX file, which needs the package {error.name!r}:"
+            " pip install 'pnpdepth[onnx]'"
+        ) from None
+    try:
+        model = onnx.load(str(file), load_external_data=False)
+        _load_external(model, file.parent)
+    except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
+        raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
+    # A graph whose names are text, of an opset that is covered.
+    if not model.graph.node:
+        raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
+    if model.functions:
+        raise ModelError(
+            f"ONNX file {file} has functions of its own; onnx.inliner.inline_local_functions writes"
+            " them out"
+        )
+    for node in model.graph.node:
+        words = (node.name, node.op_type, node.domain, *node.input, *node.output)
+        if not all(isinstance(word, str) for word in words):
+            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
+    if opset_of(model) not in _OPSETS:
+        raise ModelError(
+            f"ONNX file {file} is of opset {opset_of(model)}; export it with one from"
+            f" {_OPSETS[0]} to {_OPSETS[-1]}"
+        )
+    return model
 
 
-def optional(inputs: Inputs, index: int) -> Tensor | None:
-    """Returns an input by its index; None if it is left out."""
-    return inputs[index] if index < len(inputs) else None
+def _load_external(model: ModelProto, folder: Path) -> None:
+    """Reads the tensors that lie in files beside the model into it.
+
+    ValueError if they claim more than these files have, or more than memory holds.
+    """
+    from onnx import external_data_helper as external
+
+    claims = [
+        external.ExternalDataInfo(tensor)
+        for tensor in external._get_all_tensors(model)
+        if external.uses_external_data(tensor)
+    ]
+    sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
+    claimed = sum(claim.length or sizes[claim.location] for claim in claims)
+    most = min(_SHARED * sum(sizes.values()), budget().max_decoded_bytes)
+    check_claim(
+        f"its tensors have {claimed:,} bytes in other files", claimed, most, error=ValueError
+    )
+    external.load_external_data_for_model(model, str(folder))
 
 
-def whole_numbers(values: Tensor) -> list[int]:
-    """Returns the elements of an integer tensor as Python numbers."""
-    return [int(v) for v in values.reshape(-1).tolist()]
+def _shape(value: ValueInfoProto) -> list[int | str]:
+    dims = value.type.tensor_type.shape.dim
+    return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
 
 
-def stated(node: Node, name: str, inputs: Inputs, index: int) -> list[int] | None:
-    """Returns the numbers of an attribute, or of the input that later took its place."""
-    if name not in node.attributes and optional(inputs, index) is not None:
-        return whole_numbers(inputs[index])
-    numbers: list[int] | None = node.get(name)
-    return numbers
+def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
+    outputs: dict[str, str] = {o.name: "×".join(map(str, _shape(o))) for o in model.graph.output}
+    if wanted is None and len(outputs) == 1:
+        return next(iter(outputs))
+    if wanted is not None and wanted in outputs:
+        return wanted
+    listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
+    first = next(iter(outputs), "OUTPUT")
+    fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
+    raise ModelError(
+        f"ONNX file {file} has {fact}; name the depth as {file}:{first}; it has {listed}"
+    )
+
+
+def _prune(model: ModelProto, output: str) -> bool:
+    """Leaves in the model one output and the nodes that it needs. True if others were there."""
+    graph, needed, nodes = model.graph, {output}, []
+    for node in reversed(graph.node):
+        if not needed.isdisjoint(node.output):
+            nodes.append(node)
+            needed.update(filter(None, node.input))
+    is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
+    kept = type(graph)()
+    kept.node.extend(reversed(nodes))
+    kept.output.extend(o for o in graph.output if o.name == output)
+    graph.ClearField("node")
+    graph.ClearField("output")
+    graph.MergeFrom(kept)
+    return is_part
+
+
+def _as_map(output: Tensor) -> Tensor:
+    last = output.ndim == 4 and output.shape[-1] == 1 and output.shape[1] != 1
+    return output.permute(0, 3, 1, 2) if last else output
+
+
+def _patch_size(model: ModelProto) -> int | None:
+    """The patch size of a vision transformer: a convolution that steps by its own kernel."""
+    for node in model.graph.node:
+        if node.op_type == "Conv":
+            by_name = {a.name: list(a.ints) for a in node.attribute}
+            kernel, stride = by_name.get("kernel_shape", []), by_name.get("strides", [])
+            if kernel == stride and kernel and min(kernel) >= 8:
+                return int(kernel[0])
+    return None
+
+
+def _compare(
+    source: str | bytes, file: Path, module: nn.Module, arguments: Sequence[Tensor]
+) -> str:
+    """How well the network agrees with onnxruntime on an image. ModelError if it does not.
+
+    The source is the file that onnxruntime reads, or the content of one.
+    """
+    import onnxruntime
+
+    assert isinstance(module, FileGraph)
+    with torch.no_grad():
+        actual = module(*arguments).cpu()  # first, since it allocates no more than it should
+    feed = {n: a.float().cpu().numpy() for n, a in zip(module.inputs, arguments, strict=True)}
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    options.intra_op_num_threads = torch.get_num_threads()
+    with wrap_user_errors(f"onnxruntime, which checks ONNX file {file},"):
+        session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        expected = torch.from_numpy(session.run(None, feed)[0]).float()
+    deviation = _deviation(actual, expected)
+    if not deviation <= MISMATCH:
+        raise ModelError(
+            f"ONNX file {file}: its reading by torch differs from onnxruntime's by"
+            f" {deviation:.2g} of the output's range"
+        )
+    return f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
+
+
+def _deviation(actual: Tensor, expected: Tensor) -> float:
+    """The largest difference relative to the largest expected value."""
+    if actual.shape != expected.shape:
+        return math.inf
+    known = expected.isfinite()
+    both = known & actual.isfinite()  # a network may be inf or NaN in the sky
+    if int((known != actual.isfinite()).sum()) > MISMATCH * expected.numel() or not both.any():
+        return math.inf
+    actual, expected = actual[both].float(), expected[both]
+    largest, difference = float(expected.abs().amax()), float((actual - expected).abs().amax())
+    return difference / largest if largest else difference

@@ -13,28 +13,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torch.fx.node import Argument
 
-from pnpdepth_cli.core.user_code import describe
+from pnpdepth_cli.core.user_code import wrap_user_errors
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.onnx import (  # noqa: F401  (each file registers its operators)
-    HOST_INPUTS,
-    ONLY,
-    OPERATORS,
-    Node,
-    layers,
-    operators,
-)
-from pnpdepth_cli.models.steps import SizeLimit, Step, Steps, Unsupported, Value, hold
+from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit, Unsupported
+from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
+from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
-_MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
-"""Such as `training`, which torch itself sets; no submodule can have such a name."""
-
 _CONSTANT_ELEMENTS, _CONSTANT_GROWTH, _CONSTANTS = 1 << 24, 4, 4
 """One computed constant may have so many elements, or so many times those stored in the file; all
 of them together so many times as many as one."""
@@ -43,52 +35,8 @@ _WORK = 1 << 32
 """Elements that may be read, and products summed, for all computed constants: seconds."""
 
 
-class OnnxNode(nn.Module):
-    """One node with its constant inputs; called with the other inputs, in order.
-
-    Args:
-        node: Operator and attributes.
-        inputs: Constants of its inputs, "" or any text for one that the call gives, None for one
-            that is left out.
-    """
-
-    def __init__(self, node: Node, inputs: Sequence[Tensor | str | None]) -> None:
-        super().__init__()
-        self.node = node
-        host = HOST_INPUTS.get(node.op, ())
-        # Of each input the constant itself if it stays on the CPU, else the name of its buffer;
-        # "" if the call gives it, None if it is left out.
-        self._inputs: list[Tensor | str | None] = []
-        for index, value in enumerate(inputs):
-            name = f"input{index}"
-            if not isinstance(value, Tensor):
-                self._inputs.append(None if value is None else "")
-            elif index in host:
-                self._inputs.append(value)
-            else:
-                self._inputs.append(name)
-                hold(self, name, value)
-        self.handed_in_on_host = tuple(
-            index in host for index, value in enumerate(self._inputs) if value == ""
-        )
-
-    def forward(self, *handed_in: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Returns the node's output, or its outputs."""
-        rest = iter(handed_in)
-        inputs: list[Any] = [
-            value if not isinstance(value, str) else getattr(self, value) if value else next(rest)
-            for value in self._inputs
-        ]
-        try:
-            _check_covered(self.node)
-            return OPERATORS[self.node.op](self.node, inputs)
-        except Unsupported as error:
-            reason = f"{self.node.op} with {error} is not covered"
-            raise ModelError(f"ONNX node {self.node.name!r}: {reason}") from None
-
-
-class OnnxGraph(nn.Module):
-    """An ONNX model as a module: called with the graph's inputs, it returns its output.
+def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
+    """Returns an ONNX model as a module: called with the graph's inputs, it returns its output.
 
     Args:
         model: The onnx.ModelProto with one output, its nodes in order.
@@ -97,103 +45,71 @@ class OnnxGraph(nn.Module):
     Raises:
         ModelError: An operator is not covered; the message names every one.
     """
-
-    def __init__(self, model: ModelProto, path: Path) -> None:
-        super().__init__()
-        graph = model.graph
-        _check_operators(graph.node, path)
-        opset = max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
-        constants = {t.name: _tensor(t, path) for t in graph.initializer}
-        self.input_names = tuple(i.name for i in graph.input if i.name not in constants)
-        (self.output_name,) = (output.name for output in graph.output)
-        self._stored = sum(constant.numel() for constant in constants.values())
-        nodes = zip(_names(graph.node), graph.node, strict=True)
-        self._steps = Steps(
-            self._steps_of(nodes, opset, constants, path), [self.output_name],
-            kind="ONNX node", stored=self._stored,
-        )  # fmt: skip
-        if self.output_name in constants:
-            raise ModelError(f"ONNX file {path}: its output depends on no input")
-
-    def _steps_of(
-        self,
-        nodes: Iterable[tuple[str, NodeProto]],
-        opset: int,
-        constants: dict[str, Tensor],
-        path: Path,
-    ) -> list[Step]:
-        shapes, given = set[str](), {*self.input_names}
-        steps = []
-        largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * self._stored)
-        limit = SizeLimit(largest, in_all=_CONSTANTS * largest, work=_WORK)
-        for name, proto in nodes:
-            attributes = {a.name: _attribute(a, path) for a in proto.attribute}
-            used = sum(bool(output) for output in proto.output)
-            node = Node(
-                name=name, op=proto.op_type, opset=opset, outputs=used, attributes=attributes
-            )
-            inputs: list[Tensor | str] = [constants.get(n, n) for n in proto.input]
-            module = OnnxNode(node, [None if isinstance(n, str) and not n else n for n in inputs])
-            handed_in = tuple(n for n in inputs if isinstance(n, str) and n)
-            if not given.issuperset(handed_in):
-                raise ModelError(
-                    f"ONNX file {path}: node {name!r} reads a value that nothing before it gives"
-                )
-            given.update(proto.output)
-            if not handed_in:
-                constants.update(_fold(module, proto.output, limit, path))
-                continue
-            on_shapes = node.op in _TO_SHAPES or all(n in shapes for n in handed_in)
-            if on_shapes:
-                shapes.update(filter(None, proto.output))
+    _check_operators(model.graph.node, path)
+    graph, opset = FileGraph(), opset_of(model)
+    constants = {tensor.name: _tensor(tensor, path) for tensor in model.graph.initializer}
+    stored = sum(constant.numel() for constant in constants.values())
+    largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * stored)
+    limit = SizeLimit(largest, in_all=_CONSTANTS * largest, work=_WORK)
+    for value in model.graph.input:
+        if value.name not in constants:
+            graph.add_input(value.name)
+    shapes = set[str]()
+    for name, proto in zip(_names(model.graph.node), model.graph.node, strict=True):
+        # The operator and its inputs, of which one may be left out.
+        attributes = {a.name: _attribute(a, path) for a in proto.attribute}
+        used = sum(bool(output) for output in proto.output)
+        node = Node(op=proto.op_type, opset=opset, outputs=used, attributes=attributes)
+        title = f"ONNX file {path}: node {name!r}: {node.op}"
+        operation = Operation(title, functools.partial(_compute, node))
+        handed_in = [n for n in proto.input if n and n not in constants]
+        if not graph.values.keys() >= {*handed_in}:
+            raise ModelError(f"{title} reads a value that nothing before it gives")
+        # What only constants go into is computed now.
+        if not handed_in:
+            with torch.no_grad(), limit, wrap_user_errors(title):
+                result = operation(*map(constants.get, proto.input))
+            results = result if isinstance(result, tuple) else (result,)
+            constants.update(zip(proto.output, results, strict=False))
+            continue
+        on_shapes = node.op in _TO_SHAPES or shapes.issuperset(handed_in)
+        shapes.update(filter(None, proto.output if on_shapes else ()))
+        # Constants become weights, but for those that stay on the CPU.
+        inputs: list[Argument] = []
+        for index, n in enumerate(proto.input):
+            if n in constants and (on_shapes or index in HOST_INPUTS[node.op]):
+                inputs.append(constants[n])
+            elif n in constants and n not in graph.values:
+                inputs.append(graph.add_tensor(n, constants[n]))
             else:
-                # Not add_module, which refuses the dots that node names have.
-                self._modules[name] = module
-            steps.append(
-                Step(
-                    run=functools.partial(self._run, module, on_shapes),
-                    arguments=[Value(n) for n in handed_in],
-                    outputs=proto.output,
-                    name=name,
-                )
-            )
-        return steps
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Returns the output."""
-        values: dict[str, object] = dict(zip(self.input_names, inputs, strict=True))
-        self._device = inputs[0].device
-        self._steps.run(values, tuple(one.shape for one in inputs))
-        output = values[self.output_name]
-        assert isinstance(output, Tensor)
-        return output
-
-    def _run(self, module: OnnxNode, on_shapes: bool, *inputs: Tensor) -> Sequence[Tensor]:
-        """The node's outputs. Arithmetic on shapes stays on the CPU."""
-        if not on_shapes:
-            inputs = tuple(
-                value.to("cpu" if on_host else self._device)
-                for value, on_host in zip(inputs, module.handed_in_on_host, strict=True)
-            )
-        result = module(*inputs)
-        return result if isinstance(result, tuple) else (result,)
+                inputs.append(graph.values.get(n))
+        outputs = proto.output if node.op == "Split" else proto.output[0]
+        graph.add_operation(name, operation, inputs, {}, outputs, is_layer=not on_shapes)
+    output = model.graph.output[0].name
+    if output in constants:
+        raise ModelError(f"ONNX file {path}: its output depends on no input")
+    graph.set_outputs([output])
+    return graph
 
 
-def _fold(
-    module: OnnxNode, outputs: Sequence[str], limit: SizeLimit, path: Path
-) -> dict[str, Tensor]:
-    """The outputs of a node that has only constant inputs."""
-    try:
-        with torch.no_grad(), limit:
-            result = module()
-    except ModelError as error:
-        raise ModelError(f"ONNX file {path}: {error}") from None
-    except (RuntimeError, ValueError, TypeError, IndexError, OverflowError) as error:
-        raise ModelError(
-            f"ONNX file {path}: node {module.node.name!r} ({module.node.op}) cannot be computed:"
-            f" {describe(error)[:160]}"
-        ) from None
-    return dict(zip(outputs, result if isinstance(result, tuple) else (result,), strict=False))
+def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
+    """The node's outputs. Arithmetic on shapes stays on the CPU."""
+    if node.outputs > 1 and node.op != "Split":
+        raise Unsupported("more than its first output")
+    for name, only in ONLY.items():
+        if node.get(name, only) != only:
+            raise Unsupported(f"{name} {node.get(name)!r}")
+    devices = [value.device for value in inputs if value is not None and not value.is_cpu]
+    moved: list[Any] = []
+    for index, value in enumerate(inputs):
+        device = "cpu" if index in HOST_INPUTS[node.op] or not devices else devices[0]
+        moved.append(value if value is None else value.to(device))
+    return OPERATORS[node.op](node, moved)
+
+
+def opset_of(model: ModelProto) -> int:
+    """Returns the version of the standard's operators."""
+    return max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
 
 
 def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
@@ -210,28 +126,15 @@ def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
         )
 
 
-def _check_covered(node: Node) -> None:
-    """Unsupported for an attribute or an output that the functions of operators do not know."""
-    if node.outputs > 1 and node.op != "Split":
-        raise Unsupported("more than its first output")
-    for name, only in ONLY.items():
-        if node.get(name, only) != only:
-            raise Unsupported(f"{name} {node.get(name)!r}")
-
-
 def _names(nodes: Iterable[NodeProto]) -> list[str]:
-    """Unique names of the nodes for --layer; a node without a name has operator and output."""
+    """Names of the nodes for --layer; a node without a name has operator and output."""
     names: list[str] = []
-    taken: Counter[str] = Counter()
     for proto in nodes:
         first = next((output for output in proto.output if output), "")
         name = proto.name or f"{proto.op_type}_{first}"
         if name.replace(".", "").isdigit():
             name = f"{proto.op_type}_{name}"
-        name = name.translate(str.maketrans("#[]", "___"))
-        name = f"{name}_" if name in _MODULE_ATTRIBUTES else name
-        taken[name] += 1
-        names.append(name if taken[name] == 1 else f"{name}_{taken[name]}")
+        names.append(name.translate(str.maketrans("#[]", "___")))
     return names
 
 

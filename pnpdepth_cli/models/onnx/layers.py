@@ -1,8 +1,4 @@
-"""Convolutions and pooling with every padding of the standard, normalisations, resizing.
-
-Resize is a weighted sum: along one axis each output element is Σ_k weight[k]·x[index[k]], one
-element for nearest, two for linear, four for cubic.
-"""
+"""Convolutions and pooling with every padding of the standard, normalisations, resizing."""
 
 from __future__ import annotations
 
@@ -11,15 +7,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.onnx import Inputs, Node, operator, optional, register, whole_numbers
-from pnpdepth_cli.models.steps import Unsupported
+from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.models.file_graph import Unsupported
+from pnpdepth_cli.models.onnx.operators import (
+    Inputs,
+    Node,
+    operator,
+    optional,
+    register,
+    whole_numbers,
+)
 
 _CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
 _TRANSPOSED = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
+_RESIZE = ("mode", "coordinate_transformation_mode", "nearest_mode", "cubic_coeff_a")
 _MAX_POOL = {1: F.max_pool1d, 2: F.max_pool2d, 3: F.max_pool3d}
 
 Pads = list[tuple[int, int]]
@@ -41,11 +47,14 @@ def _pads(
         return list(zip(flat[:rank], flat[rank:], strict=True))
     if auto == "VALID":
         return [(0, 0)] * rank
-    pads = []
-    for n, k, s, d in zip(size, kernel, stride, dilation, strict=True):
-        total = max(0, (math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n)
-        pads.append((total // 2, total - total // 2))
-    return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
+    sizes = zip(size, kernel, stride, dilation, strict=True)
+    return _halves(node, [(math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n for n, k, s, d in sizes])
+
+
+def _halves(node: Node, totals: Sequence[int]) -> Pads:
+    """(begin, end) of so many pixels per axis; an odd one lies at the end for SAME_UPPER only."""
+    pairs = [(max(0, n) // 2, max(0, n) - max(0, n) // 2) for n in totals]
+    return pairs if node.get("auto_pad") == "SAME_UPPER" else [(end, begin) for begin, end in pairs]
 
 
 @operator("Conv")
@@ -68,25 +77,18 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
-    extra = node.get("output_padding", [0] * rank)
-    y: Tensor = _TRANSPOSED[rank](x, weight, None, stride, 0, 0, node.get("group", 1), dilation)
-    full = [n + e for n, e in zip(y.shape[2:], extra, strict=True)]
-    crops = _pads_of_transposed(node, x, stride, full)
-    sides = [(-begin, e - end) for (begin, end), e in zip(crops, extra, strict=True)]
-    if any(n for pair in sides for n in pair):
-        y = F.pad(y, _sides(sides))
-    return y if bias is None else y + bias.reshape(-1, *[1] * rank)
-
-
-def _pads_of_transposed(node: Node, x: Tensor, stride: Sequence[int], full: Sequence[int]) -> Pads:
-    auto, wanted = node.get("auto_pad", "NOTSET"), node.get("output_shape")
-    if wanted is None:
-        if not auto.startswith("SAME"):
-            return _pads(node, x.shape[2:], full, stride, stride)
+    extra, group = node.get("output_padding", [0] * rank), node.get("group", 1)
+    y: Tensor = _TRANSPOSED[rank](x, weight, bias, stride, 0, extra, group, dilation)
+    # The result without its pads, which may be stated by its shape.
+    sizes, wanted = y.shape[2:], node.get("output_shape")
+    if wanted is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
         wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
-    totals = [size - out for size, out in zip(full, wanted[-len(full) :], strict=True)]
-    pads = [(max(0, total) // 2, total - max(0, total) // 2) for total in totals]
-    return pads if auto == "SAME_UPPER" else [(end, begin) for begin, end in pads]
+    if wanted is None:
+        pads = _pads(node, x.shape[2:], sizes, stride, dilation)
+    else:
+        pads = _halves(node, [n - w for n, w in zip(sizes, wanted[-rank:], strict=True)])
+    kept = [slice(begin, n - end) for n, (begin, end) in zip(sizes, pads, strict=True)]
+    return y[(slice(None), slice(None), *kept)]
 
 
 def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
@@ -181,7 +183,7 @@ def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Te
         return fast
     for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
         if factor != 1:
-            x = _along(x, axis, *_taps(node, x.shape[axis], size, factor))
+            x = _along(x, axis, _weights(node, x.shape[axis], size, factor))
     return x
 
 
@@ -203,71 +205,41 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
     return None
 
 
-def _along(x: Tensor, axis: int, index: Tensor, weight: Tensor) -> Tensor:
-    """Σ_k weight (n, k) · x taken at index (n, k) along the axis."""
+def _along(x: Tensor, axis: int, weights: Tensor) -> Tensor:
+    """Σ_k weights[n, k] · x[k] along the axis, of the elements whose weight is not 0."""
     shape = [1] * x.ndim
     shape[axis] = -1
-    columns = zip(index.to(x.device).unbind(1), weight.to(x).unbind(1), strict=True)
+    most = int(weights.ne(0).sum(1).max())
+    index = weights.abs().topk(most, dim=1).indices
+    columns = zip(index.to(x.device).T, weights.gather(1, index).to(x).T, strict=True)
     return torch.stack([x.index_select(axis, i) * w.reshape(shape) for i, w in columns]).sum(
         0, dtype=x.dtype
     )
 
 
-def _taps(node: Node, size: int, out: int, factor: float) -> tuple[Tensor, Tensor]:
-    """Indices and weights (out, k) of the input's elements that make up each of the output's.
+def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
+    """The weights (out, size) of an axis: what onnxruntime makes of the identity matrix."""
+    import onnxruntime
+    from onnx import TensorProto, helper, numpy_helper
 
-    Args:
-        node: The Resize or Upsample.
-        size: Number of the input's elements along the axis.
-        out: Number of the output's.
-        factor: Scale of the axis: about out / size.
-    """
-    mode = node.get("mode", "nearest")
-    coordinates = node.get("coordinate_transformation_mode", "half_pixel")
-    position = _coordinates(coordinates, size, out, factor)
-    if mode == "nearest":
-        index = _ROUNDING[node.get("nearest_mode", "round_prefer_floor")](position).long()
-        return index.clamp(0, size - 1)[:, None], torch.ones(out, 1)
-    if mode not in ("linear", "cubic"):
-        raise Unsupported(f"mode {mode}")
-    reach = 1 if mode == "linear" else 2
-    index = position.floor().long()[:, None] + torch.arange(1 - reach, reach + 1)
-    distance = (index - position[:, None]).abs()
-    a = node.get("cubic_coeff_a", -0.75)
-    weight = (1 - distance).clamp_min(0) if mode == "linear" else _cubic(distance, a)
-    return index.clamp(0, size - 1), weight
-
-
-def _coordinates(mode: str, size: int, out: int, factor: float) -> Tensor:
-    """The input coordinates of the output's elements; in float32 as runtimes compute them.
-
-    A factor that stands for a ratio of sizes is taken as that, lest a half becomes less than one.
-    """
-    o = torch.arange(out, dtype=torch.float32)
-    scale = torch.tensor(factor, dtype=torch.float32)
-    if mode == "asymmetric":
-        return o * size / out if factor == out / size else o / scale
-    if mode == "align_corners":
-        return o * (size - 1) / (out - 1) if out > 1 else torch.zeros(out)
-    if mode == "tf_half_pixel_for_nn":
-        return (o + 0.5) / scale
-    if mode == "pytorch_half_pixel" and out == 1:
-        return torch.zeros(out)
-    if mode in ("half_pixel", "pytorch_half_pixel"):
-        return (o + 0.5) / scale - 0.5
-    raise Unsupported(f"coordinate_transformation_mode {mode}")
-
-
-_ROUNDING: dict[str, Callable[[Tensor], Tensor]] = {
-    "round_prefer_floor": lambda p: (p - 0.5).ceil(),
-    "round_prefer_ceil": lambda p: (p + 0.5).floor(),
-    "floor": torch.floor,
-    "ceil": torch.ceil,
-}
-
-
-def _cubic(t: Tensor, a: float) -> Tensor:
-    """The cubic convolution kernel at distances t (Keys 1981)."""
-    near = ((a + 2) * t - (a + 3)) * t * t + 1
-    far = ((a * t - 5 * a) * t + 8 * a) * t - 4 * a
-    return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
+    if node.get("coordinate_transformation_mode") == "tf_crop_and_resize":
+        raise Unsupported("a region of interest")
+    torch.empty(out, size, device="meta")  # which a `SizeLimit` refuses if it is too large
+    attributes = {name: node.get(name) for name in _RESIZE if name in node.attributes}
+    stated, by = ["none", "by"], np.array([out, size])
+    if factor != out / size:
+        stated, by = ["by"], np.array([factor, 1], np.float32)
+    none = np.zeros(0, np.float32)
+    graph = helper.make_graph(
+        [helper.make_node("Resize", ["x", "none", *stated], ["y"], **attributes)],
+        "resize",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, [size, size])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, [out, size])],
+        [numpy_helper.from_array(by, "by"), numpy_helper.from_array(none, "none")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 12)], ir_version=8)
+    with wrap_user_errors(f"{node.op} of onnxruntime"):
+        session = onnxruntime.InferenceSession(
+            model.SerializeToString(), providers=["CPUExecutionProvider"]
+        )
+        return torch.from_numpy(session.run(None, {"x": np.eye(size, dtype=np.float32)})[0])

@@ -19,8 +19,8 @@ import onnx.backend.test.case.node as standard  # noqa: E402
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 from pnpdepth_cli.errors import ModelError  # noqa: E402
-from pnpdepth_cli.models.onnx import OPERATORS  # noqa: E402
-from pnpdepth_cli.models.onnx.graph import OnnxGraph  # noqa: E402
+from pnpdepth_cli.models.onnx.graph import onnx_graph  # noqa: E402
+from pnpdepth_cli.models.onnx.operators import OPERATORS  # noqa: E402
 
 F32, I64 = np.float32, np.int64
 KINDS = {np.dtype(kind) for kind in ("f4", "f8", "i1", "i4", "i8", "u1", "?")}
@@ -60,7 +60,7 @@ def outputs_of(model: onnx.ModelProto, x: Any) -> list[np.ndarray]:
     results = []
     for output in outputs:
         model.graph.output[0].CopyFrom(output)
-        results.append(OnnxGraph(model, Path("x.onnx"))(torch.from_numpy(x.copy())).numpy())
+        results.append(onnx_graph(model, Path("x.onnx"))(torch.from_numpy(x.copy())).numpy())
     return results
 
 

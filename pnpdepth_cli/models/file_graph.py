@@ -1,0 +1,213 @@
+"""A graph that was read from a file, as a torch module that is run without endless memory.
+
+ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes of a file into
+gigabytes; `SizeLimit` knows the size of every result before it is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, fx, nn
+from torch.fx.node import Argument
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils.flop_counter import flop_registry
+
+from pnpdepth_cli.errors import ModelError
+
+_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
+"""One activation may have so many elements (1 GB), or so many times those of input and weights."""
+
+_NUMBERS = ("item", "_local_scalar_dense", "equal")
+"""Operators of torch whose result is a Python number."""
+
+
+class Unsupported(Exception):
+    """An operator is used in a way that is not covered; the message says which."""
+
+
+class Operation(nn.Module):
+    """One operation of a graph: a function, and what it is called in messages."""
+
+    def __init__(self, title: str, function: Callable[..., object]) -> None:
+        super().__init__()
+        self.title, self._function = title, function
+
+    def forward(self, *args: object, **kwargs: object) -> object:
+        """Returns the function's result."""
+        try:
+            return self._function(*args, **kwargs)
+        except Unsupported as error:
+            raise ModelError(f"{self.title} with {error} is not covered") from None
+
+
+class FileGraph(nn.Module):
+    """A graph as a module: called with its inputs in order, it returns its outputs.
+
+    Its operations are submodules in the file's order, so that the network can be cut at them. The
+    first run for inputs of a size gives no result far larger than inputs and weights.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values: dict[str, fx.Node] = {}
+        """What the graph computes so far, by the file's names; empty once it has its outputs."""
+        self._graph = fx.Graph()
+        self._allowed: set[tuple[torch.Size, ...]] = set()
+
+    @property
+    def inputs(self) -> list[str]:
+        """The names of the inputs."""
+        return [str(node.target) for node in self._graph.nodes if node.op == "placeholder"]
+
+    def add_input(self, name: str) -> None:
+        """Adds an input behind the others."""
+        self.values[name] = self._graph.create_node("placeholder", name)
+
+    def add_tensor(self, name: str, tensor: Tensor) -> fx.Node:
+        """Returns the value of a weight or another constant, which is added without gradient."""
+        attribute = f"tensor{len(self.values)}"
+        if tensor.is_floating_point():
+            self.register_parameter(attribute, nn.Parameter(tensor, requires_grad=False))
+        else:
+            self.register_buffer(attribute, tensor)
+        self.values[name] = self._graph.create_node("get_attr", attribute)
+        return self.values[name]
+
+    def add_operation(
+        self,
+        name: str,
+        operation: Operation,
+        inputs: Sequence[Argument],
+        keywords: Mapping[str, Argument],
+        outputs: str | Sequence[str | None],
+        *,
+        is_layer: bool = True,
+    ) -> None:
+        """Adds a call whose result, or the parts of it, are further values.
+
+        Args:
+            name: Name of the submodule; one that is taken gets an underscore.
+            operation: What is called.
+            inputs: Positional arguments, with values of the graph in them.
+            keywords: Keyword arguments.
+            outputs: Name of the result, or names of its parts, empty for one that nothing reads.
+            is_layer: Whether the operation is a submodule.
+        """
+        while hasattr(self, name) or name in self._modules:  # as of a node named `to`
+            name += "_"
+        kind: str = "call_module" if is_layer else "call_function"
+        if is_layer:
+            self._modules[name] = operation  # not add_module, which refuses dots
+        target = name if is_layer else operation
+        result = self._graph.create_node(kind, target, tuple(inputs), dict(keywords), name)
+        if isinstance(outputs, str):
+            self.values[outputs] = result
+            return
+        for index, output in enumerate(outputs):
+            if output:
+                self.values[output] = self._graph.call_function(operator.getitem, (result, index))
+
+    def set_outputs(self, names: Sequence[str]) -> None:
+        """Ends the graph: these values are returned, a single one alone."""
+        values = tuple(self.values[name] for name in names)
+        self._graph.output(values if len(values) > 1 else values[0])
+        self.values.clear()
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Returns the output, or a tuple of several.
+
+        Raises:
+            ModelError: A result is too large, or all at a time are.
+        """
+        sizes = tuple(each.shape for each in inputs)
+        if sizes in self._allowed:
+            return _Runner(self, math.inf).run(*inputs)
+        given = _elements([*inputs, *self.parameters(), *self.buffers()])
+        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
+        with SizeLimit(largest):
+            result = _Runner(self, 2 * largest).run(*inputs)
+        self._allowed.add(sizes)
+        return result
+
+
+class _Runner(fx.Interpreter):
+    """Runs a graph with so many elements at a time; a value is dropped behind its last use."""
+
+    def __init__(self, module: FileGraph, most: float) -> None:
+        super().__init__(module, graph=module._graph)
+        self.extra_traceback, self._most = False, most
+
+    def call_module(self, target: Any, args: Any, kwargs: Any) -> Any:
+        """The result of a submodule, whose name may have dots in it."""
+        return self.submodules[target](*args, **kwargs)
+
+    def run_node(self, node: fx.Node) -> Any:
+        """The node's result, without what debuggers of graphs would note of it."""
+        args, kwargs = self.fetch_args_kwargs_from_env(node)
+        result = getattr(self, node.op)(node.target, args, kwargs)
+        if self._most < math.inf and _elements([*self.env.values(), result]) > self._most:
+            raise ModelError(
+                f"operation {node.name!r}: more than {self._most:,} elements at a time, far more"
+                " than image and weights have"
+            )
+        return result
+
+
+def _elements(values: object) -> int:
+    return sum(map(torch.numel, _tensors_in(values)))
+
+
+class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Inside, an operation with a result of too many elements raises Unsupported without being run.
+
+    Args:
+        largest: Elements of one result.
+        in_all: Elements of all results together, or no limit.
+        work: Elements read and products summed by all operations together, or no limit.
+    """
+
+    def __init__(self, largest: int, in_all: float = math.inf, work: float = math.inf) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._largest, self._left, self._work = largest, in_all, work
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Runs the operation if its result fits; see TorchDispatchMode."""
+        kwargs = kwargs or {}
+        expected = _shaped_result(func, args, kwargs)
+        elements = [each.numel() for each in _tensors_in(expected)]
+        in_place_or_view = any(each.alias_info is not None for each in func._schema.returns)
+        self._left -= 0 if in_place_or_view else sum(elements)
+        if max(elements, default=0) > self._largest or self._left < 0:
+            raise Unsupported(f"a result of {sum(elements):.3g} elements")
+        self._work -= sum(map(torch.numel, _tensors_in((args, kwargs))))
+        if elements and func.overloadpacket in flop_registry:
+            self._work -= flop_registry[func.overloadpacket](*args, **kwargs, out_val=expected) / 2
+        if self._work < 0:
+            raise Unsupported("far more arithmetic on constants than networks have")
+        return func(*args, **kwargs)
+
+
+def _shaped_result(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Tensors without memory that are at least as large as the operation's results."""
+    without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
+    args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
+    try:
+        return func(*args, **kwargs | without)
+    except NotImplementedError:
+        if func._opname not in _NUMBERS:
+            raise Unsupported("a result of a size that only its values tell") from None
+        return None
+    except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
+        return None
+
+
+def _tensors_in(value: object) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(value) if isinstance(leaf, Tensor)]
