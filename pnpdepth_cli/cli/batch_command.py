@@ -21,9 +21,8 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, progress_bar, say
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
-    HoldOut,
     NetworkChoice,
-    OutputOptions,
+    RefineRequest,
     parse_sample,
 )
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -31,7 +30,7 @@ from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.summary import BatchSummary
+    from pnpdepth_cli.commands.batch.records import BatchSummary
 
 DEFAULT = "default"
 """A value that leaves the option out."""
@@ -58,9 +57,9 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
         "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
         "Input": (ScanOptions, ReadOptions),
         "Network": (NetworkChoice,),
-        "Method": (Settings, HoldOut),
+        "Method": (Settings, "--baselines", "--uncertainty", "--holdout"),
         "Study": ("--vary",),
-        "Output": ("--output", OutputOptions, BatchRequest),
+        "Output": ("--output", RefineRequest, BatchRequest),
         "Cluster": ("--ray",),
     },
 )
@@ -151,9 +150,9 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
     from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("batch", "frame") as show:
-        progress = BatchProgress(show)
+        progress = BatchProgress(show, pressed)
         try:
-            summary = run_batch(request, progress, pressed)
+            summary = run_batch(request, progress)
         except StorageError as error:
             raise StorageError(f"{error}; run the same command to continue") from error
         except KeyboardInterrupt:

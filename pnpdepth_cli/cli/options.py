@@ -11,12 +11,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine_request import (
-    HoldOut,
-    NetworkChoice,
-    OutputOptions,
-    RefineRequest,
-)
+from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice, RefineRequest
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
@@ -86,7 +81,7 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
     Args:
         without: Names of fields of a `RefineRequest` that are left out.
     """
-    groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, HoldOut, OutputOptions)
+    groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, RefineRequest)
 
     def decorate(command: Command) -> Command:
         return models(options_of_groups(*groups, without=["model", *without])(command))
@@ -96,7 +91,7 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
 
 _DECLARED = {
     each.name: each
-    for group in (BatchRequest, OutputOptions, Settings, ReadOptions, NetworkChoice)
+    for group in (BatchRequest, RefineRequest, Settings, ReadOptions, NetworkChoice)
     for each in options_of(group)
 }
 _MODEL = _DECLARED["model"]

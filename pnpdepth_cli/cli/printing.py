@@ -26,11 +26,13 @@ from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.stages import GT
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.summary import BatchSummary
+    from pnpdepth_cli.commands.batch.records import BatchSummary
     from pnpdepth_cli.commands.sparse.make import SparseSummary
 
 _WIDE = 1000
 """Columns of what is no terminal."""
+_NAMED = 3
+"""Names of frames that are listed with a warning or note."""
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 
@@ -143,11 +145,11 @@ def print_batch(summary: BatchSummary) -> None:
         parts.append(f"{worse} worse than linear interpolation")
     say(", ".join(parts))
     # Warnings and notes of several frames, each once, weights and files.
-    for each in (*summary.warnings, *summary.frame_notes):
-        names = ", ".join([*each.first, *["…"] * (each.frames > len(each.first))])
-        count = count_of(each.frames, "frame")
-        kind = "warning" if each.is_warning else "note"
-        say(f"{kind} in {count} ({names}): {each.note.removeprefix(f'{kind}: ')}")
+    for note, names in summary.frame_notes.items():
+        first = ", ".join([*names[:_NAMED], *["…"] * (len(names) > _NAMED)])
+        kind = "warning" if note.startswith("warning") else "note"
+        count = count_of(len(names), "frame")
+        say(f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}")
     if summary.weights:
         say(f"mean weights in the result: {mean_weights_text(summary.weights)}")
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")

@@ -8,7 +8,7 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json
-from pnpdepth_cli.commands.refinement.refine_request import HoldOut, NetworkChoice, OutputOptions
+from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice, RefineRequest
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError
 from pnpdepth_cli.settings import Settings
@@ -29,8 +29,8 @@ from pnpdepth_cli.settings import Settings
             *(ScanOptions, ReadOptions),
         ),
         "Network": (NetworkChoice,),
-        "Method": (Settings, HoldOut),
-        "Output": ("--output", OutputOptions, "--json"),
+        "Method": (Settings, "--uncertainty", "--holdout"),
+        "Output": ("--output", RefineRequest, "--json"),
     },
 )
 @click.argument("image", type=options.FILE, required=False)

@@ -34,10 +34,9 @@ def cloud(**values: Any) -> None:
     from pnpdepth_cli.commands.cloud import write_depth_cloud
 
     with progress_bar("cloud", "frame") as show:
-        summary = write_depth_cloud(CloudRequest(**values), show)
-    print_notes(summary.notes)
-    colours = "coloured" if summary.coloured else "without colours (no image is known)"
-    click.echo(f"wrote {summary.points:,} points, {colours}: {values['output']}")
+        what, notes = write_depth_cloud(CloudRequest(**values), show)
+    print_notes(notes)
+    click.echo(f"wrote {what}: {values['output']}")
 
 
 @click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
@@ -65,10 +64,8 @@ def export(**values: Any) -> None:
     """
     from pnpdepth_cli.cli.printing import print_notes
     from pnpdepth_cli.commands.exports import export_results
-    from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("export", "frame") as show:
-        summary = export_results(**values, show=show)
-    print_notes(summary.notes)
-    frames = count_of(summary.frames, "frame")
-    click.echo(f"wrote {frames} in {summary.unit}: {values['output']}")
+        what, notes = export_results(**values, show=show)
+    print_notes(notes)
+    click.echo(f"wrote {what}: {values['output']}")

@@ -78,9 +78,9 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
 class BatchProgress:
     """Progress of a run over frames on stderr; its counts are numbers of frames."""
 
-    def __init__(self, show: Callable[..., None]) -> None:
+    def __init__(self, show: Callable[..., None], stopped: Callable[[], bool]) -> None:
         self.done = self.to_do = self.failed = 0
-        self._show = show
+        self.stopped, self._show = stopped, show
 
     def say(self, text: str) -> None:
         """Prints a line on stderr, above the bar."""

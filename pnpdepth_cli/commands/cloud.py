@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,19 +33,10 @@ _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
 
 
-class CloudSummary(NamedTuple):
-    """What was written."""
-
-    points: int
-    coloured: bool
-    notes: list[str]
-    """Lines for a person."""
-
-
 def write_depth_cloud(
     request: CloudRequest, show: Callable[[int, int], None] = lambda done, of: None
-) -> CloudSummary:
-    """Writes the cloud, and returns what is in it.
+) -> tuple[str, list[str]]:
+    """Writes the cloud; returns what is in it in words, and notes, lines for a person.
 
     Args:
         request: Depth files, camera, poses and limits of the cloud.
@@ -70,7 +60,8 @@ def write_depth_cloud(
     parts = _parts(request, frames, poses, coloured, notes, show)
     make_folder(request.output.parent)
     points = write_cloud(request.output, _merge(request, parts, coloured))
-    return CloudSummary(points, coloured, notes)
+    colours = "coloured" if coloured else "without colours (no image is known)"
+    return f"{points:,} points, {colours}", notes
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 from pnpdepth_cli.cli.batch_command import batch
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import GROUPS, RefineRequest
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple
 from pnpdepth_cli.settings import PAPER, Settings, flag_of, options_of
@@ -30,8 +30,10 @@ def test_settings_are_the_users_then_the_networks_then_the_papers() -> None:
 
 
 def test_every_field_belongs_to_one_group_and_its_option_is_one_of_batch() -> None:
-    groups = [getattr(RefineRequest(), group.name) for group in fields(RefineRequest)]
-    names = [each.name for group in groups for each in fields(group)]
+    request = RefineRequest()
+    groups = [request, *(getattr(request, name) for name in GROUPS)]
+    names = [each.name for group in groups[1:] for each in fields(group)]
+    names += [each.name for each in fields(request) if each.name not in GROUPS]
     assert len(names) == len(set(names))
     spelled = {name for option in batch.params for name in option.opts}
     for group in groups:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.records import BatchSummary
 from pnpdepth_cli.commands.batch.run_batch import run_batch
-from pnpdepth_cli.commands.batch.summary import BatchSummary
 from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
@@ -24,7 +25,8 @@ NAMES = ("a", "b", "c", "d")
 class RecordingListener:
     """Keeps the messages and records of a batch."""
 
-    def __init__(self) -> None:
+    def __init__(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        self.stopped = stopped
         self.messages: list[str] = []
         self.records: list[FrameRecord] = []
         self.to_do = 0
@@ -80,7 +82,6 @@ def batch(
     root: Path,
     listener: RecordingListener | None = None,
     *,
-    stopped: Any = lambda: False,
     refine: dict[str, Any] | None = None,
     **changes: Any,
 ) -> BatchSummary:
@@ -90,7 +91,7 @@ def batch(
         "output": root / "out",
         "refine": refinement(root, **(refine or {})),
     }
-    return run_batch(BatchRequest(**fields | changes), listener or RecordingListener(), stopped)
+    return run_batch(BatchRequest(**fields | changes), listener or RecordingListener())
 
 
 def done(root: Path, listener: RecordingListener | None = None, **changes: Any) -> list[str]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.cloud import CloudSummary, write_depth_cloud
+from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
@@ -35,12 +35,15 @@ def frame(
     return path
 
 
-def written(path: Path, output: Path, **values: Any) -> CloudSummary:
+def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
+    """The number of points in the cloud, and all that is said."""
     calib = output.parent / "k.txt"
     calib.write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
-    return write_depth_cloud(
-        CloudRequest(**({"depth": path, "output": output, "calib": calib} | values))
-    )
+    request = CloudRequest(**({"depth": path, "output": output, "calib": calib} | values))
+    what, notes = write_depth_cloud(request)
+    count = len(read_scan(output).points)
+    assert what.startswith(f"{count:,} points")
+    return count, " ".join([what, *notes])
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -48,9 +51,9 @@ def points_of(path: Path) -> np.ndarray:
 
 
 def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:
-    record = written(frame(tmp_path, "a"), tmp_path / "a.ply")
-    assert record.coloured
-    assert record.points == HEIGHT * WIDTH
+    count, said = written(frame(tmp_path, "a"), tmp_path / "a.ply")
+    assert count == HEIGHT * WIDTH
+    assert "without colours" not in said
     corner = [-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2]  # by the calibration of `written`
     assert points_of(tmp_path / "a.ply")[0] == pytest.approx(corner, rel=1e-5)
     row = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1][:27]
@@ -73,9 +76,7 @@ POSE = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
 
 def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
     path = with_camera(frame(tmp_path, "a"), POSE)
-    assert written(path, tmp_path / "a.ply", calib=None).notes == [
-        "camera: made up (from the record)"
-    ]
+    assert "made up" in written(path, tmp_path / "a.ply", calib=None)[1]
     last = [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(last)
 
@@ -103,12 +104,12 @@ def test_pixels_beyond_the_limit_and_of_a_far_plane_are_left_out(tmp_path: Path)
     depth = np.linspace(2, 8, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
     depth[:5] = 1e10
     write_depth(tmp_path / "d.exr", depth)
-    record = written(tmp_path / "d.exr", tmp_path / "d.ply")
-    assert record.points == (HEIGHT - 5) * WIDTH
-    assert any("far plane" in note for note in record.notes)
-    nearer = written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)
-    assert nearer.points == int((depth <= 5).sum())
-    assert not nearer.coloured
+    count, said = written(tmp_path / "d.exr", tmp_path / "d.ply")
+    assert count == (HEIGHT - 5) * WIDTH
+    assert "far plane" in said
+    count, said = written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)
+    assert count == int((depth <= 5).sum())
+    assert "without colours" in said
 
 
 def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
@@ -120,9 +121,8 @@ def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> N
     sigma = np.full((HEIGHT, WIDTH), 0.05, np.float32)
     sigma[:, :8] = 0.5
     write_depth(tmp_path / f"a_sigma{path.suffix}", sigma)
-    assert written(path, tmp_path / "a.ply").points == (HEIGHT - 4) * WIDTH
-    record = written(path, tmp_path / "b.ply", max_sigma=0.1)
-    assert record.points == (HEIGHT - 4) * (WIDTH - 8)
+    assert written(path, tmp_path / "a.ply")[0] == (HEIGHT - 4) * WIDTH
+    assert written(path, tmp_path / "b.ply", max_sigma=0.1)[0] == (HEIGHT - 4) * (WIDTH - 8)
 
 
 def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_path: Path) -> None:
@@ -130,11 +130,11 @@ def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_
         frame(tmp_path / "out", name)
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 100 0 1 0 0 0 0 1 0\n")
     poses = {"poses": tmp_path / "poses.txt"}
-    assert written(tmp_path / "out", tmp_path / "w.ply", **poses).points == 2 * HEIGHT * WIDTH
+    assert written(tmp_path / "out", tmp_path / "w.ply", **poses)[0] == 2 * HEIGHT * WIDTH
     points = points_of(tmp_path / "w.ply")
     first, second = np.split(points, 2)
     assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
-    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5, **poses).points
+    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5, **poses)[0]
     assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
 
 
@@ -145,7 +145,7 @@ def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None
         frame(tmp_path / "out", name, depth)
     values = {"poses": tmp_path / "poses.txt", "overwrite": True}
     found = {
-        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values).points
+        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values)[0]
         for views in (1, 2)
     }
     assert found == {1: 3 * HEIGHT * WIDTH, 2: 2 * HEIGHT * WIDTH}
@@ -178,4 +178,4 @@ def test_a_file_that_exists_is_kept_without_overwrite(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         written(path, output)
     assert output.read_text() == "mine"
-    assert written(path, output, overwrite=True).points
+    assert written(path, output, overwrite=True)[0]

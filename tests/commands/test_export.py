@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.exports import ExportSummary, export_results
+from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
@@ -54,7 +54,7 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
     return folder
 
 
-def export(folder: Path, to: str, output: Path, **values: Any) -> ExportSummary:
+def export(folder: Path, to: str, output: Path, **values: Any) -> tuple[str, list[str]]:
     return export_results(folder, output, to=to, **values)
 
 
@@ -108,7 +108,7 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_and_no_pixel_is_infinitely_far
     valid[5] = 0  # not valid: its own depth
     for name in NAMES:
         cv2.imwrite(str(folder / f"{name}_valid.png"), valid)
-    notes = export(folder, "gaussian-splatting", root).notes
+    notes = export(folder, "gaussian-splatting", root)[1]
     assert any(f"{3 * 3 * WIDTH:,} pixels are unknown" in note for note in notes)
     parameters = json.loads((root / "sparse/0/depth_params.json").read_text())
     assert set(parameters) == set(NAMES)
@@ -126,8 +126,8 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
 ) -> None:
     scene, far = root / "scene", DEPTH.copy()
     far[0] = 20
-    record = export(results(root, far, unit_scale), "nerfstudio", scene)
-    assert record.unit == ("m" if unit_scale else "model units")
+    what, _ = export(results(root, far, unit_scale), "nerfstudio", scene)
+    assert what == f"3 frames in {'m' if unit_scale else 'model units'}"
     content = json.loads((scene / "transforms.json").read_text())
     assert content["camera_model"] == "OPENCV"
     assert len(content["frames"]) == 3
@@ -153,8 +153,8 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
 
 def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    record = export(results(root, unit_scale=0.25), "gaussian-splatting", root / "scene")
-    assert record.unit == "model units"
+    what, _ = export(results(root, unit_scale=0.25), "gaussian-splatting", root / "scene")
+    assert what == "3 frames in model units"
     own, new = (pycolmap.Reconstruction(root / path) for path in ("sparse", "scene/sparse/0"))
     assert new.num_points3D() > 500
     depths = [point.xyz[2] for point in new.points3D.values()]
@@ -164,22 +164,22 @@ def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root
         assert image.cam_from_world().matrix() == pytest.approx(pose_of[image.name], abs=1e-6)
         assert image.camera.params == pytest.approx([50, 52, 32.5, 23])
         assert (root / "scene/images" / image.name).is_file()
-    again = export(root / "out", "gaussian-splatting", root / "scene", overwrite=True)
-    assert again.files == record.files
+    export(root / "out", "gaussian-splatting", root / "scene", overwrite=True)
     shutil.copytree(root / "sparse", root / "sparse/0")  # COLMAP's own stays
-    record = export(root / "out", "gaussian-splatting", root)
-    assert not any(path.name == "cameras.txt" for path in record.files)
+    export(root / "out", "gaussian-splatting", root)
+    own, kept = (root / path / "cameras.txt" for path in ("sparse", "sparse/0"))
+    assert kept.read_bytes() == own.read_bytes()
 
 
 def test_depth_beyond_16_bits_is_unknown_for_nerfstudio_and_said_so(root: Path) -> None:
     depth = DEPTH.copy()
     depth[:2] = np.array([[65.534], [65.535]]) / 0.25  # metres, in units of the model
-    record = export(results(root, depth, unit_scale=0.25), "nerfstudio", root)
+    _, notes = export(results(root, depth, unit_scale=0.25), "nerfstudio", root)
     codes = cv2.imread(str(root / "depths/a.png"), cv2.IMREAD_UNCHANGED)
     assert (codes[0] == 65534).all()
     assert not codes[1].any()
     assert codes[2:].all()
-    assert f" {3 * WIDTH} pixels beyond 65.53 m" in record.notes[0]
+    assert f" {3 * WIDTH} pixels beyond 65.53 m" in notes[0]
 
 
 def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     names = ("k1", "k2", "p1", "p2", "k3")
     assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
     for to in ("colmap", "gaussian-splatting"):
-        notes = "".join(export(folder, to, tmp_path / to).notes)
+        notes = "".join(export(folder, to, tmp_path / to)[1])
         assert " 3 of 3 images have lens distortion" in notes
         assert ("sparse/0 has no model" in notes) == (to == "gaussian-splatting")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
@@ -33,8 +33,7 @@ def with_adapted_weights(
     records: Records,
     sequence: str,
     frames: Sequence[FrameFiles],
-    say: Callable[[str], None],
-    stopped: Callable[[], bool],
+    listener: Listener,
 ) -> BatchRequest:
     """Returns the request for the frames of a sequence, with adapted weights where they help.
 
@@ -45,8 +44,7 @@ def with_adapted_weights(
         records: The results of the batch.
         sequence: Name of the sequence.
         frames: Frames of the sequence.
-        say: Receives what was decided.
-        stopped: True ends the adaptation by KeyboardInterrupt.
+        listener: Receives what was decided; if it stops the batch, KeyboardInterrupt is raised.
 
     Raises:
         UsageError: The network takes no points.
@@ -63,24 +61,23 @@ def with_adapted_weights(
         digest = _digest(records.settings, lessons)
         record = read_json(file) if file.exists() else {}
         if record.get("digest") != digest or not (record.get("why") or weights.exists()):
-            why = _learn(lessons, weights, say, stopped)
+            why = _learn(lessons, weights, listener)
             record = {"digest": digest, "why": why}
             make_folder(folder)
             write_json(file, record)
     except (InputError, DivergedError) as error:
         record = {"why": str(error)}
     if record["why"]:
-        say(f"adapt: {named}the network's own weights are used: {record['why']}")
+        listener.say(f"adapt: {named}the network's own weights are used: {record['why']}")
         return request
-    say(f"adapt: {named}{len(frames):,} frames are refined with {weights}")
+    listener.say(f"adapt: {named}{len(frames):,} frames are refined with {weights}")
     return replace(request, refine=request.refine.with_fields(checkpoint=weights))
 
 
 def _learn(
     lessons: Sequence[RefineRequest],
     path: Path,
-    say: Callable[[str], None],
-    stopped: Callable[[], bool],
+    listener: Listener,
 ) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
     from safetensors.torch import save_file  # these import torch
@@ -91,7 +88,7 @@ def _learn(
     from pnpdepth_cli.models.network import load_network
 
     def check() -> None:
-        if stopped():
+        if listener.stopped():
             raise KeyboardInterrupt
 
     def read() -> Iterator[tuple[str, Frame]]:
@@ -116,7 +113,7 @@ def _learn(
         ) from error
     if not learnt.is_better:
         return str(learnt)
-    say(f"adapt: {learnt}")
+    listener.say(f"adapt: {learnt}")
     # All its tensors are written, those that learnt among them.
     with weights_in_place(network, learnt.weights):
         state = network.module.state_dict()

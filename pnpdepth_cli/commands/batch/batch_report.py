@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.summary import BatchSummary
+from pnpdepth_cli.commands.batch.records import BatchSummary
 from pnpdepth_cli.commands.error_tables import (
     bases_of,
     mean_weights_text,
@@ -63,7 +63,7 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
             f"{folder} holds the results; name a folder of its own for the report, such as"
             f" {request.output / 'report'}"
         )
-    overwrite = request.refine.outputs.overwrite
+    overwrite = request.refine.overwrite
     check_report_folder(folder, made_of=_source(request, folder), overwrite=overwrite)
 
 

@@ -1,4 +1,4 @@
-"""What the user asks of a batch. Imports neither numpy nor torch."""
+"""What the user asks of a batch, and who hears of it. Imports neither numpy nor torch."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
@@ -14,6 +15,9 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.dataset.frame_record import FrameRecord
 
 LOCAL = "local"
 """The address of a Ray cluster of this machine's devices, which ends with the command."""
@@ -36,6 +40,22 @@ def parse_address(text: str) -> str:
         f"{text!r} is no address of a Ray cluster; give --ray=auto, --ray=HOST:PORT, or --ray as"
         " the last option for this machine"
     )
+
+
+class Listener(Protocol):
+    """Receives the progress of a batch, and may stop it."""
+
+    def say(self, text: str) -> None:
+        """Receives a note or a warning, one line."""
+
+    def begin(self, to_do: int) -> None:
+        """Called with the number of frames to do."""
+
+    def frame(self, record: FrameRecord) -> None:
+        """Called with the record of each frame that is done or has failed."""
+
+    def stopped(self) -> bool:
+        """Asked before each frame; True ends the batch."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.output_files import outputs_in
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.frame_files import (
@@ -263,7 +262,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
     """Raises InputError for a frame whose results have no files of their own."""
-    endings = [path.name for path in outputs_in(Path(), "", refine, with_gt=True).values()]
+    endings = [path.name for path in refine.outputs_in(Path(), "", with_gt=True).values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
     # names that differ in Unicode normalisation only are one file on macOS
     names = {frame.name: unicodedata.normalize("NFC", frame.name) for frame in frames}

@@ -1,7 +1,8 @@
-"""The record beside a result is the state of a batch: how the result was made, and of which files.
+"""The records of a batch: by which its frames are done, and of which its summary is made.
 
-`NAME.json` is written last, by rename, and removed before the files of `NAME` are written again.
-Its entry `batch` holds the digest of the settings and what identifies the inputs.
+`NAME.json` beside a result says how it was made, and of which files. It is written last, by rename,
+and removed before the files of `NAME` are written again. Its entry `batch` holds the digest of the
+settings and what identifies the inputs.
 """
 
 from __future__ import annotations
@@ -9,25 +10,58 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import CSV, JSON, input_files, request_of
-from pnpdepth_cli.commands.refinement.output_files import IMAGES, Outputs, outputs_in
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
+from pnpdepth_cli.commands.batch.find_frames import (
+    CSV,
+    JSON,
+    BatchFrames,
+    input_files,
+    request_of,
+)
+from pnpdepth_cli.commands.refinement.refine_request import GROUPS, Outputs, RefineRequest
+from pnpdepth_cli.commands.statistics import find_clusters
+from pnpdepth_cli.commands.tables import Table, write_text
+from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_by_name
+from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import LOCKS, cannot_write, make_folder, remove_leftovers
-from pnpdepth_cli.io.file_bytes import Fingerprint, is_unchanged, parse_json, plain, sha256_of
+from pnpdepth_cli.io.file_bytes import (
+    Fingerprint,
+    is_unchanged,
+    parse_json,
+    plain,
+    sha256_of,
+    write_json,
+)
+from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
 from pnpdepth_cli.models.definition import file_and_part
+from pnpdepth_cli.stages import AFTER, BASES, GT
 
+_IMAGES = frozenset({"preview", "improvement"})
+"""Kinds of outputs for a person, which may be deleted."""
+_NO_SETTINGS = frozenset(
+    {
+        *("name", "group", "image", "sparse", "sparse_mask", "gt", "masks", "calib", "extrinsics"),
+        *("pose", "neighbours", "model", "more_models", "checkpoint", "output", "overwrite"),
+        "view_3d",
+    }
+)
+"""Fields that say where something lies, whose content is compared instead, or that add a file."""
+_MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
+_MAIN = tuple(measure.key for measure in MEASURES if measure.main)
+_RUN_STAGES = ("read", "refine", "write")
+_NUMBER = re.compile(r"\d[\d.,]*")
 _OWN_SUMMARY = b'{\n  "command": "batch"'
 
 
@@ -46,7 +80,7 @@ class Records:
     def outputs_of(self, frame: FrameFiles) -> Outputs:
         """Returns the files of a frame's result."""
         output, refine = self.request.output, self.request.refine
-        return outputs_in(output, frame.name, refine, with_gt=frame.gt is not None)
+        return refine.outputs_in(output, frame.name, with_gt=frame.gt is not None)
 
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
@@ -82,7 +116,7 @@ class Records:
             return "other input files"
         if not all(is_unchanged(path, known[part]) for part, path in inputs.items()):
             return "input changed"
-        there = all(path.exists() for kind, path in outputs.items() if kind not in IMAGES)
+        there = all(path.exists() for kind, path in outputs.items() if kind not in _IMAGES)
         return None if there else "result missing"
 
     def record_of(self, frame: FrameFiles) -> FrameRecord | None:
@@ -115,25 +149,30 @@ class Records:
 
     def _digest(self, request: RefineRequest) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
-        own = _settings_of(request, "files", "reading")  # by which frames of a batch differ
+        own = self.settings | _settings_of(request)
         if request.files.pose is not None:  # to a micrometre, as processors round differently
             own["pose"] = [[round(value, 6) + 0.0 for value in row] for row in request.files.pose]
-        text = json.dumps(self.settings | own, sort_keys=True)
+        text = json.dumps(own, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _settings_of(request: RefineRequest, *groups: str) -> dict[str, object]:
-    """The settings of these groups, or all, that decide a frame's result, in JSON's own types."""
-    values = request.settings(*groups)
-    values.pop("more_models", None)
-    if neighbours := values.pop("neighbours", None):
+def _settings_of(request: RefineRequest) -> dict[str, object]:
+    """The settings that decide a frame's result, in JSON's own types."""
+    groups = [vars(getattr(request, name)) for name in GROUPS]
+    own = {name: value for name, value in vars(request).items() if name not in GROUPS}
+    values = {
+        name: value
+        for group in (*groups, own)
+        for name, value in group.items()
+        if name not in _NO_SETTINGS
+    }
+    if neighbours := request.files.neighbours:
         values["neighbours"] = [(other.motion, other.apart) for other in neighbours]
-    if "device" in values:  # devices of one kind give equal results, so shards may use one each
-        values["device"] = values["device"].split(":")[0]
-    settings: dict[str, Any] = plain(values)
-    for name in ("calib", "extrinsics"):  # files are compared by their content elsewhere
-        settings.get("scan", {}).pop(name, None)
-    return settings
+    # Devices of one kind give equal results, so shards may use one each.
+    values["device"] = request.network.device.split(":")[0]
+    scan = asdict(request.reading.scan).items()
+    values["scan"] = {name: value for name, value in scan if name not in _NO_SETTINGS}
+    return dict(plain(values))
 
 
 def _code_of(request: RefineRequest) -> dict[str, object]:
@@ -184,3 +223,157 @@ def _content(path: Path) -> bytes | None:
         return path.read_bytes() if path.is_file() else None  # no pipe, which never ends
     except OSError:
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchSummary:
+    """What `summary.json` says of all frames together."""
+
+    command: str = "batch"
+    source: str
+    output: str
+    layout: str
+    fixed_by: str
+    """The options that fix the method; empty for the default one."""
+    settings: Mapping[str, object]
+    """What decides the results."""
+    counts: dict[str, int]
+    """Frames: all, done, diverged, failed, pending, with warnings, and worse than linear
+    interpolation of those that are compared with it."""
+    unit: str
+    columns: Sequence[str] | None
+    """Measures of the tables. None: all."""
+    notes: list[str]
+    errors: dict[str, dict[str, Scores]]
+    """Means over the frames that have the value, by basis and stage, with their number."""
+    weights: dict[str, dict[str, float]]
+    """Mean, least and largest weight of each expert of the default method, by name."""
+    frame_notes: dict[str, list[str]]
+    """Warnings, notes and unsure guesses, each once, with the names of the frames that have it."""
+    unmatched: list[str]
+    """Files that are in no frame."""
+    varied: dict[str, str]
+    """Options that `--vary` varies, with their values."""
+
+
+def summarise(
+    request: BatchRequest,
+    found: BatchFrames,
+    settings: Mapping[str, object],
+    records: Sequence[FrameRecord],
+) -> BatchSummary:
+    """Returns the summary of a batch, from the record of each frame that has one."""
+    # Counts of frames.
+    results = [record for record in records if record.status != "failed"]
+    statuses = Counter[str](record.status for record in records)
+    worse = [w for record in results if (w := record.worse_than_linear) is not None]
+    counts = {
+        "frames": len(found.frames),
+        **{status: statuses[status] for status in ("done", "diverged", "failed")},
+        "with_warnings": sum(bool(record.warnings) for record in results),
+        "compared": len(worse),
+        "worse": sum(worse),
+        "pending": len(found.frames) - len(records),
+    }
+    # Weights of the networks.
+    weights = defaultdict[str, list[float]](list)
+    for record in results:
+        for name, weight in record.weights.items():
+            weights[name].append(weight)
+    return BatchSummary(
+        source=str(request.source),
+        output=str(request.output),
+        layout=found.layout,
+        fixed_by=request.refine.method.fixed_by,
+        settings=settings,
+        counts=counts,
+        unit=" and ".join(sorted({record.unit for record in results})) or "m",
+        columns=request.columns,
+        notes=_notes([record for record in results if GT in record.errors]),
+        errors=_means(results),
+        weights={
+            name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
+            for name, all_ in weights.items()
+        },
+        frame_notes=_frame_notes(results),
+        unmatched=[str(each) for each in found.unmatched],
+        varied=dict(request.varied),
+    )
+
+
+def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
+    """The names of the frames by their notes, warnings first; notes differ in more than numbers."""
+    kinds = defaultdict[str, dict[str, str]](dict)
+    for record in records:
+        for note in record.notes:
+            if note.startswith(("warning", "note")) or ", unsure (" in note:
+                kinds[_NUMBER.sub("", note)].setdefault(record.name, note)
+    noted = {next(iter(of.values())): list(of) for of in kinds.values()}
+    return dict(sorted(noted.items(), key=lambda item: not item[0].startswith("warning")))
+
+
+def _means(records: Iterable[FrameRecord]) -> dict[str, dict[str, Scores]]:
+    """The mean errors over frames, by basis and stage, with their number."""
+    of_stages = defaultdict[tuple[str, str], list[Scores]](list)
+    for record in records:
+        for basis, stages in record.errors.items():
+            for stage, scores in stages.items():
+                own = {key: value for key, value in scores.items() if key in _MEASURED}
+                of_stages[basis, stage].append(own)
+    means: dict[str, dict[str, Scores]] = {}
+    for (basis, stage), frames in of_stages.items():
+        count = sum(any(value is not None for value in own.values()) for own in frames)
+        means.setdefault(basis, {})[stage] = {"frames": count, **frame_means(frames)}
+    return means
+
+
+def _notes(records: Sequence[FrameRecord]) -> list[str]:
+    """How many frames with ground truth count as independent."""
+    if len(records) < 2:
+        return []
+    by_name = groups_by_name([record.name for record in records])
+    groups = [each.group or name or each.name for each, name in zip(records, by_name, strict=True)]
+    errors = [[each.errors[GT][AFTER].get(key) for key in _MAIN] for each in records]
+    return find_clusters(groups, np.array(errors, np.float64)).notes()
+
+
+def write_summary(
+    request: BatchRequest,
+    found: BatchFrames,
+    settings: Mapping[str, object],
+    records: Sequence[FrameRecord],
+) -> BatchSummary:
+    """Writes `summary.json`, with the records as its `frames`, `summary.csv` and the report."""
+    summary = summarise(request, found, settings, records)
+    frames = [record.to_json() for record in records]
+    write_json(request.output / JSON, {**asdict(summary), "frames": frames})
+    write_text(request.output / CSV, _table(summary, records).csv())
+    if request.html is not None:
+        from pnpdepth_cli.commands.batch.batch_report import write_batch_report
+
+        write_batch_report(request, request.html, summary, records)
+    return summary
+
+
+def _table(summary: BatchSummary, records: Iterable[FrameRecord]) -> Table:
+    """A row for each record, with errors of ground truth first."""
+    shown = _MEASURED if summary.columns is None else (*summary.columns, COVERAGE.key)
+    measured = [
+        (basis, stage, key)
+        for basis in BASES
+        for stage, scores in summary.errors.get(basis, {}).items()
+        for key in shown
+        if key in scores
+    ]
+    columns = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
+    columns += [f"{'' if b == GT else f'{b}_'}{key}_{stage}" for b, stage, key in measured]
+    columns += ["warnings", *(f"seconds_{stage}" for stage in _RUN_STAGES)]
+    rows = []
+    for record in records:
+        points, errors = record.points, record.errors
+        row: list[object] = [record.name, record.status, record.message or ""]
+        row += [points and points.used, points and points.held_out, record.improved_fraction]
+        row += [errors.get(basis, {}).get(stage, {}).get(key) for basis, stage, key in measured]
+        row += ["; ".join(record.warnings), *(record.seconds.get(stage) for stage in _RUN_STAGES)]
+        rows.append(row)
+    return Table(columns=columns, rows=rows)

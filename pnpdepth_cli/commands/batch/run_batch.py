@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
-from typing import Protocol
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, sequences_of
-from pnpdepth_cli.commands.batch.records import Records, remove_all_leftovers
-from pnpdepth_cli.commands.batch.summary import BatchSummary, write_summary
+from pnpdepth_cli.commands.batch.records import (
+    BatchSummary,
+    Records,
+    remove_all_leftovers,
+    write_summary,
+)
 from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.ordered_pool import in_order
 from pnpdepth_cli.commands.tables import count_of
@@ -26,28 +29,12 @@ _READERS = 8
 """Threads that read records, whose time on network storage is waiting."""
 
 
-class Listener(Protocol):
-    """Receives the progress of a batch."""
-
-    def say(self, text: str) -> None:
-        """Receives a note or a warning, one line."""
-
-    def begin(self, to_do: int) -> None:
-        """Called with the number of frames to do."""
-
-    def frame(self, record: FrameRecord) -> None:
-        """Called with the record of each frame that is done or has failed."""
-
-
-def run_batch(
-    request: BatchRequest, listener: Listener, stopped: Callable[[], bool] = lambda: False
-) -> BatchSummary:
+def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
     """Refines every frame that is to be done; one that fails has a record that says why.
 
     Args:
         request: Frames to refine, and the method.
-        listener: Receives notes and the records of frames.
-        stopped: Asked before each frame; True ends the batch.
+        listener: Receives notes and the records of frames, and may stop the batch.
 
     Returns:
         What summary.json says of all frames.
@@ -66,24 +53,25 @@ def run_batch(
         check_batch_report(request, request.html)
     for note in _notes(request, found):
         listener.say(note)
-    if not refine.outputs.overwrite:
+    if not refine.overwrite:
         own.check_new(found.chosen)
     make_folder(request.output)
     with lock_folder(request.output, request.shard):
         if request.shard is None and (leftovers := remove_all_leftovers(request.output)):
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
         # Those that are not done are refined; the frames of a sequence may have adapted weights.
-        of_frame = _records_of_frames(own, found.frames, listener, stopped)
+        of_frame = _records_of_frames(own, found.frames, listener)
         reasons = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
         why = {frame.name: reason for frame, reason in zip(found.chosen, reasons, strict=True)}
         to_do = [frame for frame in found.chosen if why[frame.name]]
         listener.say(_plan([*why.values()]))
         if to_do:
+            from pnpdepth_cli.commands.batch.running import refine_all  # imports torch
+
             listener.begin(len(to_do))
             worked = len(to_do) < len(found.chosen)
-            with closing(
-                _refine(to_do, found.frames, of_frame, worked, listener, stopped)
-            ) as records:
+            refining = refine_all(to_do, found.frames, of_frame, worked, listener)
+            with closing(refining) as records:
                 _follow(records, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
         known = in_order(lambda f: of_frame[f.name].record_of(f), found.frames, _READERS)
@@ -92,7 +80,7 @@ def run_batch(
 
 
 def _records_of_frames(
-    own: Records, frames: Sequence[FrameFiles], listener: Listener, stopped: Callable[[], bool]
+    own: Records, frames: Sequence[FrameFiles], listener: Listener
 ) -> dict[str, Records]:
     """The records that each frame belongs to, by its name: of the batch, or of adapted weights."""
     from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
@@ -102,41 +90,10 @@ def _records_of_frames(
         return records
     for name, indices in sequences_of(frames).items():
         sequence = [frames[index] for index in indices]
-        request = with_adapted_weights(own, name, sequence, listener.say, stopped)
+        request = with_adapted_weights(own, name, sequence, listener)
         if request is not own.request:
             records |= dict.fromkeys([frame.name for frame in sequence], Records(request))
     return records
-
-
-def _refine(
-    to_do: Sequence[FrameFiles],
-    frames: Sequence[FrameFiles],
-    of_frame: Mapping[str, Records],
-    worked: bool,
-    listener: Listener,
-    stopped: Callable[[], bool],
-) -> Generator[FrameRecord, None, None]:
-    """Refines frames in this process or on Ray workers; yields the record of each."""
-    # these import torch, which a run with nothing to do does not need
-    from pnpdepth_cli.commands.batch.ray_workers import refine_on_workers
-    from pnpdepth_cli.commands.batch.running import open_method, refine_frames, spread
-
-    for number, records in enumerate(dict.fromkeys(of_frame[frame.name] for frame in to_do)):
-        if number and stopped():
-            return
-        # The frames that are refined alike. Some of all decide for every run and shard.
-        wanted = [frame for frame in to_do if of_frame[frame.name] is records]
-        alike = [frame for frame in frames if of_frame[frame.name] is records]
-        deciding = [alike[number] for number in spread(len(alike))]
-        if records.request.ray is not None:
-            yield from refine_on_workers(
-                deciding, wanted, records, worked=worked, say=listener.say, stopped=stopped
-            )
-            continue
-        with open_method(records.request, deciding) as method:
-            yield from refine_frames(
-                wanted, method, records, settings_worked=worked, stopped=stopped
-            )
 
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import EXPORTS
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.commands.tables import count_of
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_files import ImageSource
 from pnpdepth_cli.dataset.frame_record import Pose
@@ -86,8 +86,11 @@ class ExportFrame:
         rgb = image_of_size(self.image, self.size)
         parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb=rgb))
         step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
-        columns: Any = zip(*parts, strict=True)
-        cloud = PointCloud(*(np.concatenate(column)[::step] for column in columns))
+        cloud = PointCloud(
+            xyz=np.concatenate([part.xyz for part in parts])[::step],
+            normals=np.concatenate([part.normals for part in parts])[::step],
+            rgb=np.concatenate([part.rgb for part in parts if part.rgb is not None])[::step],
+        )
         return cloud.transform(self.pose)
 
 
@@ -122,16 +125,6 @@ def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
     ]
 
 
-class ExportSummary(NamedTuple):
-    """What was written."""
-
-    files: list[Path]
-    frames: int
-    unit: str
-    notes: list[str]
-    """Lines for a person."""
-
-
 def export_results(
     results: Path,
     output: Path,
@@ -139,8 +132,8 @@ def export_results(
     to: str,
     overwrite: bool = False,
     show: Callable[[int, int], None] = lambda done, of: None,
-) -> ExportSummary:
-    """Writes the files, and returns what they hold.
+) -> tuple[str, list[str]]:
+    """Writes the files; returns what they hold in words, and notes, lines for a person.
 
     Args:
         results: A folder that `refine` or `batch` wrote, or a depth file in it.
@@ -174,7 +167,7 @@ def export_results(
         notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
     of_model = export.in_model_units and frames[0].unit_scale != 1
     unit = MODEL_UNITS if of_model else frames[0].result.record.unit
-    return ExportSummary(written, len(frames), unit, notes)
+    return f"{count_of(len(frames), 'frame')} in {unit}", notes
 
 
 def _frame(result: ResultFrame, export: Export) -> ExportFrame:

@@ -1,4 +1,4 @@
-"""Writes the files of a refined frame, with its 3D view for the report of a batch."""
+"""Plans and writes the files of a refined frame, with its 3D view for the report of a batch."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.output_files import Outputs
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest, endings_of
+from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.completion.interpolation import in_hull
+from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.io.depth import metres, write_depth
+from pnpdepth_cli.io.atomic import cannot_write
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.visualisation import depth_scale, improvement, preview, write_mask
@@ -44,6 +46,54 @@ _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
 
+def plan_outputs(request: RefineRequest) -> Outputs:
+    """Returns the paths of the results: `-o FILE.exr` for the depth alone, a folder for all.
+
+    Raises:
+        OutputError: One exists and may not be replaced, or is one of the inputs.
+    """
+    # Where results go without -o.
+    files = request.files
+    sources = [files.image, files.sparse, files.gt, request.reading.scan.calib]
+    inputs = [path for path in sources if isinstance(path, Path)]
+    output = request.output or Path(f"{inputs[0].stem}_refined")
+    suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)
+    # A depth file alone, or all files in a folder.
+    if suffix in DEPTH_SUFFIXES:
+        if request.uncertainty:
+            raise UsageError(
+                f"--uncertainty writes a second file; name a folder, not {output}, with -o"
+            )
+        outputs: Outputs = {"depth": output}
+    elif suffix[1:].isalpha() and not output.is_dir():
+        raise OutputError(f"{output}: depth is written as {formats}, or into a folder")
+    elif output.is_file():
+        raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")
+    else:
+        outputs = request.outputs_in(output, inputs[0].stem, with_gt=files.gt is not None)
+    # No input is replaced, and no result unless it may be.
+    check_outputs(outputs.values(), inputs, overwrite=request.overwrite)
+    return outputs
+
+
+def remove_outdated(outputs: Outputs) -> None:
+    """Removes the record of an earlier result, and its files that are not written again.
+
+    The record goes first, so that none names files of two runs.
+    """
+    record = outputs.get("record")
+    if record is None:
+        return
+    endings = (end for suffix in DEPTH_SUFFIXES for end in endings_of(suffix).values())
+    files = dict.fromkeys(record.with_name(record.stem + end) for end in endings)
+    for path in (record, *(path for path in files if path not in outputs.values())):
+        try:
+            if path.is_file():
+                path.unlink()
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
+
 def output_scale(inputs: Frame) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
@@ -65,7 +115,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
 
     Where it is not, a note tells how much of a scan's image lies outside of its points.
     """
-    if request.outputs.unknown == "zero" and frame.valid is not None:
+    if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, after=np.where(frame.valid, frame.after, np.float32(0)))
     source = inputs.sources.get("sparse")
     if frame.valid is not None or source is None:

@@ -13,9 +13,14 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.error_tables import names_of_depths
-from pnpdepth_cli.commands.refinement.output_files import Outputs, plan_outputs, remove_outdated
-from pnpdepth_cli.commands.refinement.outputs import within_range, without_unknown, write_outputs
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.outputs import (
+    plan_outputs,
+    remove_outdated,
+    within_range,
+    without_unknown,
+    write_outputs,
+)
+from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
 from pnpdepth_cli.completion.baselines import Baseline
 from pnpdepth_cli.completion.interpolation import linear
@@ -71,8 +76,8 @@ def read_requested(request: RefineRequest) -> Frame:
         request.files,
         request.read_options,
         seed=request.method.seed,
-        holdout=request.hold_out.holdout,
-        needs_camera=request.outputs.view_3d,
+        holdout=request.holdout,
+        needs_camera=request.view_3d,
     )
 
 
@@ -90,7 +95,7 @@ def load_method(
         UsageError: The request combines what cannot be combined.
         ModelError: The network cannot be loaded.
     """
-    choice, hold_out = request.network, request.hold_out
+    choice = request.network
     chosen = [(choice.model, choice.checkpoint), *((spec, None) for spec in choice.more_models)]
     networks = [load_network(spec, checkpoint, choice.device) for spec, checkpoint in chosen]
     networks[0] = with_input_range(networks[0], choice.normalise)
@@ -99,8 +104,8 @@ def load_method(
         request.method,
         first,
         more,
-        validated=hold_out.baselines,
-        uncertainty=hold_out.uncertainty or request.outputs.unknown == "zero",
+        validated=request.baselines,
+        uncertainty=request.uncertainty or request.unknown == "zero",
     )
 
 
@@ -192,7 +197,7 @@ def _record_of(
             "propagate": "gp" if method.is_default else method.settings.propagate,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
-            "holdout": request.hold_out.holdout,
+            "holdout": request.holdout,
             "device": str(network.device),
         },
         registration=asdict(refined.registration) if refined.registration else None,
@@ -207,7 +212,7 @@ def _record_of(
         ),
         weights=dict(refined.weights),
         loss=list(refined.losses),
-        errors=_errors_of(refined, frame, with_baselines=request.hold_out.baselines),
+        errors=_errors_of(refined, frame, with_baselines=request.baselines),
         improved_fraction=_improved_fraction(refined, frame.gt),
         notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
     )

@@ -1,11 +1,12 @@
-"""What the user asks of a refinement, in groups. None means the network's own default.
+"""What the user asks of a refinement, and the files of its result.
 
-Command line options and batch cache keys are derived from these declarations
-(`pnpdepth_cli.settings`). Imports neither numpy nor torch.
+None means the network's own default. Command line options and batch cache keys are derived from
+these declarations (`pnpdepth_cli.settings`). Imports neither numpy nor torch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,12 @@ from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.settings import Settings, option
+
+Outputs = Mapping[str, Path]
+"""The files of a result by kind: depth, sigma, preview, …, and last its record."""
+
+GROUPS = ("files", "reading", "network", "method")
+"""Fields of a `RefineRequest` that hold fields."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,20 +58,20 @@ class NetworkChoice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HoldOut:
-    """Which points are held out, and what is measured by them."""
+class RefineRequest:
+    """Everything the user asks of the refinement of one frame."""
 
+    files: FrameFiles = field(default_factory=FrameFiles)
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    network: NetworkChoice = field(default_factory=NetworkChoice)
+    method: Settings = field(default_factory=Settings)
+    # What is measured and estimated.
     baselines: bool = option(False, "Also print every baseline, such as linear interpolation.")
     uncertainty: bool = option(
         False, "Write the depth's standard deviation and a mask of valid depth."
     )
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
-
-
-@dataclass(frozen=True, kw_only=True)
-class OutputOptions:
-    """Where results go, and in which form."""
-
+    # Where results go, and in which form.
     output: Path | None = None
     """A folder, or one depth file. None: a folder named after the image."""
     format: str = option(
@@ -80,29 +87,8 @@ class OutputOptions:
         show_default=True,
     )
     view_3d: bool = False
+    """Whether the 3D view of a report is written."""
     overwrite: bool = option(False, "Replace existing results.")
-
-
-_NOT_IN_DIGEST = frozenset(
-    {
-        *("name", "group", "image", "sparse", "gt", "calib", "pose", "masks"),
-        "sparse_mask",
-        *("model", "checkpoint", "output", "overwrite", "view_3d"),
-    }
-)
-"""Fields that say where something lies, whose content is compared instead, or that add a file."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefineRequest:
-    """Everything the user asks of the refinement of one frame."""
-
-    files: FrameFiles = field(default_factory=FrameFiles)
-    reading: ReadOptions = field(default_factory=ReadOptions)
-    network: NetworkChoice = field(default_factory=NetworkChoice)
-    method: Settings = field(default_factory=Settings)
-    hold_out: HoldOut = field(default_factory=HoldOut)
-    outputs: OutputOptions = field(default_factory=OutputOptions)
 
     @property
     def read_options(self) -> ReadOptions:
@@ -117,29 +103,39 @@ class RefineRequest:
         )
 
     def with_fields(self, **values: Any) -> RefineRequest:
-        """Returns a copy with other values of these fields, whichever group each is in."""
-        groups = {}
-        for group in fields(self):
-            own = getattr(self, group.name)
-            names = values.keys() & {each.name for each in fields(own)}
-            groups[group.name] = replace(own, **{name: values.pop(name) for name in names})
+        """Returns a copy with other values of these fields, its own or of any group."""
+        changes = {}
+        for each in fields(self):
+            own = getattr(self, each.name)
+            if each.name in GROUPS:
+                names = values.keys() & {field.name for field in fields(own)}
+                changes[each.name] = replace(own, **{name: values.pop(name) for name in names})
+            elif each.name in values:
+                changes[each.name] = values.pop(each.name)
         if values:
             raise TypeError(f"a RefineRequest has no fields {', '.join(sorted(values))}")
-        return RefineRequest(**groups)
+        return replace(self, **changes)
 
-    def settings(self, *groups: str) -> dict[str, Any]:
-        """Returns all fields that decide the result except the frame's files, by name.
+    def outputs_in(self, folder: Path, name: str, *, with_gt: bool) -> Outputs:
+        """Returns the files of a result in a folder; slashes in the name are subfolders."""
+        without = set() if self.uncertainty else {"sigma", "valid"}
+        without |= set() if self.view_3d else {"view"}
+        without |= set() if with_gt else {"improvement"}
+        endings = endings_of(f".{self.format}")
+        return {k: folder / f"{name}{end}" for k, end in endings.items() if k not in without}
 
-        Args:
-            *groups: Names of groups. None: all of them.
-        """
-        chosen = [getattr(self, e.name) for e in fields(self) if not groups or e.name in groups]
-        return {
-            each.name: getattr(group, each.name)
-            for group in chosen
-            for each in fields(group)
-            if each.name not in _NOT_IN_DIGEST
-        }
+
+def endings_of(suffix: str) -> dict[str, str]:
+    """Returns the ends of the names of all files of a result, by kind; the depth has the suffix."""
+    return {
+        "depth": f"_depth{suffix}",
+        "sigma": f"_sigma{suffix}",
+        "valid": "_valid.png",  # mask of the pixels whose depth is valid
+        "preview": "_preview.png",
+        "improvement": "_improvement.png",
+        "view": "_view.json",  # 3D view for a report
+        "record": ".json",
+    }
 
 
 def parse_sample(text: str) -> SamplePattern:

@@ -72,7 +72,7 @@ def test_learning_can_be_stopped(drive: Path) -> None:
         adapt=True,
     )
     with pytest.raises(KeyboardInterrupt):
-        run_batch(request, RecordingListener(), lambda: True)
+        run_batch(request, RecordingListener(lambda: True))
     assert not (drive.parent / "out/adapted").exists()
 
 

@@ -21,7 +21,7 @@ from pnpdepth_cli.cli.printing import print_batch
 from pnpdepth_cli.commands.batch.batch_report import write_batch_report
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.summary import BatchSummary, summarise
+from pnpdepth_cli.commands.batch.records import BatchSummary, summarise
 from pnpdepth_cli.commands.results import result_frames
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -64,9 +64,9 @@ def test_a_scale_of_ground_truth_that_nothing_decides_is_a_warning_until_it_is_s
     root = ground_truth_alone(pairs_on_disk(tmp_path / "drive"), "image/{}.png", "depth/{}.png")
     options: dict[str, Any] = {"sample": SamplePattern(count=60)}
     assumed, stated = (batch(root, refine=options | o) for o in ({}, {"depth_scale": 256.0}))
-    (frames,) = (each.frames for each in assumed.warnings if "--depth-scale 1000" in each.note)
-    assert frames == len(NAMES)
-    assert not [each for each in stated.warnings if "--depth-scale" in each.note]
+    (names,) = (names for note, names in assumed.frame_notes.items() if "--depth-scale" in note)
+    assert names == list(NAMES)
+    assert not any("--depth-scale" in note for note in stated.frame_notes)
 
 
 def ground_truth_alone(root: Path, image: str, depth: str) -> Path:
@@ -345,10 +345,8 @@ def test_the_summary_counts_weights_warnings_by_kind_and_frames_that_are_indepen
     ]  # fmt: skip
     told = summary_of(root, records)
     assert told.weights == {"net": {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}}
-    noted = told.warnings + told.frame_notes
-    assert [each.note for each in noted] == [kind.format(0) for kind in kinds]
-    assert {(each.frames, *each.first) for each in noted} == {(4, "a/0000", "b/0001", "a/0002")}
-    assert len(told.warnings) == 1
+    names = [record.name for record in records]
+    assert told.frame_notes == {kind.format(0): names for kind in kinds}
     assert ["4 frames count as 2 groups of frames" in note for note in told.notes] == [True]
 
 
@@ -371,8 +369,8 @@ def test_columns_choose_the_measures_of_the_tables_of_a_batch(
 def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
     root: Path,
 ) -> None:
-    stops = iter([False, False, True])
-    result = batch(root, stopped=lambda: next(stops))
+    stops = iter([False, False, True, True])
+    result = batch(root, RecordingListener(lambda: next(stops)))
     (root / "out" / "deep").mkdir()
     for folder in ("out", "out/deep"):
         (root / folder / ".0123456789ab").write_bytes(b"half")

@@ -114,8 +114,8 @@ def test_what_is_wrong_with_all_frames_ends_the_batch(cluster: Any, root: Path) 
 @pytest.mark.slow
 @on_a_cluster
 def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root: Path) -> None:
-    listener = RecordingListener()
-    batch(root, listener, stopped=lambda: bool(listener.records), ray=cluster.address)
+    listener = RecordingListener(lambda: bool(listener.records))
+    batch(root, listener, ray=cluster.address)
     assert 1 <= len(listener.records) < len(NAMES)
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
 
