@@ -96,7 +96,7 @@ def test_without_a_terminal_there_is_a_line_a_minute(
     now = 0.0
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now)
     with progress_bar("batch", "frame") as show:
-        display = BatchProgress(show)
+        display = BatchProgress(show, lambda: False)
         display.begin(600)
         for number in range(300):
             now += 1.0
@@ -114,7 +114,7 @@ def test_on_a_terminal_there_is_a_bar(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(terminal, "_SHOWN_AFTER_S", 0)
     with progress_bar("batch", "frame") as show:
-        display = BatchProgress(show)
+        display = BatchProgress(show, lambda: False)
         display.begin(2)
         display.frame(FAILED)
         display.frame(FrameRecord(name="y"))

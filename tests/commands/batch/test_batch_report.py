@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
-from tests.commands.batches import NAMES, batch, done, pairs_on_disk, refinement
+from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, refinement
 from tests.commands.report_pages import everything, frames_of, images_of, page_data
 
 
@@ -68,7 +68,7 @@ def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_
     root: Path, report: Path
 ) -> None:
     answers = iter([False, True, True, True])
-    batch(root, html=report, stopped=lambda: next(answers))
+    batch(root, RecordingListener(lambda: next(answers)), html=report)
     assert list(frames_of(report)) == ["a"]
     assert dict(page_data(report)["facts"])["frames"] == "1 done, 3 pending"
     batch(root, html=report, shard=(1, 2))  # a and c
