@@ -19,7 +19,7 @@ from pnpdepth_cli.models.cut_layers import suggest_layers
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
-from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
+from pnpdepth_cli.models.weights import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
 
 FARTHEST_DEPTH = 1e4

@@ -25,7 +25,7 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
 from pnpdepth_cli.models.file_graph import FileGraph, Operation
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
-from pnpdepth_cli.models.weights.torch_file import refuse_inflated
+from pnpdepth_cli.models.weights.pickled_files import refuse_inflated
 
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?)\.(\w+)\.(\w+)")
 _TOUCHES_FILES = re.compile("file|save|load")

@@ -17,7 +17,7 @@ from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights import read_checkpoint
 
 
 def broken(*_: object, **__: object) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from model_zoo_defs.eigen import Eigen, definitions
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
+from pnpdepth_cli.models.weights import load_checkpoint
 
 COARSE = {
     "conv1": (6, 3, 11, 11), "conv2": (8, 6, 5, 5), "conv3": (10, 8, 3, 3),

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_zoo_defs.fcrn import FCRN, definitions
-from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
+from pnpdepth_cli.models.weights import load_checkpoint
 from tests.models.weights.files import npy_of, pickled
 
 Arrays = dict[str, dict[str, NDArray[np.float32]]]

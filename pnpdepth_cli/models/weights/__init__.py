@@ -1,0 +1,232 @@
+"""Weights from files, without running anything that is in them.
+
+safetensors files hold tensors only, numpy files arrays, TensorFlow checkpoints variables. torch
+files are pickles, often with more in them (whole modules, optimisers, arguments); the tensors are
+taken out, and nothing is run.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from pnpdepth_cli.budget import check_network_file
+from pnpdepth_cli.core.user_code import describe
+from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
+from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
+from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file
+from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
+
+_STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "params")
+_PREFIXES = ("module.", "_orig_mod.", "model.")
+"""Prefixes of torch's DataParallel, of torch.compile, and of modules that hold the network."""
+
+_WRAPPED = re.compile(f"^(?:{'|'.join(map(re.escape, _PREFIXES))})+")
+_READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    ".safetensors": ("safetensors file", load_file),
+    ".npy": ("numpy file", read_numpy_file),
+    ".index": ("TensorFlow checkpoint", read_tensor_bundle),
+}
+"""Kind and reader by suffix; any other file is one of torch."""
+
+WEIGHT_SUFFIXES = (*_READERS, ".pth", ".pt", ".bin", ".ckpt", ".tar")
+
+_COUNTER = "num_batches_tracked"
+_SHOWN_NAMES = 4
+_MAX_WORD = 60  # characters of a word out of a file that are shown
+
+
+def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Tensor]:
+    """Returns the tensors of a checkpoint by name, on the CPU.
+
+    Args:
+        path: A torch, safetensors or .npy file, the PREFIX.index of a TensorFlow checkpoint, or a
+            folder with several of these, such as encoder.pth and decoder.pth; then each name is
+            preceded by the name of its file up to the first dot. In a torch file the tensors may
+            lie in an entry such as "state_dict" beside an epoch or an optimiser; FILE:KEY names it.
+        notes: List that gets what a person should know of the reading.
+
+    Raises:
+        CheckpointError: The file is missing or broken, or holds no named tensors.
+    """
+    notes = [] if notes is None else notes
+    path, key = file_and_part(path)
+    if path.is_dir():
+        return _read_folder(path, notes)
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path} does not exist")
+    check_network_file(path, "checkpoint", CheckpointError)
+    # Its reader gives named tensors, or what a torch file holds.
+    kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
+    try:
+        content = read(path)
+    except (*CONTENT_ERRORS, SafetensorError) as error:
+        fact = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
+        reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
+        raise CheckpointError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
+    if isinstance(content, dict):
+        if key:
+            raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
+        return content
+    # The state dict in that.
+    content, names = content
+    if names:
+        notes.append(f"checkpoint {path.name}: its pickle names {_some(names)}; none of it was run")
+    return _state_in(content, path, key, notes)
+
+
+def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:
+    files = sorted(file for file in folder.iterdir() if file.suffix in WEIGHT_SUFFIXES)
+    if not files:
+        raise CheckpointError(
+            f"checkpoint {folder} is a folder without weights; it may hold"
+            f" {', '.join(WEIGHT_SUFFIXES)}"
+        )
+    notes.append(f"checkpoint {folder.name}: {', '.join(file.name for file in files)}")
+    if len(files) == 1:
+        return read_checkpoint(files[0], notes)
+    state = dict[str, Tensor]()
+    for file in files:
+        part = _without_prefixes(read_checkpoint(file, notes), file, notes)
+        state |= {f"{file.name.partition('.')[0]}.{name}": tensor for name, tensor in part.items()}
+    return state
+
+
+def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[str, Tensor]:
+    """The state dict in what a torch file holds: the one that the key names, or a usual one."""
+    if not isinstance(content, Mapping):
+        kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
+        raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
+    if not key and content and _only_tensors(content):
+        return dict(content)
+    states = {
+        str(name): dict(value)
+        for name, value in content.items()
+        if isinstance(value, Mapping) and value and _only_tensors(value)
+    }
+    chosen = key or next((each for each in _STATE_KEYS if each in states), "")
+    if chosen in states:
+        others = _some([repr(name) for name in states if name != chosen])
+        if others:
+            fact = f"{chosen!r} is read, not {others}; {path.name}:KEY chooses"
+            notes.append(f"checkpoint {path.name}: {fact}")
+        return states[chosen]
+    if key in content:  # with a state dict in it, beside other things
+        return _state_in(content[key], path, "", notes)
+    fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
+    held = _some([str(name) for name in content]) or "nothing"
+    way_out = f"; {path}:KEY reads that of {_some(list(states), ' or ')}"
+    raise CheckpointError(f"checkpoint {path} has {fact}; it holds {held}{way_out * bool(states)}")
+
+
+def _only_tensors(mapping: Mapping[Any, object]) -> bool:
+    return all(isinstance(k, str) and isinstance(v, Tensor) for k, v in mapping.items())
+
+
+def _some(names: list[str], between: str = ", ") -> str:
+    """The first few of the names, and how many more there are."""
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return f"{between.join(map(_short, names[:_SHOWN_NAMES]))}{more}"
+
+
+def _short(word: str) -> str:
+    return word if len(word) <= _MAX_WORD else f"{word[:_MAX_WORD]}…"
+
+
+def _without_prefixes(
+    state: dict[str, Tensor], path: Path, notes: list[str], own: Mapping[str, object] | None = None
+) -> dict[str, Tensor]:
+    """The tensors without prefixes of wrappers that a network's own names lack."""
+    own, stripped = own or {}, list[str]()
+    while (prefix := _prefix(state)) is not None and prefix != _prefix(own):
+        if prefix == "model." and own.keys().isdisjoint(_WRAPPED.sub("", name) for name in state):
+            break  # part of the names of a published file
+        state = {name.removeprefix(prefix): tensor for name, tensor in state.items()}
+        stripped += [] if prefix in stripped else [prefix]
+    if stripped:
+        listing = " and ".join(map(repr, stripped))
+        notes.append(f"checkpoint {path.name}: prefix {listing} of every key stripped")
+    return state
+
+
+def _prefix(state: Mapping[str, object]) -> str | None:
+    """The one of `_PREFIXES` that all names have."""
+    return next((p for p in _PREFIXES if state and all(n.startswith(p) for n in state)), None)
+
+
+def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path) -> list[str]:
+    """Loads the weights of a file into a network; returns notes on what was done to fit them.
+
+    The counters of batch normalisations may be missing, as in files from before PyTorch 0.4.1: they
+    matter in training only.
+
+    Args:
+        network: Network built by `definition`; its weights are replaced.
+        definition: Definition whose `read_checkpoint` renames the tensors of a published file.
+        path: File or folder, as `read_checkpoint` takes it.
+
+    Raises:
+        CheckpointError: A tensor is missing, unexpected, of another shape, or not finite.
+    """
+    notes = list[str]()
+    own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
+    stored = _without_prefixes(read_checkpoint(path, notes), path, notes, own)
+    state = _renamed(definition, stored, path)
+    _check_fit(own, state, f"checkpoint {path} does not fit network {definition.name!r}")
+    # A sum shows a value that is not finite, without a copy of the tensor.
+    broken = [
+        name
+        for name, _ in network.named_parameters()
+        if name in state and not state[name].sum(dtype=torch.float64).isfinite()
+    ]
+    if broken:
+        raise CheckpointError(
+            f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
+            f" ({_some(broken)}); was its training broken off?"
+        )
+    network.load_state_dict(state, strict=False)
+    return notes
+
+
+def _renamed(
+    definition: ModelDefinition, stored: Mapping[str, Tensor], path: Path
+) -> Mapping[str, Tensor]:
+    """The tensors as the definition renames those of a published file."""
+    if definition.read_checkpoint is None:
+        return stored
+    try:
+        state = definition.read_checkpoint(stored)
+    except Exception as error:  # what a definition raises at an unknown layout is its own
+        raise CheckpointError(
+            f"checkpoint {path} is not in a layout that {definition.name!r} reads"
+            f" ({describe(error)})"
+        ) from None
+    if not isinstance(state, Mapping) or not _only_tensors(state):
+        raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
+    return state
+
+
+def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: str) -> None:
+    """CheckpointError, which begins with `misfit`, unless the state has the network's tensors."""
+    both = [name for name in own if name in state]
+    problems = {
+        "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
+        "complex": [n for n in both if state[n].is_complex() > own[n].is_complex()],
+        "unexpected": [name for name in state if name not in own],
+        "of another shape": [
+            f"{n} {tuple(state[n].shape)} for {tuple(own[n].shape)}"
+            for n in both
+            if state[n].shape != own[n].shape
+        ],
+    }
+    listed = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
+    if listed:
+        raise CheckpointError(f"{misfit}: {'; '.join(listed)}")

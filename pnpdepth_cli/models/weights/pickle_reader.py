@@ -1,8 +1,8 @@
 """Reads a pickle without calling anything that it names.
 
-A pickle is a program for a stack machine, which may call any function. Here no name is imported: a
-call of one gives a tensor, a plain container or an inert `StandIn`, and opcodes that files of
-weights do not have are refused.
+A pickle is a program for a stack machine, which may call any function. Here Python's own machine
+runs it without the opcodes that files of weights do not have. No name is imported: a call of one
+gives a tensor, a plain container or an inert `StandIn`.
 
 Time and memory are bounded by the file and by `MAX_STEPS`. torch.load(weights_only=True) is not
 used: it allocates the sizes that a file states, hashes what the file holds, and refuses whole
@@ -11,14 +11,17 @@ modules.
 
 from __future__ import annotations
 
+import functools
 import math
-import pickletools
+import pickle
 import struct
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
+from mmap import mmap
 from typing import Any, cast
 
 from torch import Tensor
@@ -32,15 +35,18 @@ MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
 _MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_LITERALS = frozenset(
-    {
-        *("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINSTRING"),
-        *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"),
-        *("BINBYTES8",),
-    }
+_OPCODES = (
+    *("PROTO", "FRAME", "STOP", "MARK", "BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET"),
+    *("LONG_BINGET", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "APPEND"),
+    *("APPENDS", "EMPTY_SET", "ADDITEMS", "EMPTY_DICT", "SETITEM", "SETITEMS", "NONE", "NEWTRUE"),
+    *("NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINSTRING"),
+    *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"),
+    *("BINBYTES8", "GLOBAL", "STACK_GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID"),
 )
-"""Opcodes of protocols 2 to 5 that put their argument on the stack."""
+"""Opcodes of protocols 2 to 5; no others are done, as some take the memory that a size claims."""
+
+LoadStorage = Callable[[tuple[Any, ...]], Tensor]
+"""Function that returns the flat tensor for ("storage", type, key, location, elements, ...)."""
 
 
 class BrokenFileError(Exception):
@@ -48,146 +54,64 @@ class BrokenFileError(Exception):
 
 
 CONTENT_ERRORS = (
-    *(BrokenFileError, OSError, EOFError, zipfile.BadZipFile, zlib.error, struct.error),
-    *(ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
+    *(BrokenFileError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
+    *(struct.error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    *(RuntimeError, SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""
 
 
-@dataclass(frozen=True)
-class Name:
-    """A function or class that the pickle names; it is never looked up."""
-
-    path: str
-
-
 @dataclass(eq=False, repr=False)
 class StandIn:
-    """Stands for what a call of `path` would have returned; `state` is its state as pickled."""
+    """Stands for a function or class, or for what a call of it would have returned.
+
+    Nothing of that name is looked up; `state` is the state as pickled.
+    """
 
     path: str
     arguments: tuple[Any, ...] = ()
-    state: Any = None
+    state: object = None
+
+    def extend(self, items: list[object]) -> None:
+        """Forgets what a container of this class would hold."""
+
+    append = extend
 
 
-def read_pickle(
-    file: Any, load_storage: Callable[[tuple[Any, ...]], Tensor] | None = None
-) -> tuple[object, list[str]]:
-    """Returns the content of one pickle, and the functions and classes of its stand-ins.
+class _Unpickler(pickle._Unpickler):
+    """Python's own machine, but for the opcodes that would find, call, change or hash something."""
 
-    A broken pickle raises BrokenFileError or what its parts raise.
+    stack: list[Any]
+    pop_mark: Callable[[], list[object]]
 
-    Args:
-        file: File that stands at the first opcode, afterwards behind the last. It is in memory or
-            mapped: its `read` allocates no more than there is.
-        load_storage: Function that returns the flat tensor for a persistent id
-            ("storage", type, key, location, elements, ...); None refuses one.
-    """
-    machine = _Machine(load_storage)
-    for opcode, argument, _ in pickletools.genops(file):
-        machine.charge(1)
-        machine.step(opcode.name, argument)
-    return machine.stack.pop(), list(machine.stood_for)
-
-
-class _Machine:
-    """The stack, the marks in it, and the memo of a pickle's program."""
-
-    def __init__(self, load_storage: Callable[[tuple[Any, ...]], Tensor] | None) -> None:
-        self.stack: list[Any] = []
+    def __init__(self, file: BytesIO | mmap, load_storage: LoadStorage | None) -> None:
+        super().__init__(file, encoding="latin-1")
         self.stood_for: dict[str, None] = {}
-        self._marks: list[int] = []
-        self._memo: dict[int, Any] = {}
         self._load_storage = load_storage
         self._left = MAX_STEPS
+        codes = [getattr(pickle, opcode)[0] for opcode in _OPCODES]
+        functions = {code: getattr(self, self.dispatch[code].__name__) for code in codes}
+        self.dispatch = {  # type: ignore[misc]
+            code: functools.partial(self._step, function) for code, function in functions.items()
+        }
 
-    def charge(self, steps: int) -> None:
+    def _step(self, function: Callable[[], None], _: object) -> None:
+        self._charge(1)
+        function()
+
+    def _charge(self, steps: int) -> None:
         self._left -= steps
         if self._left < 0:
             raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
-    def step(self, opcode: str, argument: Any) -> None:
-        """Does what the opcode says; calls are left to `_call`."""
-        stack = self.stack
-        # One case for each opcode that pickles of weights have.
-        match opcode:
-            case "BINPUT" | "LONG_BINPUT":
-                self._memo[argument] = stack[-1]
-            case "MEMOIZE":
-                self._memo[len(self._memo)] = stack[-1]
-            case "BINGET" | "LONG_BINGET":
-                stack.append(self._memo[argument])
-            case "MARK":
-                self._marks.append(len(stack))
-            case "TUPLE":
-                stack.append(tuple(self._to_mark()))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                count = int(opcode[-1])
-                stack[-count:] = [tuple(stack[-count:])]
-            case "EMPTY_LIST" | "EMPTY_SET":  # elements of a set would have to be hashed
-                stack.append([])
-            case "EMPTY_DICT":
-                stack.append({})
-            case "APPEND":
-                self._extend([stack.pop()])
-            case "APPENDS" | "ADDITEMS":
-                self._extend(self._to_mark())
-            case "SETITEM":
-                self._set_items([stack.pop(-2), stack.pop()])
-            case "SETITEMS":
-                self._set_items(self._to_mark())
-            case "GLOBAL":
-                stack.append(self._name(*argument.split(" ", 1)))
-            case "STACK_GLOBAL":
-                stack.append(self._name(stack.pop(-2), stack.pop()))
-            case "REDUCE" | "NEWOBJ":
-                stack.append(self._call(stack.pop(-2), stack.pop()))
-            case "BUILD":
-                state = stack.pop()
-                if isinstance(stack[-1], StandIn):
-                    stack[-1].state = state
-            case "BINPERSID":
-                stack.append(self._persistent(stack.pop()))
-            case "PROTO" | "FRAME" | "STOP":
-                pass
-            case _ if opcode in _LITERALS:
-                stack.append(argument)
-            case _ if opcode in _CONSTANTS:
-                stack.append(_CONSTANTS[opcode])
-            case _:
-                raise BrokenFileError(f"its pickle has an opcode {opcode}")
-
-    def _to_mark(self) -> list[Any]:
-        """What lies above the last mark, taken off the stack."""
-        start = self._marks.pop()
-        values = self.stack[start:]
-        del self.stack[start:]
-        return values
-
-    def _extend(self, values: list[object]) -> None:
-        if isinstance(self.stack[-1], list):  # and not the stand-in of another class
-            self.stack[-1].extend(values)
-
-    def _set_items(self, values: list[object]) -> None:
-        if isinstance(self.stack[-1], dict):
-            self.stack[-1].update(self._mapping(values))
-
-    def _mapping(self, values: list[object]) -> dict[object, object]:
-        """Keys and values in turn as a dict; a key that may be costly to hash becomes its type."""
-        self.charge(len(values))
-        return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
-
-    def _name(self, module: object, name: object) -> Name:
+    def find_class(self, module: str, name: str) -> StandIn:
         """The name itself, that of Python 3."""
-        if not isinstance(module, str) or not isinstance(name, str):
-            raise BrokenFileError("its pickle has a name that is no text")
         if len(module) + len(name) > MAX_NAME:
             raise BrokenFileError("its pickle has a name without end")
         module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
-        return Name(f"{module}.{name}")
+        return StandIn(f"{module}.{name}")
 
-    def _persistent(self, pid: object) -> object:
+    def persistent_load(self, pid: object) -> object:
         """The storage, or the class without its source text, that the id stands for."""
         if isinstance(pid, tuple) and len(pid) >= 4:
             if pid[0] == "module":
@@ -196,9 +120,40 @@ class _Machine:
                 return self._load_storage(pid)
         raise BrokenFileError("its pickle refers to something outside it")
 
-    def _call(self, function: object, arguments: Any) -> Any:
+    def load_empty_set(self) -> None:
+        self.stack.append([])
+
+    def load_additems(self) -> None:
+        self.stack[-1].extend(self.pop_mark())
+
+    def load_setitem(self) -> None:
+        self._update([self.stack.pop(-2), self.stack.pop()])
+
+    def load_setitems(self) -> None:
+        self._update(self.pop_mark())
+
+    def _update(self, values: list[object]) -> None:
+        if isinstance(self.stack[-1], dict):  # and not the stand-in of another class
+            self.stack[-1].update(self._mapping(values))
+
+    def _mapping(self, values: list[object]) -> dict[object, object]:
+        """Keys and values in turn as a dict; a key that may be costly to hash becomes its type."""
+        self._charge(len(values))
+        return dict(zip(map(_key, values[::2]), values[1::2], strict=True))
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        if isinstance(self.stack[-1], StandIn):
+            self.stack[-1].state = state
+
+    def load_reduce(self) -> None:
+        self.stack.append(self._result(self.stack.pop(-2), self.stack.pop()))
+
+    load_newobj = load_reduce
+
+    def _result(self, function: object, arguments: object) -> object:
         """The result of a call if it is a tensor or a plain container, else what stands for it."""
-        if not isinstance(arguments, tuple) or not isinstance(function, Name):
+        if not isinstance(arguments, tuple) or not isinstance(function, StandIn):
             raise BrokenFileError("its pickle calls something other than a function")
         # Plain containers and tensors are made; nothing is run.
         first = arguments[0] if arguments else None
@@ -212,8 +167,8 @@ class _Machine:
                 return "" if first is None else first  # text of Latin-1
             case "torch.Size" | "torch.device":
                 return first or ()
-            case "copyreg._reconstructor" if isinstance(first, Name):
-                return self._call(first, ())
+            case "copyreg._reconstructor" if isinstance(first, StandIn):
+                return self._result(first, ())
             case "torch._utils._rebuild_tensor" | "torch._utils._rebuild_tensor_v2":
                 return view_of(*arguments[:4])
             case (
@@ -230,6 +185,22 @@ class _Machine:
 def _key(key: object) -> object:
     small = isinstance(key, int) and abs(key) < 1 << 63
     return key if small or isinstance(key, str | float | None) else type(key).__name__
+
+
+def read_pickle(
+    file: BytesIO | mmap, load_storage: LoadStorage | None = None
+) -> tuple[object, list[str]]:
+    """Returns the content of one pickle, and the functions and classes of its stand-ins.
+
+    A broken pickle raises BrokenFileError or what its parts raise.
+
+    Args:
+        file: File that stands at the first opcode, afterwards behind the last. It is in memory or
+            mapped: its `read` allocates no more than there is.
+        load_storage: Function for the persistent ids; None refuses one.
+    """
+    unpickler = _Unpickler(file, load_storage)
+    return unpickler.load(), list(unpickler.stood_for)
 
 
 def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:

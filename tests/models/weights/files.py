@@ -16,7 +16,7 @@ import pytest
 from numpy.lib import format as npy
 
 from pnpdepth_cli.errors import CheckpointError
-from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights import read_checkpoint
 
 
 def refused(path: Path) -> str:

@@ -18,7 +18,7 @@ from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.torch_export import exported_definition
-from pnpdepth_cli.models.weights.checkpoint import load_checkpoint
+from pnpdepth_cli.models.weights import load_checkpoint
 from tests.models.weights.files import npy_of, pickled, refused
 from tests.models.weights.test_tensor_bundle import bundle, entry
 

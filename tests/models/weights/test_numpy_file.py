@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.models.weights.numpy_file import read_numpy_file
+from pnpdepth_cli.models.weights.pickled_files import read_numpy_file
 from tests.models.weights.files import hostile, little, npy_of, pickled, refused
 
 RING: dict[str, Any] = {}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.models.weights.checkpoint import read_checkpoint
+from pnpdepth_cli.models.weights import read_checkpoint
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 from tests.models.weights.files import refused
 

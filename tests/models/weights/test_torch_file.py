@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.models.weights.torch_file import read_torch_file
+from pnpdepth_cli.models.weights.pickled_files import read_torch_file
 from tests.models.weights.files import Hostile, hostile, little, refused
 
 both_layouts = pytest.mark.parametrize("new", [True, False], ids=["zip", "row of pickles"])

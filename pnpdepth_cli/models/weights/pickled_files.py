@@ -1,0 +1,259 @@
+"""Tensors and plain containers of torch and numpy files, which are pickles; nothing in them is run.
+
+Both layouts of torch.save are read, the zip archive (torch ≥ 1.6) and the older row of pickles, and
+the .npy of a dict of arrays, or of dicts of arrays, as converters from Caffe write it. Memory stays
+bounded by the size of the file: compressed archives, and storages and tensors larger than what is
+stored, are refused, and tensors of one storage share it.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib import format as npy
+from torch import Tensor
+
+from pnpdepth_cli.budget import check_claim
+from pnpdepth_cli.models.weights.pickle_reader import (
+    CONTENT_ERRORS,
+    MAX_NAME,
+    BrokenFileError,
+    StandIn,
+    read_pickle,
+)
+
+_MAGIC = 0x1950A86A20F9469CFC6C
+_MAX_DEPTH = 100  # of modules inside each other
+_MAX_MODULES = 100_000
+_RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
+_MAX_DICTS = 3  # inside each other
+_MAX_ENTRIES = 10_000
+_DTYPES: dict[str, torch.dtype] = {
+    f"{name}Storage": getattr(torch, dtype)
+    for name, dtype in {
+        "Float": "float32", "Double": "float64", "Half": "float16", "BFloat16": "bfloat16",
+        "Long": "int64", "Int": "int32", "Short": "int16", "Char": "int8", "Byte": "uint8",
+        "Bool": "bool", "ComplexFloat": "complex64", "ComplexDouble": "complex128",
+        "Untyped": "uint8",
+    }.items()
+}  # fmt: skip
+
+
+def read_torch_file(path: Path) -> tuple[object, list[str]]:
+    """Returns the content of a torch file, and the functions and classes that its pickle names.
+
+    The content is tensors in plain containers, the state dict of each whole module, and a `StandIn`
+    for all else; no name was run. A broken file raises whatever its parts do.
+    """
+    if zipfile.is_zipfile(path):
+        content, names = _read_archive(path)
+    else:
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as mapped:
+            content, names = _read_row_of_pickles(mapped)
+    if isinstance(content, Mapping):
+        content = {key: _with_state(value) for key, value in content.items()}
+    return _with_state(content), names
+
+
+def _with_state(value: object) -> object:
+    """The state dict of a whole pickled module, as the module itself would have given it."""
+    module = _module_state(value)
+    return value if module is None else dict(_walk(module, "", itertools.count()))
+
+
+def _module_state(value: object) -> Mapping[str, object] | None:
+    state = value.state if isinstance(value, StandIn) else None
+    return state if isinstance(state, Mapping) and "_parameters" in state else None
+
+
+def _walk(
+    module: Mapping[str, object], prefix: str, visited: Iterator[int]
+) -> Iterator[tuple[str, Tensor]]:
+    endless = next(visited) > _MAX_MODULES or prefix.count(".") > _MAX_DEPTH
+    if endless or len(prefix) > MAX_NAME:
+        raise BrokenFileError("its modules contain each other without end")
+    fleeting = module.get("_non_persistent_buffers_set")
+    # Not a set, in which other elements may take for ever to hash.
+    left_out = [n for n in fleeting if isinstance(n, str)] if isinstance(fleeting, list) else []
+    for kind in ("_parameters", "_buffers", "_modules"):
+        entries = module.get(kind)
+        for name, value in entries.items() if isinstance(entries, Mapping) else ():
+            inside = _module_state(value)
+            if kind == "_modules" and inside is not None:
+                yield from _walk(inside, f"{prefix}{name}.", visited)
+            elif kind != "_modules" and isinstance(value, Tensor) and name not in left_out:
+                yield f"{prefix}{name}", value
+
+
+def _read_archive(path: Path) -> tuple[object, list[str]]:
+    with zipfile.ZipFile(path) as archive:
+        entries = {info.filename: info for info in archive.infolist()}
+        if any("/code/" in name for name in entries):
+            raise BrokenFileError("it is TorchScript; save the state_dict() of its module instead")
+        refuse_inflated(archive, path)
+        pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
+        if len(pickles) != 1:
+            raise BrokenFileError(f"the archive has {len(pickles)} entries named data.pkl")
+        folder = pickles[0].removesuffix("data.pkl")
+        order = entries.get(f"{folder}byteorder")
+        if order is not None and archive.read(order).strip() == b"big":
+            raise BrokenFileError("it was written on a big-endian machine")
+
+        def read(key: str, _: int) -> bytearray:
+            return bytearray(archive.read(entries[f"{folder}data/{key}"]))
+
+        load = functools.partial(_load_storage, {}, read)
+        return read_pickle(io.BytesIO(archive.read(pickles[0])), load)
+
+
+def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
+    """Raises BrokenFileError for an archive whose entries are compressed, or overlap."""
+    if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+        raise BrokenFileError("it is compressed, which torch never does")
+    claimed, most = sum(info.file_size for info in archive.infolist()), path.stat().st_size
+    check_claim(f"its entries have {claimed:,} bytes", claimed, most, error=BrokenFileError)
+
+
+def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
+    """The content of a torch file of before PyTorch 1.6, and the names in its pickle.
+
+    Such a file has pickles of a magic number, the protocol, the system, the content, and the keys
+    of the storages. Each storage's length and bytes follow, so that storages are filled at the end.
+    """
+    # It begins with the magic number.
+    try:
+        begins, _ = read_pickle(file)
+    except CONTENT_ERRORS:  # of another kind of file
+        begins = None
+    if begins != _MAGIC:
+        raise BrokenFileError("it begins as no torch file does")
+    for _ in ("protocol", "system"):
+        read_pickle(file)
+    # The content, with storages of the size that it states.
+    promised = 0
+
+    def room_for(key: str, count: int) -> bytearray:
+        nonlocal promised
+        check_claim(
+            f"a storage has {count:,} bytes", count, len(file) - promised, error=BrokenFileError
+        )
+        promised += count
+        return bytearray(count)
+
+    storages = dict[str, Tensor]()
+    content, named = read_pickle(file, functools.partial(_load_storage, storages, room_for))
+    # The bytes of each storage.
+    keys, _ = read_pickle(file)
+    keys = keys if isinstance(keys, list) else []
+    names = [str(key) for key in keys if isinstance(key, str | int)]
+    if {*names} != storages.keys():
+        raise BrokenFileError("its storages are not those that its pickle names")
+    for key in names:
+        memory = storages[key].view(torch.uint8).numpy()
+        stored = int.from_bytes(file.read(8), "little") * storages[key].itemsize
+        part = file.read(len(memory))
+        if not stored == len(memory) == len(part):
+            raise BrokenFileError(f"storage {key[:20]} is shorter than it should be")
+        memory[:] = np.frombuffer(part, np.uint8)
+    return content, named
+
+
+def _load_storage(
+    storages: dict[str, Tensor], read: Callable[[str, int], bytearray], pid: tuple[Any, ...]
+) -> Tensor:
+    """The storage for ("storage", type, key, location, elements, view) as a flat tensor.
+
+    It is made once, of what `read` returns for its key and the bytes that it should have.
+    """
+    kind, key = pid[1].path.rpartition(".")[2] if isinstance(pid[1], StandIn) else "", pid[2]
+    if kind not in _DTYPES:
+        raise BrokenFileError(f"a storage of type {kind[:40] or '?'}")
+    if not isinstance(key, str | int):
+        raise BrokenFileError("a storage without a key")
+    key, dtype, count = str(key), _DTYPES[kind], int(pid[4])
+    if key not in storages:
+        data = read(key, count * dtype.itemsize)
+        storages[key] = torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
+    view = pid[5] if len(pid) > 5 else None
+    _, start, count = view if isinstance(view, tuple) else (None, 0, count)
+    if min(start, count) < 0 or start + count > len(storages[key]):
+        raise BrokenFileError(f"storage {key[:20]} is shorter than its {count} elements")
+    if storages[key].dtype != dtype:
+        raise BrokenFileError(f"storage {key[:20]} has two types")
+    return storages[key][start : start + count]
+
+
+def read_numpy_file(path: Path) -> dict[str, Tensor]:
+    """Returns the arrays of a .npy with a dict by name, those in a dict of it as "layer.name".
+
+    The arrays keep their type and their order of axes. A broken file raises whatever its parts do.
+    """
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        if npy.read_magic(content) != (1, 0):
+            raise BrokenFileError("it holds no dict of arrays")
+        shape, _, dtype = npy.read_array_header_1_0(content)
+        if not dtype.hasobject or shape != ():
+            raise BrokenFileError(f"it holds one array of shape {shape}, not named arrays")
+        array, _ = read_pickle(content)
+        left = len(content)
+    objects = _state_of_array(array)[4]
+    if not (isinstance(objects, list) and len(objects) == 1 and isinstance(objects[0], Mapping)):
+        raise BrokenFileError("it holds no dict of arrays")
+    tensors: dict[str, Tensor] = {}
+    for name, value in _entries(objects[0]):
+        tensors[name] = _unpickle(value, name, left)
+        left -= tensors[name].nbytes
+        count = len(tensors)
+        check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES, error=BrokenFileError)
+    return tensors
+
+
+def _state_of_array(value: object) -> tuple[Any, ...]:
+    """(version, shape, type, order, data) of a pickled numpy array; nothing for anything else."""
+    state = value.state if isinstance(value, StandIn) and value.path in _RECONSTRUCT else None
+    return state if isinstance(state, tuple) and len(state) == 5 else (None,) * 5
+
+
+def _entries(
+    content: Mapping[Any, object], prefix: str = "", depth: int = 1
+) -> Iterator[tuple[str, object]]:
+    """All that lies in the dict and in the dicts in it, by name; "." joins the keys."""
+    if depth > _MAX_DICTS:
+        raise BrokenFileError("its dicts are nested deeper than the layers of any network")
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _entries(value, f"{prefix}{key}.", depth + 1)
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _unpickle(value: object, name: str, most: int) -> Tensor:
+    """The tensor of a pickled array of at most so many bytes."""
+    _, shape, dtype, fortran, data = _state_of_array(value)
+    if not isinstance(shape, tuple):
+        kind = value.path if isinstance(value, StandIn) else type(value).__name__
+        raise BrokenFileError(f"{name} is a {kind}, not an array")
+    shape, code, order = tuple(map(int, shape)), dtype.arguments[0], dtype.state[1]
+    data = data.encode("latin-1") if isinstance(data, str) else data  # as Python 2 has it
+    if not isinstance(data, bytes):
+        raise BrokenFileError(f"{name} holds objects, not numbers")
+    check_claim(f"{name} has {len(data):,} bytes", len(data), most, error=BrokenFileError)
+    if any(side < 0 for side in shape):
+        raise BrokenFileError(f"{name} has a shape of {shape}")
+    if not isinstance(code, str) or not isinstance(order, str):
+        raise BrokenFileError("an array without a type")
+    number = np.dtype(f"{order[:1]}{code[:8]}")
+    array = np.frombuffer(data, number) if data else np.empty(0, number)
+    if array.dtype.kind not in "fiub":
+        raise BrokenFileError(f"{name} is an array of {array.dtype.str}, not of numbers")
+    array = array.reshape(shape, order="F" if fortran else "C")
+    return torch.from_numpy(array.astype(number.newbyteorder("="), order="C"))
