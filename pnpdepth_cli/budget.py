@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import FileFormatError
 
 _MOST_PIXELS = 64_000_000  # of the largest common cameras
 _MOST_FILE_BYTES = 1 << 30
@@ -71,13 +71,7 @@ def check_claim(
     """Raises the error if a file claims more than may be taken, or less than nothing.
 
     Every reader calls this with what a file claims, before memory is taken for it.
-
-    Args:
-        claim: Beginning of the message, such as "a.png has 9 pixels".
-        size: Bytes, pixels, values or entries claimed.
-        most: Largest size allowed.
-        error: Type of the error, or function that makes it of a message.
-        way_out: End of the message.
+    The claim begins the message, as in "a.png has 9 pixels"; the way out ends it.
     """
     if not 0 <= size <= most:
         raise error(f"{claim}, more than {most:,}{f'; {way_out}' if way_out else ''}")
@@ -93,14 +87,8 @@ def check_network_file(path: Path, kind: str, error: Callable[[str], Exception])
 
 
 def set_max_pixels(max_pixels: int | None) -> None:
-    """Allow images of this many pixels, and files in proportion; None restores the default.
-
-    Raises:
-        UsageError: The number is below 1.
-    """
+    """Allow images of this many pixels, and files in proportion; None restores the default."""
     global _chosen
-    if max_pixels is not None and max_pixels < 1:
-        raise UsageError(f"max-pixels is {max_pixels}; give a number of pixels above 0")
     _chosen = max_pixels
 
 

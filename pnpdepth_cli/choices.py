@@ -6,7 +6,6 @@ of an installed package adds another. Closed lists are tuples.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib.util
 import pkgutil
@@ -32,9 +31,7 @@ class OpenList(Mapping[str, Any]):
     Args:
         module: Name of the module or package, such as "pnpdepth_cli.core.losses".
         group: Last part of the entry point group.
-        noun: Name of one entry in messages.
         names: All names in the module's table, in the order of their listing.
-        first: Names listed before the others, which follow in alphabetical order.
         attribute: Name of the object in each file of the package.
         in_file: Name of the object in a user's Python file, whose path is then a name too.
     """
@@ -44,18 +41,15 @@ class OpenList(Mapping[str, Any]):
         module: str,
         *,
         group: str,
-        noun: str,
         names: tuple[str, ...] = (),
-        first: tuple[str, ...] = (),
         attribute: str | None = None,
         in_file: str | None = None,
     ) -> None:
-        self.group, self.noun = group, noun
-        self._module, self._attribute, self._in_file = module, attribute, in_file
-        self._names, self._first = names, names or first
+        self._module, self._group, self._names = module, group, names
+        self._attribute, self._in_file = attribute, in_file
 
     def __getitem__(self, name: str) -> Any:
-        """Returns the entry. Raises UsageError, with near matches, for an unknown name."""
+        """Returns the entry. Raises UsageError for an unknown name."""
         if name in self._modules:
             module = importlib.import_module(self._modules[name])
             if self._names:
@@ -64,19 +58,15 @@ class OpenList(Mapping[str, Any]):
         if name in self._entry_points:
             return self._entry_points[name].load()
         if name in self:
-            return _from_file(name, str(self._in_file), self.noun)
-        near = difflib.get_close_matches(name, list(self), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"choose from {', '.join(self)}"
-        raise UsageError(f"unknown {self.noun} {name!r}; {hint}")
+            return _from_file(name, str(self._in_file))
+        raise UsageError(f"{name!r} is none of the {self._group} {', '.join(self)}")
 
     def __contains__(self, name: object) -> bool:
         is_file = self._in_file is not None and str(name).endswith(".py")
         return is_file or name in self._modules or name in self._entry_points
 
     def __iter__(self) -> Iterator[str]:
-        names = {**self._modules, **self._entry_points}
-        order = {name: index for index, name in enumerate(self._first)}
-        return iter(sorted(names, key=lambda name: (order.get(name, len(order)), name)))
+        return iter({**self._modules, **self._entry_points})
 
     def __len__(self) -> int:
         return len({**self._modules, **self._entry_points})
@@ -95,20 +85,21 @@ class OpenList(Mapping[str, Any]):
 
     @functools.cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:
-        return {point.name: point for point in entry_points(group=f"pnpdepth.{self.group}")}
+        found = entry_points(group=f"pnpdepth.{self._group}")
+        return {point.name: point for point in sorted(found, key=lambda point: point.name)}
 
 
 @functools.cache
-def _from_file(path: str, attribute: str, noun: str) -> Any:
+def _from_file(path: str, attribute: str) -> Any:
     """The object in a Python file, which is run. UsageError if there is none."""
-    values: dict[str, Any] = {"__name__": Path(path).stem, "__file__": path}
+    values: dict[str, object] = {"__name__": Path(path).stem, "__file__": path}
     try:
         exec(compile(Path(path).read_bytes(), path, "exec"), values)
     except Exception as error:
         fact = f"{type(error).__name__}: {error}"
-        raise UsageError(f"{noun} file {path} cannot be run: {fact}") from None
+        raise UsageError(f"{path} cannot be run: {fact}") from None
     if not callable(values.get(attribute)):
-        raise UsageError(f"{noun} file {path} defines no function {attribute!r}")
+        raise UsageError(f"{path} defines no function {attribute!r}")
     return values[attribute]
 
 
@@ -116,7 +107,6 @@ LOSSES = OpenList(
     "pnpdepth_cli.core.losses",
     in_file="loss",
     group="losses",
-    noun="loss",
     names=("l1", "l2", "huber", "berhu", "cauchy"),
 )
 """L: (N,) predicted and (N,) measured depth to a scalar."""
@@ -125,23 +115,18 @@ UPDATES = OpenList(
     "pnpdepth_cli.core.update_rules",
     in_file="update_rule",
     group="updates",
-    noun="update rule",
     names=("sign", "sgd", "normalised", "momentum", "adam"),
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
 PROPAGATIONS = OpenList(
-    "pnpdepth_cli.completion.propagation",
-    group="propagations",
-    noun="propagation",
-    names=("gp", "local"),
+    "pnpdepth_cli.completion.propagation", group="propagations", names=("gp", "local")
 )
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
 BASELINES = OpenList(
     "pnpdepth_cli.completion.baselines",
     group="baselines",
-    noun="baseline",
     names=(
         *("nearest", "linear", "linear-log", "median", "scale", "affine"),
         *("scale-disparity", "affine-disparity", "local"),
@@ -149,29 +134,17 @@ BASELINES = OpenList(
 )
 """Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
 
-NETWORKS = OpenList(
-    "model_zoo_defs",
-    group="models",
-    noun="network",
-    first=(
-        *("compact", "eigen", "fcrn", "sfmlearner", "sparseconv", "adnn", "sparse2dense"),
-        *("latefusion", "nconv", "pncnn"),
-    ),
-)
+NETWORKS = OpenList("model_zoo_defs", group="models")
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
 FORMATS = OpenList(
-    "pnpdepth_cli.io.depth",
-    group="formats",
-    noun="depth format",
-    names=("png", "exr", "npy", "npz", "pfm", "tiff"),
+    "pnpdepth_cli.io.depth", group="formats", names=("png", "exr", "npy", "npz", "pfm", "tiff")
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 LAYOUTS = OpenList(
     "pnpdepth_cli.dataset.layouts",
     group="layouts",
-    noun="layout",
     names=(
         *("manifest", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
         *("tum", "7scenes", "eth3d", "colmap", "void", "diode", "ibims", "scannet"),
@@ -180,18 +153,10 @@ LAYOUTS = OpenList(
 )
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""
 
-EXPORTS = OpenList(
-    "pnpdepth_cli.commands.exports",
-    attribute="EXPORT",
-    group="exports",
-    noun="export",
-    first=("colmap", "nerfstudio", "gaussian-splatting"),
-)
+EXPORTS = OpenList("pnpdepth_cli.commands.exports", attribute="EXPORT", group="exports")
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-MEASURES = OpenList(
-    "pnpdepth_cli.measures", group="measures", noun="measure", names=tuple(measures.TABLE)
-)
+MEASURES = OpenList("pnpdepth_cli.measures", group="measures", names=tuple(measures.TABLE))
 """Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method
@@ -207,19 +172,15 @@ SPACES: tuple[Space, ...] = get_args(Space)
 """The quantities in which depth is predicted, fitted or interpolated."""
 
 OutputKind = Literal[Space, "unknown"]
-OUTPUT_KINDS: tuple[OutputKind, ...] = get_args(OutputKind)
 """What the numbers of a network's output are."""
 
 OutputScale = Literal["metric", "scale", "affine", "unknown"]
-OUTPUT_SCALES: tuple[OutputScale, ...] = get_args(OutputScale)
 """Up to what a network's output is known: metres, a factor, or a factor and a shift."""
 
 InputKind = Literal["rgb", "sparse", "rgb+sparse"]
-INPUT_KINDS: tuple[InputKind, ...] = get_args(InputKind)
 """What a network takes as input."""
 
 Fit = Literal["stretch", "crop"]
-FITS: tuple[Fit, ...] = get_args(Fit)
 """How an image is brought to a network's fixed input size."""
 
 NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mean and std, −1…1, 0…255

@@ -55,17 +55,21 @@ class SparsePoints(Generic[A]):
         """
         if (height, width) == self.size:
             return self
-        scale = self._like_xy(width / self.size[1], height / self.size[0])
-        return replace(self, xy=(self.xy + 0.5) * scale - 0.5, size=(height, width))
+        xy = self.xy + 0.5
+        xy[:, 0] *= width / self.size[1]
+        xy[:, 1] *= height / self.size[0]
+        return replace(self, xy=xy - 0.5, size=(height, width))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
         """Returns the points inside these rows and columns, in coordinates of that crop."""
-        xy = self.xy - self._like_xy(left, top)
-        inside: Any = in_frame(xy, (height, width))
-        return replace(self, xy=xy[inside], depth=self.depth[inside], size=(height, width))
+        xy = self.xy + 0.0  # a copy, in either library
+        xy[:, 0] -= left
+        xy[:, 1] -= top
+        moved = replace(self, xy=xy, size=(height, width))
+        return moved.select(in_frame(xy, moved.size))
 
-    def select(self, mask: Any) -> SparsePoints[A]:
-        """Returns the points where mask, (N,) bool of the same library, is true."""
+    def select(self, mask: Tensor | NDArray[np.bool_] | slice) -> SparsePoints[A]:
+        """Returns the points where mask, (N,) bool of the same library, is true; or a slice."""
         return replace(self, xy=self.xy[mask], depth=self.depth[mask])
 
     def joined(self: SparsePoints[Tensor], others: SparsePoints[Tensor]) -> SparsePoints[Tensor]:
@@ -126,15 +130,6 @@ class SparsePoints(Generic[A]):
         flat = self.depth.new_full((height * width,), math.inf)
         flat.scatter_reduce_(0, (row * width + column)[inside], self.depth[inside], "amin")
         return flat.masked_fill(flat.isinf(), 0.0).reshape(1, 1, height, width)
-
-    def _like_xy(self, x: float, y: float) -> Any:
-        """(2,): x and y as an array like `xy`, of its dtype and on its device."""
-        xy: Any = self.xy
-        if hasattr(xy, "new_tensor"):
-            return xy.new_tensor([x, y])
-        import numpy as np
-
-        return np.asarray((x, y), dtype=xy.dtype)
 
 
 @overload

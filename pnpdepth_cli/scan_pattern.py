@@ -6,11 +6,12 @@ The points of a rotating LiDAR are close together along a scan line and farther 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 MIN_LINES = 12
 """With fewer scan lines, leaving some out is another task than filling in between them."""
@@ -41,8 +42,6 @@ class ScanPattern:
 
 def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern:
     """Returns the spacing along rows and columns of (N, 2) pixel coordinates in an image (H, W)."""
-    import numpy as np
-
     pixels = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
     return ScanPattern(points=len(x), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
@@ -54,11 +53,6 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     Each point is linked with the next one to the right in nearly the same row; a line that is
     interrupted, as by the sky, is several.
     """
-    import numpy as np
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     pattern = scan_pattern(xy, size)
     if not pattern.has_scan_lines:
         return None
@@ -83,8 +77,6 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
 
 def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
     """The median distance in pixels from a point to the next in its row or a row beside it."""
-    import numpy as np
-
     if not len(column):
         return float("inf")
     width = int(column.max()) + 1

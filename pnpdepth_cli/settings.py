@@ -56,7 +56,6 @@ class Settings:
         "fused: NETWORK and the included network `compact` refined, fused and propagated; alone:"
         " the same without `compact`; paper: the paper's setting and nothing else.",
         choices=choices.METHODS,
-        show_default=True,
     )
     layer: str | None = option(
         None,

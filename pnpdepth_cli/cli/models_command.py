@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
+
+if TYPE_CHECKING:
+    from pnpdepth_cli.commands.networks import MeasuredLayer
 
 
 @click.group(short_help="List or check networks.", invoke_without_command=True)
@@ -35,14 +38,12 @@ def models(context: click.Context, as_json: bool) -> None:
     from pnpdepth_cli.commands.tables import Table
 
     columns = ("name", "takes", "size", "gives", "params", "weights", "defaults")
-    keys = ("name", "input_kind", "size", "output_kind")
-    defaults = "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}"
     rows = [
         (
-            *(each[key] for key in keys),
+            *(each[key] for key in ("name", "input_kind", "size", "output_kind")),
             f"{each['parameters']:,}",
             "shipped" if each["checkpoint"] else "yours",
-            defaults.format(**each),
+            "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}".format(**each),
         )
         for each in listed
     ]
@@ -70,7 +71,7 @@ def check(network: str, image: Path | None, checkpoint: Path | None) -> None:
     "--all", "every", is_flag=True, help="List every submodule, not only the definition's."
 )
 @options.as_json
-def layers(every: bool, as_json: bool, **values: Any) -> None:
+def layers(model: str, checkpoint: Path | None, every: bool, as_json: bool) -> None:
     """List the layers a network can be cut at.
 
     For each layer: shape and stride of z, the fraction of the network's cost behind the cut (which
@@ -78,31 +79,30 @@ def layers(every: bool, as_json: bool, **values: Any) -> None:
     """
     from pnpdepth_cli.commands.networks import list_layers
 
-    choice = NetworkChoice(**values)
+    choice = NetworkChoice(model=model, checkpoint=checkpoint)
     with progress_bar("layers", "layer") as show:
-        rows = [asdict(row) for row in list_layers(choice, every=every, on_layer=show)]
+        listed = list_layers(choice, every=every, on_layer=show)
     if as_json:
-        print_json(rows)
+        print_json([asdict(layer) for layer in listed])
         return
     from pnpdepth_cli.cli.printing import print_table
     from pnpdepth_cli.commands.tables import Table
 
     columns = ("layer", "z", "stride", "cost\nbehind", "field\nin z", "field\nin depth")
-    title = f"layers of {choice.model}"
-    print_table(Table(title=title, columns=columns, rows=[_cells(row) for row in rows]))
+    print_table(Table(title=f"layers of {model}", columns=columns, rows=[*map(_cells, listed)]))
 
 
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    if row["problem"]:
-        reason = row["problem"].partition(": ")[2] or row["problem"]
-        return (row["name"], "–", *[""] * 3, reason)
+def _cells(layer: MeasuredLayer) -> tuple[str, ...]:
+    if layer.problem is not None:
+        return (layer.name, "–", *[""] * 3, layer.problem.partition(": ")[2] or layer.problem)
+    in_z, in_depth = layer.field_in_z, layer.field_in_output
     return (
-        row["name"],
-        "×".join(str(n) for n in row["shape"]),
-        f"{row['stride']:g}" if row["stride"] else "–",
-        f"{row['cost_behind']:.0%}" if row["cost_behind"] is not None else "–",
-        "{}×{}".format(*row["field_in_z"]) if row["field_in_z"] else "–",
-        "{}×{}".format(*row["field_in_output"]),
+        layer.name,
+        "×".join(map(str, layer.shape or ())),
+        f"{layer.stride:g}" if layer.stride else "–",
+        f"{layer.cost_behind:.0%}" if layer.cost_behind is not None else "–",
+        "×".join(map(str, in_z)) if in_z else "–",
+        "×".join(map(str, in_depth or ())),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field
 from itertools import chain
@@ -16,6 +17,8 @@ from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
 FILE = click.Path(path_type=Path)
+_WITHOUT = (None, False, 0, math.inf)
+"""Defaults that are no value to show."""
 _NAME_COLUMN = 22
 _HELP = ("--help", "--help-all")
 _SHOW_ALL = "pnpdepth.help_all"
@@ -25,11 +28,13 @@ Decorator = Callable[[Command], Command]
 
 def click_option(declared: Field[Any]) -> Decorator:
     """Returns the click option of a field that `pnpdepth_cli.settings.option` made."""
-    details = {"type": _type_of(declared), "default": declared.default, **declared.metadata}
+    default = declared.default
+    details = {"type": _type_of(declared), "default": default, **declared.metadata}
     for ours in ("flag", "choices", "least", "most"):
         details.pop(ours, None)
     if declared.type == "bool":
         details["is_flag"] = True
+    details.setdefault("show_default", default not in _WITHOUT)
     return click.option(flag_of(declared), declared.name, **details)
 
 

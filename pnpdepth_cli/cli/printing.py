@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from pnpdepth_cli.cli.terminal import printable, say
 from pnpdepth_cli.commands.error_tables import (
@@ -22,7 +22,7 @@ from pnpdepth_cli.commands.error_tables import (
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.stages import GT
 
 if TYPE_CHECKING:
@@ -59,9 +59,6 @@ class TableFiles:
         if len({path.resolve() for path in files}) < len(files):
             raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
         check_outputs(files, inputs, overwrite=self.overwrite)
-        for path in files:
-            if not path.parent.is_dir():
-                raise OutputError(f"{path}: its folder does not exist; create it first")
 
     def write(self, csv: Table, latex: Table | None = None) -> bool:
         """Writes the files that were named. Returns whether a text went to stdout."""
@@ -81,21 +78,16 @@ def print_table(table: Table, *, err: bool = False) -> None:
     console = Console(stderr=err, highlight=False)
     if not console.is_terminal:
         console.width = _WIDE
-    title = escape(printable(table.title))
+    title = Text(printable(table.title), style="table.title")
     shown = RichTable(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    first, *others = map(escape, table.headings)
+    first, *others = map(Text, table.headings)
     shown.add_column(first, overflow="fold", no_wrap=True)
     for heading in others:
         shown.add_column(heading, overflow="fold", justify="right")
     for row in table.texts:
-        shown.add_row(*map(_markup, row))
+        styles = (_COLOURS[each.style] if isinstance(each, Cell) else "" for each in row)
+        shown.add_row(*map(Text, map(printable, row), styles))
     console.print(shown)
-
-
-def _markup(cell: str) -> str:
-    text = escape(printable(cell))
-    colour = _COLOURS[cell.style] if isinstance(cell, Cell) else ""
-    return f"[{colour}]{text}[/]" if colour else text
 
 
 def print_notes(notes: Sequence[str]) -> None:

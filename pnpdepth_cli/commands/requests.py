@@ -59,7 +59,6 @@ class CloudRequest:
         "Keep pixels on which N views agree; their depth is the mean.",
         metavar="N",
         least=1,
-        show_default=True,
     )
     voxel: float | None = option(None, "Merge the points in cubes of this side.", metavar="M")
     overwrite: bool = False
@@ -85,7 +84,7 @@ class FramesRequest:
     topics: tuple[str, ...] = ()
     """Topics of images, of points (PointCloud2) and of poses; else the only one of its kind."""
     tolerance: float = option(
-        0.05, "Largest time between an image and its scan.", metavar="SECONDS", show_default=True
+        0.05, "Largest time between an image and its scan.", metavar="SECONDS"
     )
     clock_offset: float | None = option(
         None,
@@ -95,7 +94,7 @@ class FramesRequest:
     between: tuple[int, int] | None = option(
         None, "Only the frames of these numbers, from 0.", metavar="FIRST LAST"
     )
-    every: int = option(1, "Only every N-th of these.", metavar="N", least=1, show_default=True)
+    every: int = option(1, "Only every N-th of these.", metavar="N", least=1)
     overwrite: bool = False
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.file_bytes import write_csv
 from pnpdepth_cli.measures import Measure
 
@@ -97,5 +97,6 @@ def count_of(number: int, noun: str) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
+    make_folder(path.parent)
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))

@@ -92,7 +92,6 @@ class ReadOptions:
         "Whether the image is moved to the points: auto, if their depth edges show"
         " that it is not registered; or off.",
         choices=choices.REGISTRATIONS,
-        show_default=True,
     )
     scan: ScanOptions = field(default_factory=ScanOptions)
     sample: SamplePattern | None = None

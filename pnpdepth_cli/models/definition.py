@@ -19,9 +19,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from pnpdepth_cli import choices
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
@@ -79,7 +78,7 @@ class Fixed:
 
     def __post_init__(self) -> None:
         _check_whole(self, "height", "width")
-        _check_choice(self, "fit", choices.FITS)
+        _check_choice(self, "fit", get_args(Fit))
 
 
 @dataclass(frozen=True)
@@ -217,9 +216,9 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
-        _check_choice(self, "input_kind", choices.INPUT_KINDS)
-        _check_choice(self, "output_kind", choices.OUTPUT_KINDS)
-        _check_choice(self, "output_scale", choices.OUTPUT_SCALES)
+        _check_choice(self, "input_kind", get_args(InputKind))
+        _check_choice(self, "output_kind", get_args(OutputKind))
+        _check_choice(self, "output_scale", get_args(OutputScale))
         none = type(None)
         for field, kinds, wanted in (
             ("name", (str,), "a text"),

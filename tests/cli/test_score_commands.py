@@ -69,7 +69,9 @@ def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path
     before = Path("gt/e.npy").read_bytes()
     assert code_of("eval", "out/e.npy", "gt/e.npy", "--csv", "gt/e.npy", "--overwrite") == 2
     assert Path("gt/e.npy").read_bytes() == before
-    assert code_of("eval", "out", "gt", "--csv", "nowhere/s.csv") == 2
+    assert code_of("eval", "out", "gt", "--csv", "gt/e.npy/s.csv") == 2
+    assert code_of("eval", "out", "gt", "--csv", "new/s.csv") == 7
+    assert Path("new/s.csv").is_file()
 
 
 def test_columns_choose_measures_and_latex_has_no_thousands_separators(

@@ -39,8 +39,7 @@ def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(model_zoo_defs, "__path__", folders)
     monkeypatch.setattr(model_zoo_defs.__spec__, "submodule_search_locations", folders)
     monkeypatch.syspath_prepend(str(tmp_path))
-    old = choices.NETWORKS
-    table = choices.OpenList("model_zoo_defs", group="models", noun="network", first=tuple(old))
+    table = choices.OpenList("model_zoo_defs", group="models")
     monkeypatch.setattr(choices, "NETWORKS", table)
     return tmp_path
 

@@ -78,7 +78,7 @@ class BatchRequest:
     names: str | None = option(
         None, "Only frames whose names match, such as 'drive_1/*'.", metavar="GLOB", flag="--frames"
     )
-    every: int = option(1, "Only every N-th of these.", metavar="N", least=1, show_default=True)
+    every: int = option(1, "Only every N-th of these.", metavar="N", least=1)
     limit: int | None = option(None, "Only the first N of these.", metavar="N", least=1)
     html: Path | None = option(
         None,

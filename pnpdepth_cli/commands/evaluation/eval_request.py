@@ -41,9 +41,7 @@ class EvalRequest:
     """A depth file, or a folder of them."""
     ground_truth: Path
     """A depth file, a folder of them, or a data set of a known layout."""
-    protocol: str = option(
-        "paper", "Preset of the rules.", choices=choices.PROTOCOLS, show_default=True
-    )
+    protocol: str = option("paper", "Preset of the rules.", choices=choices.PROTOCOLS)
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
     delta: float | None = option(
         None,
@@ -55,7 +53,6 @@ class EvalRequest:
         "Scale each image to its ground truth, for relative predictions. affine-disparity takes"
         " disparity.",
         choices=choices.SCALINGS,
-        show_default=True,
     )
     depth_limits: tuple[float, float] | None = option(
         None,

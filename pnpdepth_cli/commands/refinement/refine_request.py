@@ -34,7 +34,6 @@ class NetworkChoice:
         "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
         " FILE.py[:ATTR], which is Python code and is run.",
         metavar="NETWORK",
-        show_default=True,
     )
     more_models: tuple[str, ...] = ()
     """Further networks, with their own weights, which are fused with the first."""
@@ -53,7 +52,6 @@ class NetworkChoice:
         "cpu",
         "cpu, cuda, cuda:1, mps, …",
         metavar="NAME",
-        show_default=True,
     )
 
 
@@ -78,13 +76,11 @@ class RefineRequest:
         "png",
         "Format of the depth file in an output folder.",
         choices=choices.FORMATS,
-        show_default=True,
     )
     unknown: str = option(
         "keep",
         "Depth that the points do not support, such as of the sky above a scan: keep it, or zero.",
         choices=choices.UNKNOWN,
-        show_default=True,
     )
     view_3d: bool = False
     """Whether the 3D view of a report is written."""
