@@ -46,20 +46,16 @@ def load_network(
         CheckpointError: The weights cannot be read or do not fit.
         DeviceError: The device cannot be used.
     """
-    if not isinstance(checkpoint, str | Path | None):
-        raise UsageError(f"checkpoint must be a path, not {type(checkpoint).__name__}")
     path = None if checkpoint is None else Path(checkpoint)
-    what: str | ModelDefinition
     if isinstance(spec, nn.Module):
         known = definition or assume_definition(name=type(spec).__name__, build=lambda: spec)
-        what = replace(known, build=lambda: spec, complete=path is None)
-    elif not isinstance(spec, str | Path):
+        known = replace(known, build=lambda: spec, complete=path is None)
+        return networks.load_network(known, path, device)
+    if not isinstance(spec, str | Path):
         raise UsageError(f"spec must be a name, a path or a module, not {type(spec).__name__}")
-    elif definition is not None:
+    if definition is not None:
         raise UsageError("definition is for a module; a name or a file has its own")
-    else:
-        what = str(spec)
-    return networks.load_network(what, path, device)
+    return networks.load_network(str(spec), path, device)
 
 
 def refine(

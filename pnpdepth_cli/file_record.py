@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import UsageError
 
 
-def what_applies(entries: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def what_applies(entries: Iterable[tuple[str, object]]) -> dict[str, object]:
     """Returns the entries that are not None, false or empty, as `asdict` wants them."""
     return {k: v for k, v in entries if v is not None and v is not False and v not in ({}, [])}
 
@@ -89,7 +88,7 @@ class FileRecord:
     contradicts_images: bool = False
     """Whether the images show another motion."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Returns what applies, by name."""
         return asdict(self, dict_factory=what_applies)
 

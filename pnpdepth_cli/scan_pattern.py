@@ -5,7 +5,7 @@ The points of a rotating LiDAR are close together along a scan line and farther 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,30 +21,27 @@ _ACROSS_OVER_ALONG = 1.5  # at least: spacing across over spacing along scan lin
 _ALONG, _ACROSS = 3.0, 0.35  # spacings to the next point of a line, at most
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScanPattern:
-    """Spacing of sparse points."""
+class ScanPattern(NamedTuple):
+    """Spacing of points on scan lines."""
 
-    points: int
     along_px: float
     """Median distance to the next point along a row."""
     across_px: float
     """Median distance to the next point along a column."""
 
-    @property
-    def has_scan_lines(self) -> bool:
-        """Whether points are much denser along rows than along columns."""
-        return (
-            self.points >= _MIN_POINTS
-            and _ACROSS_OVER_ALONG * self.along_px <= self.across_px < float("inf")
-        )
 
+def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern | None:
+    """Returns the spacing of (N, 2) pixel coordinates in an image (H, W); None without scan lines.
 
-def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern:
-    """Returns the spacing along rows and columns of (N, 2) pixel coordinates in an image (H, W)."""
+    With scan lines, points are much denser along rows than along columns.
+    """
     pixels = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
-    return ScanPattern(points=len(x), along_px=_median_gap(x, y), across_px=_median_gap(y, x))
+    if len(x) < _MIN_POINTS:
+        return None
+    along, across = _median_gap(x, y), _median_gap(y, x)
+    is_scan = _ACROSS_OVER_ALONG * along <= across < np.inf
+    return ScanPattern(along, across) if is_scan else None
 
 
 def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:
@@ -53,8 +50,7 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     Each point is linked with the next one to the right in nearly the same row; a line that is
     interrupted, as by the sky, is several.
     """
-    pattern = scan_pattern(xy, size)
-    if not pattern.has_scan_lines:
+    if (pattern := scan_pattern(xy, size)) is None:
         return None
     xy = np.asarray(xy, np.float64)
     reach = np.array([_ALONG * pattern.along_px, max(1.0, _ACROSS * pattern.across_px)])
@@ -77,8 +73,6 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
 
 def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
     """The median distance in pixels from a point to the next in its row or a row beside it."""
-    if not len(column):
-        return float("inf")
     width = int(column.max()) + 1
     pixels = np.unique(row * width + column)
     row, column = np.divmod(pixels, width)

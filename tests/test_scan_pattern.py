@@ -21,14 +21,8 @@ def lines_of_points(gap: int, slope: float = 0.03) -> tuple[NDArray[np.float64],
 
 def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
     y, x = np.mgrid[:120:5, :300:3]
-    pattern = scan_pattern(np.column_stack([x.ravel(), y.ravel()]), SIZE)
-    assert (pattern.along_px, pattern.across_px) == (3.0, 5.0)
-    assert pattern.has_scan_lines
-    turned = scan_pattern(np.column_stack([y.ravel(), x.ravel()]), SIZE[::-1])
-    assert (turned.along_px, turned.across_px) == (5.0, 3.0)
-    assert not turned.has_scan_lines
-    # the last column of a row is not beside the first of the next
-    assert scan_pattern(np.array([[2, 0], [0, 1], [1, 1]]), (2, 3)).along_px == 1
+    assert scan_pattern(np.column_stack([x.ravel(), y.ravel()]), SIZE) == (3.0, 5.0)
+    assert scan_pattern(np.column_stack([y.ravel(), x.ravel()]), SIZE[::-1]) is None
 
 
 @pytest.mark.parametrize("gap", [4, 7])

@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.refinement.refine_request import (
     parse_sample,
 )
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
-from pnpdepth_cli.errors import FramesFailedError, StorageError, UsageError
+from pnpdepth_cli.errors import FramesFailedError, UsageError
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -151,13 +151,7 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
 
     with progress_bar("batch", "frame") as show:
         progress = BatchProgress(show, pressed)
-        try:
-            summary = run_batch(request, progress)
-        except StorageError as error:
-            raise StorageError(f"{error}; run the same command to continue") from error
-        except KeyboardInterrupt:
-            say("stopped; run the same command to continue")
-            raise click.exceptions.Exit(INTERRUPTED) from None
+        summary = run_batch(request, progress)
     print_batch(summary)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
@@ -190,20 +184,9 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
 def _combinations(
     context: click.Context, varied: Sequence[str]
 ) -> dict[str, tuple[dict[str, str], dict[str, Any]]]:
-    """The combinations of the values of all `--vary`; the last one's change fastest.
+    """The values of all combinations of `--vary`, by the folder of the results.
 
-    Args:
-        context: The parsed options of the command.
-        varied: Texts such as `lr=1%,3%`.
-
-    Returns:
-        By the folder of the results, such as `lr=1%,iterations=5`: the values as the user wrote
-        them, by the option's name without dashes; and by the name of the command's parameter,
-        without those left out.
-
-    Raises:
-        UsageError: An option cannot be varied, is given besides, or two folders have one name.
-        click.UsageError: A value is none of the option's.
+    They are as the user wrote them, by the option's name, and by the command's parameter.
     """
     varying = [_option(context, text.partition("=")[0]) for text in varied]
     axes = [text.partition("=")[2].split(",") for text in varied]

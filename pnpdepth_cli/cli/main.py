@@ -29,8 +29,6 @@ _MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
 _LONGEST = 2000
 """Most characters of a message; a longer one loses its middle."""
 
-_NO_MEMORY = "memory is exhausted; use a smaller image"
-
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""
 
@@ -106,8 +104,6 @@ def run(arguments: list[str]) -> int:
         return 0
     except click.Abort:
         return _end("interrupted", INTERRUPTED)
-    except MemoryError:
-        return _end(_NO_MEMORY, DeviceError.exit_code)
     except OSError as error:
         reason = error.strerror or str(error)
         full = error.errno in _OUTPUT_ERRORS
@@ -115,8 +111,8 @@ def run(arguments: list[str]) -> int:
         return _end(named + reason, (OutputError if full else InputError).exit_code)
     except Exception as error:
         exhausted = any(text in str(error) for text in _MEMORY_MESSAGES)
-        if exhausted and isinstance(error, ImportError | RuntimeError):
-            return _end(_NO_MEMORY, DeviceError.exit_code)
+        if exhausted or isinstance(error, MemoryError):
+            return _end("memory is exhausted; use a smaller image", DeviceError.exit_code)
         traceback.print_exception(error)
         fact = f"internal error ({type(error).__name__}: {error})"
         return _end(f"{fact}; it is a bug of this program, please report it", 1)

@@ -64,12 +64,7 @@ def _type_of(declared: Field[Any]) -> Any:
 
 
 def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator:
-    """Returns a decorator that adds the options of these groups of a request to a command.
-
-    Args:
-        *groups: Dataclasses whose fields are made by `pnpdepth_cli.settings.option`.
-        without: Names of fields that are left out.
-    """
+    """Returns a decorator that adds the options of dataclasses, but those of some fields."""
 
     def decorate(command: Command) -> Command:
         declared = [each for group in groups for each in options_of(group)]
@@ -81,11 +76,7 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
 
 
 def refinement(*, without: Collection[str] = ()) -> Decorator:
-    """Returns a decorator that adds the options of how a frame is refined.
-
-    Args:
-        without: Names of fields of a `RefineRequest` that are left out.
-    """
+    """Returns a decorator that adds the options of a `RefineRequest`, but those of some fields."""
     groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, RefineRequest)
 
     def decorate(command: Command) -> Command:
@@ -116,13 +107,18 @@ pose_kind = click_option(_DECLARED["pose_kind"])
 seed = click_option(_DECLARED["seed"])
 overwrite = click_option(_DECLARED["overwrite"])
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-sparse_output = click.option(
+_sparse_output = click.option(
     "-o",
     "--output",
     type=FILE,
     required=True,
     help="Sparse depth file: PNG, EXR, NPY, NPZ, PFM or TIFF map, or CSV rows x y depth.",
 )
+
+
+def sparse_files(command: Command) -> Command:
+    """Adds the options of a command that makes a file of sparse depth from other depth."""
+    return depth_scale(_sparse_output(overwrite(command)))
 
 
 def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
@@ -132,12 +128,7 @@ def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
-    """Returns the request that these options of a command make.
-
-    Args:
-        values: Values of the options of `refinement`, by their names; some are removed.
-        **others: Other fields of the request.
-    """
+    """Returns the request of the options of `refinement`, some of which are removed, and others."""
     scan = ScanOptions(**take_options(ScanOptions, values))
     first, *more = values.pop("model")
     models = {"model": first, "more_models": tuple(more)}

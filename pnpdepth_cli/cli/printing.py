@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.records import BatchSummary
     from pnpdepth_cli.commands.sparse.make import SparseSummary
 
+_STDOUT = Path("-")
 _WIDE = 1000
 """Columns of what is no terminal."""
 _NAMED = 3
@@ -36,41 +36,26 @@ _NAMED = 3
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableFiles:
-    """Where the tables of a command are written; `-` is stdout."""
+def check_tables(
+    *named: Path | None, inputs: Sequence[Path], overwrite: bool, as_json: bool
+) -> None:
+    """Raises UsageError or OutputError for files of tables, or `-`, that cannot be written."""
+    files = [path for path in named if path not in (None, _STDOUT)]
+    if named.count(_STDOUT) + as_json > 1:
+        raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
+    check_outputs(files, inputs, overwrite=overwrite)
+    if len({path.resolve() for path in files}) < len(files):
+        raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
 
-    csv: Path | None
-    latex: Path | None = None
-    overwrite: bool
-    as_json: bool
 
-    def check(self, inputs: Sequence[Path]) -> None:
-        """Checks the files before the work.
-
-        Raises:
-            UsageError: Two outputs go to one file or to stdout.
-            OutputError: A file is an input, or exists and is not to be replaced.
-        """
-        named = [path for path in (self.csv, self.latex) if path is not None]
-        files = [path for path in named if str(path) != "-"]
-        if len(named) - len(files) + self.as_json > 1:
-            raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
-        if len({path.resolve() for path in files}) < len(files):
-            raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
-        check_outputs(files, inputs, overwrite=self.overwrite)
-
-    def write(self, csv: Table, latex: Table | None = None) -> bool:
-        """Writes the files that were named. Returns whether a text went to stdout."""
-        texts = {} if self.csv is None else {self.csv: csv.csv()}
-        if self.latex is not None and latex is not None:
-            texts[self.latex] = latex.latex()
-        for path, text in texts.items():
-            if str(path) == "-":
-                click.echo(text.encode("utf-8", "backslashreplace"), nl=False)
-            else:
-                write_text(path, text)
-        return Path("-") in texts
+def write_tables(texts: Mapping[Path | None, str]) -> bool:
+    """Writes each text to its file, if that is named. Returns whether one went to stdout."""
+    for path, text in texts.items():
+        if path == _STDOUT:
+            click.echo(text.encode("utf-8", "backslashreplace"), nl=False)
+        elif path is not None:
+            write_text(path, text)
+    return _STDOUT in texts
 
 
 def print_table(table: Table, *, err: bool = False) -> None:

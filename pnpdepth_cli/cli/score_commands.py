@@ -36,7 +36,14 @@ _OUTPUT = ("--csv", "--columns", "--overwrite", "--json")
 @click.option("--csv", type=options.FILE, metavar="FILE|-", help="Write a row per frame.")
 @options.overwrite
 @options.as_json
-def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
+def evaluate(
+    prediction: Path,
+    ground_truth: Path,
+    csv: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
     """Score the depth in PRED against the ground truth in GT: two files, or two folders.
 
     \b
@@ -61,20 +68,18 @@ def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     kitti-devkit  figures of KITTI's development kit: missing depth filled in, metres, 1/m
     eigen, garg   0.001–80 m, predictions clipped to it, Eigen's or Garg's crop
     """
-    from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
+    from pnpdepth_cli.cli.printing import check_tables, print_notes, print_table, write_tables
     from pnpdepth_cli.commands.evaluation import evaluate as command
 
     # All that can be wrong is found before anything is scored.
-    names = ("csv", "overwrite", "as_json")
-    files = TableFiles(**{name: values.pop(name) for name in names})
-    files.check((prediction, ground_truth))
+    check_tables(csv, inputs=(prediction, ground_truth), overwrite=overwrite, as_json=as_json)
     request = EvalRequest(prediction=prediction, ground_truth=ground_truth, **values)
     # The scores, as tables and as JSON.
     with progress_bar("eval", "frame") as show:
         evaluation = command.evaluate(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])
-    to_stdout = files.write(command.frames_table(evaluation))
-    if files.as_json:
+    to_stdout = write_tables({csv: command.frames_table(evaluation).csv()})
+    if as_json:
         print_json(evaluation.to_json())
     elif not to_stdout:
         print_table(command.means_table(evaluation))
@@ -108,7 +113,13 @@ def evaluate(prediction: Path, ground_truth: Path, **values: Any) -> None:
     " plot.",
 )
 def compare(
-    runs: tuple[str, ...], columns: tuple[str, ...] | None, plot: Path | None, **table_files: Any
+    runs: tuple[str, ...],
+    columns: tuple[str, ...] | None,
+    plot: Path | None,
+    csv: Path | None,
+    latex: Path | None,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Compare RUNs with the first of them, on the frames that all of them scored.
 
@@ -126,19 +137,20 @@ def compare(
     correlated. p is adjusted for the number of measures and runs (Holm). It is exact for few
     groups, else computed with random permutations.
     """
-    from pnpdepth_cli.cli.printing import TableFiles, print_notes, print_table
+    from pnpdepth_cli.cli.printing import check_tables, print_notes, print_table, write_tables
     from pnpdepth_cli.commands.evaluation import compare as command
     from pnpdepth_cli.commands.evaluation.plot import plot_comparison
 
-    files = TableFiles(**table_files)
-    files.check([Path(run) for run in runs])
+    inputs = [Path(run) for run in runs]
+    check_tables(csv, latex, inputs=inputs, overwrite=overwrite, as_json=as_json)
     comparison = command.compare(runs, columns=columns)
     if plot is not None:
-        plot_comparison(comparison, plot, overwrite=files.overwrite)
+        plot_comparison(comparison, plot, overwrite=overwrite)
     print_notes(comparison.notes)
     table = command.comparison_table(comparison)
-    to_stdout = files.write(table, command.methods_table(comparison))
-    if files.as_json:
+    methods = command.methods_table(comparison)
+    to_stdout = write_tables({csv: table.csv(), latex: methods.latex()})
+    if as_json:
         print_json(comparison.to_json())
     elif not to_stdout:
         print_table(table)

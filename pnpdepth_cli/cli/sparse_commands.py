@@ -24,9 +24,7 @@ from pnpdepth_cli.dataset.read_options import ScanOptions
     required=True,
     help="Camera image: gives the size, and is drawn on.",
 )
-@options.depth_scale
-@options.sparse_output
-@options.overwrite
+@options.sparse_files
 def project(**values: Any) -> None:
     """Project a LiDAR SCAN (KITTI's BIN, NPY, PCD or PLY) to a sparse depth map.
 
@@ -57,9 +55,7 @@ def project(**values: Any) -> None:
 )
 @click.option("--image", type=options.FILE, help="Image for `features`.")
 @options.seed
-@options.depth_scale
-@options.sparse_output
-@options.overwrite
+@options.sparse_files
 def sample(**values: Any) -> None:
     """Sample sparse depth from the dense DEPTH.
 
@@ -109,9 +105,7 @@ def sample(**values: Any) -> None:
     help="Intrinsics: a file with nine numbers or K, or a KITTI calibration.",
 )
 @options.seed
-@options.depth_scale
-@options.sparse_output
-@options.overwrite
+@options.sparse_files
 def simulate(
     sensor: str | None, beams: int | None, vertical_fov: tuple[float, float] | None, **values: Any
 ) -> None:

@@ -159,7 +159,7 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
     spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
     step = min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
     pattern = scan_pattern(points.xy, points.size)
-    if not pattern.has_scan_lines:
+    if pattern is None:
         return step, step
     return min(_MAX_STEP, max(step, int(pattern.across_px / _NODES_BETWEEN_LINES))), step
 

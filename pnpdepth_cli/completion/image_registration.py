@@ -139,7 +139,7 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     """
     xy, depth = points.xy.double().numpy(), points.depth.double().numpy()
     # Points that cannot tell.
-    if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size).has_scan_lines:
+    if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size):
         return None
     if len(xy) > _MOST_POINTS:
         chosen = np.linspace(0, len(xy) - 1, _MOST_POINTS).astype(np.intp)

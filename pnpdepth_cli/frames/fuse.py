@@ -75,7 +75,7 @@ class ValidatedFrame(ValidationPoints):
     def has_scan_lines(self) -> bool:
         """Whether the points are those of a scanner."""
         points = self.whole.points
-        return scan_pattern(points.xy, points.size).has_scan_lines
+        return scan_pattern(points.xy, points.size) is not None
 
     @property
     def propagation(self) -> str:

@@ -81,7 +81,7 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     if frame.validation is not None:
         residual, sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
-    is_map = is_dense(points) and not scan_pattern(points.xy, points.size).has_scan_lines
+    is_map = is_dense(points) and scan_pattern(points.xy, points.size) is None
     of_points = calibration(residual, sigma, len(points)) * shape
     of_sensor = torch.tensor(SENSOR_ERROR * is_map)
     sigma_m = of_points.hypot(of_sensor) * depth

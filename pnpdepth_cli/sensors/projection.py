@@ -223,7 +223,7 @@ def occluded_in_map(points: Points) -> Mask | None:
         return None
     pattern = scan_pattern(points.xy, points.size)
     low, high = _LINE_SPACING_PX
-    if not (pattern.has_scan_lines and low <= pattern.across_px <= high):
+    if pattern is None or not low <= pattern.across_px <= high:
         return None
     if interleaved(as_depth_image(points)).sum() < _INTERLEAVED * len(points):
         return None

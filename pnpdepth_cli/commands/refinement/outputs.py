@@ -120,7 +120,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     source = inputs.sources.get("sparse")
     if frame.valid is not None or source is None:
         return frame
-    if not (source.calibration or scan_pattern(frame.used.xy, frame.used.size).has_scan_lines):
+    if not (source.calibration or scan_pattern(frame.used.xy, frame.used.size)):
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
     note = (
