@@ -33,8 +33,8 @@ _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""
 
 COMMANDS = {
-    "refine": "refine_command:refine",
-    "batch": "batch_command:batch",
+    "refine": "refine_commands:refine",
+    "batch": "refine_commands:batch",
     "models": "models_command:models",
     "layers": "models_command:layers",
     "project": "sparse_commands:project",
@@ -43,8 +43,8 @@ COMMANDS = {
     "simulate": "sparse_commands:simulate",
     "cloud": "result_commands:cloud",
     "export": "result_commands:export",
-    "eval": "score_commands:evaluate",
-    "compare": "score_commands:compare",
+    "eval": "result_commands:evaluate",
+    "compare": "result_commands:compare",
     "doctor": "models_command:doctor",
 }
 """The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""

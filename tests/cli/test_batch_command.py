@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.cli import batch_command as command
+from pnpdepth_cli.cli import refine_commands as command
 from pnpdepth_cli.cli import terminal
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.terminal import BatchProgress, progress_bar

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
-from pnpdepth_cli.cli.batch_command import batch
+from pnpdepth_cli.cli.refine_commands import batch
 from pnpdepth_cli.commands.refinement.refine_request import GROUPS, RefineRequest
 from pnpdepth_cli.frames.resolve import resolve_settings
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, ModelDefinition, Multiple

@@ -1,4 +1,4 @@
-"""`pnpdepth batch`."""
+"""`pnpdepth refine` and `batch`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import click
 from click.core import ParameterSource
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, progress_bar, say
+from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, print_json, progress_bar, say
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import (
     NetworkChoice,
@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.refinement.refine_request import (
     parse_sample,
 )
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
-from pnpdepth_cli.errors import FramesFailedError, UsageError
+from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
 from pnpdepth_cli.settings import Settings
 
 if TYPE_CHECKING:
@@ -39,6 +39,78 @@ _GROUPS = ("Network", "Method", "Sequences")
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
 """Characters that a folder's name cannot have, on some system."""
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
+
+
+@click.command(
+    short_help="Refine the depth of one image.",
+    cls=options.GroupedCommand,
+    common=frozenset(
+        {
+            *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),
+            *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
+        }
+    ),
+    groups={
+        "Input": (
+            *("--sparse", "--sparse-mask", "--min-confidence", "--gt"),
+            *(ScanOptions, ReadOptions),
+        ),
+        "Network": (NetworkChoice,),
+        "Method": (Settings, "--uncertainty", "--holdout"),
+        "Output": ("--output", RefineRequest, "--json"),
+    },
+)
+@click.argument("image", type=options.FILE, required=False)
+@click.option(
+    "--sparse",
+    type=options.FILE,
+    required=True,
+    help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
+    " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
+)
+@click.option(
+    "--sparse-mask",
+    type=options.FILE,
+    help="Confidence of the sparse depth, or a mask: image or array of its size or the image's.",
+)
+@click.option(
+    "--min-confidence",
+    type=float,
+    metavar="N",
+    help="Least value of the mask, such as 2 of 0…2, whose depth is used.  [default: above 0]",
+)
+@click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
+@click.option(
+    "-o",
+    "--output",
+    type=options.FILE,
+    help="Output folder, or one depth file such as depth.exr.  [default: ./IMAGE_refined/]",
+)
+@options.refinement(without=["seed", "baselines", "format"])
+@options.as_json
+def refine(as_json: bool, **values: Any) -> None:
+    """Refine a depth network's prediction for IMAGE with sparse depth.
+
+    \b
+    pnpdepth refine img.png --sparse s.png
+    pnpdepth refine img.png --sparse s.exr --gt gt.png -o out/
+    pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
+    pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
+
+    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and, with
+    ground truth, <name>_improvement.png (blue better, orange worse).
+    """
+    from pnpdepth_cli.cli.printing import print_refinement
+    from pnpdepth_cli.commands.refinement.refine_image import refine_image
+
+    request = options.request_of(values)
+    record = refine_image(request)
+    if as_json:
+        print_json(record.to_json())
+    else:
+        print_refinement(record)
+    if record.status == "diverged":
+        raise DivergedError(record.message or "")
 
 
 @click.command(
@@ -67,6 +139,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @click.option(
     "--sample",
+    type=parse_sample,
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
@@ -121,8 +194,7 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
 
         raise FramesFailedError(
             f"{' and '.join(bad)} of {count_of(counts['frames'], 'frame')}; the reasons are in"
-            f" {values['output']}{'/*' if vary else ''}/summary.csv; run the same command to retry"
-            " the failed frames"
+            f" {values['output']}{'/*' if vary else ''}/summary.csv"
         )
 
 
@@ -135,9 +207,7 @@ def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> 
 
     own = options.take_options(BatchRequest, values)
     own |= {name: values.pop(name) for name in ("source", "output")}
-    text = values.pop("sample")
-    sample = None if text is None else parse_sample(text)
-    request = BatchRequest(refine=options.request_of(values, sample=sample), varied=varied, **own)
+    request = BatchRequest(refine=options.request_of(values), varied=varied, **own)
     request = unpack(request, say)
     html = request.html and request.html / folder
     return replace(request, output=request.output / folder, html=html)
