@@ -1,4 +1,4 @@
-"""The functions of the public Python API: arrays in, arrays out. Import from `pnpdepth_cli`."""
+"""The public Python API: arrays in, arrays out. Its names are imported from `pnpdepth_cli`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,34 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from pnpdepth_cli.core.metrics import Scores
+from pnpdepth_cli.core.metrics import Scores as Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
-from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.core.split import Split as Split
+from pnpdepth_cli.errors import CheckpointError as CheckpointError
+from pnpdepth_cli.errors import DeviceError as DeviceError
+from pnpdepth_cli.errors import DivergedError as DivergedError
+from pnpdepth_cli.errors import InputError as InputError
+from pnpdepth_cli.errors import LayerError as LayerError
+from pnpdepth_cli.errors import ModelError as ModelError
+from pnpdepth_cli.errors import NoPointsError as NoPointsError
+from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
+from pnpdepth_cli.errors import SizeError as SizeError
+from pnpdepth_cli.errors import UsageError as UsageError
 from pnpdepth_cli.frames.frame import Registration
-from pnpdepth_cli.frames.refined import Refined
-from pnpdepth_cli.frames.refiner import Refiner, Unit, in_metres
+from pnpdepth_cli.frames.refined import Refined as Refined
+from pnpdepth_cli.frames.refiner import Refiner as Refiner
+from pnpdepth_cli.frames.refiner import Unit, in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS
 from pnpdepth_cli.models import network as networks
-from pnpdepth_cli.models.definition import ModelDefinition, assume_definition
-from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.models.definition import Fixed as Fixed
+from pnpdepth_cli.models.definition import ModelDefinition as ModelDefinition
+from pnpdepth_cli.models.definition import Multiple as Multiple
+from pnpdepth_cli.models.definition import Near as Near
+from pnpdepth_cli.models.definition import Normalisation as Normalisation
+from pnpdepth_cli.models.definition import assume_definition
+from pnpdepth_cli.models.network import Network as Network
+from pnpdepth_cli.points import SparsePoints as SparsePoints
+from pnpdepth_cli.settings import Settings as Settings
 
 
 def load_network(

@@ -87,7 +87,11 @@ class SparsePoints(Generic[A]):
         return SparsePoints(xy=xy, depth=depth, size=self.size, dropped=self.dropped)
 
     def known_in(self: SparsePoints[Tensor], depth: Tensor) -> Tensor:
-        """Returns (N,) bool, whether depth (h, w) is known, above 0, at all pixels of a point."""
+        """Returns (N,) bool, whether all pixels that a point is sampled from are known.
+
+        Args:
+            depth: (h, w), 0 = unknown.
+        """
         return self.sample((depth > 0).float()) > 0.999  # of products of weights
 
     def sample(self: SparsePoints[Tensor], dense: Tensor) -> Tensor:
