@@ -15,8 +15,8 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import NoPointsError, UsageError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import NYU_PART, FramePart
-from pnpdepth_cli.sensors.lidar import LIDARS, simulate_lidar
 from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.sensors.simulation import LIDARS, simulate_lidar
 
 ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
 """Metres beyond which rendered ground truth counts as unknown: a Kinect's range, and KITTI's."""

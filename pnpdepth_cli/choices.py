@@ -188,13 +188,13 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 # Files and sensors
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
 PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
-"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.samplers`."""
+"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.simulation`."""
 
 SENSORS = (
     *("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e"),
     *("paper-vlp-16", "paper-vlp-32c", "paper-hdl-32e", "paper-hdl-64e"),
 )
-"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.lidar`."""
+"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.simulation`."""
 
 LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""

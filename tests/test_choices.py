@@ -15,8 +15,7 @@ from pnpdepth_cli.core.update_rules import SCHEDULES
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.sensors.lidar import LIDARS
-from pnpdepth_cli.sensors.samplers import SAMPLERS
+from pnpdepth_cli.sensors.simulation import LIDARS
 
 
 @pytest.fixture
@@ -66,7 +65,6 @@ def test_a_table_lists_the_names_of_its_module_in_their_order(
 def test_every_name_of_a_closed_list_is_implemented() -> None:
     assert tuple(SCHEDULES) == choices.SCHEDULES
     assert tuple(NORMALISATIONS) == choices.NORMALISATIONS
-    assert tuple(SAMPLERS) == choices.PATTERNS
     assert tuple(LIDARS) == choices.SENSORS
 
 

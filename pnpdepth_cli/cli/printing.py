@@ -26,7 +26,7 @@ from pnpdepth_cli.stages import GT
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.records import BatchSummary
-    from pnpdepth_cli.commands.sparse.make import SparseSummary
+    from pnpdepth_cli.commands.make_sparse import Written
 
 _STDOUT = Path("-")
 _WIDE = 1000
@@ -132,9 +132,10 @@ def print_batch(summary: BatchSummary) -> None:
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
 
 
-def print_sparse(summary: SparseSummary) -> None:
+def print_sparse(written: Written) -> None:
     """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
-    print_notes(summary.notes)
-    count, (height, width) = len(summary.points), summary.points.size
+    points, notes, files = written
+    print_notes(notes)
+    count, (height, width) = len(points), points.size
     share = f"{count / (height * width):.2%} of {width}×{height} pixels"
-    say(f"wrote {count:,} points, {share}: {'  '.join(map(str, summary.files))}")
+    say(f"wrote {count:,} points, {share}: {'  '.join(map(str, files))}")

@@ -37,7 +37,7 @@ def project(**values: Any) -> None:
     the points, and a JSON file records the settings.
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import project_scan
+    from pnpdepth_cli.commands.make_sparse import project_scan
 
     scan_options = ScanOptions(**options.take_options(ScanOptions, values))
     print_sparse(project_scan(options=scan_options, **values))
@@ -73,7 +73,7 @@ def sample(**values: Any) -> None:
     A JSON file beside the output records the settings.
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import sample_depth
+    from pnpdepth_cli.commands.make_sparse import sample_depth
 
     print_sparse(sample_depth(**values))
 
@@ -117,7 +117,7 @@ def simulate(
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.sparse.make import lidar_of, simulate_scan
+    from pnpdepth_cli.commands.make_sparse import lidar_of, simulate_scan
 
     print_sparse(simulate_scan(sensor=lidar_of(sensor, beams, vertical_fov), **values))
 
@@ -147,7 +147,7 @@ def frames(bag: Path, output: Path, **values: Any) -> None:
     gets rgb/, sparse/ (PLY or EXR), calib.txt from camera_info and tf_static, and poses.txt from
     odometry.
     """
-    from pnpdepth_cli.commands.sparse.bag_frames import write_frames
+    from pnpdepth_cli.commands.bag_frames import write_frames
 
     request = FramesRequest(bag=bag, output=output, **values)
     say(f"wrote {write_frames(request, say):,} frames to {output}")

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
-from pnpdepth_cli.dataset.arrays import image_of_size
-from pnpdepth_cli.dataset.frame_camera import camera_of_exif, camera_of_file
+from pnpdepth_cli.dataset.arrays import camera_of_exif, camera_of_file, image_of_size
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
@@ -23,9 +22,9 @@ from pnpdepth_cli.io.scans import write_cloud
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,
-    VoxelGrid,
     cloud_from_depth,
     consistent_depth,
+    merge_in_voxels,
     neighbouring_views,
 )
 
@@ -57,9 +56,10 @@ def write_depth_cloud(
         )
     # The cloud, part by part.
     coloured = all(request.image or frame.image for frame in frames)
-    parts = _parts(request, frames, poses, coloured, notes, show)
+    parts = _some_points(request, _parts(request, frames, poses, coloured, notes, show))
     make_folder(request.output.parent)
-    points = write_cloud(request.output, _merge(request, parts, coloured))
+    merged = parts if request.voxel is None else [merge_in_voxels(parts, request.voxel)]
+    points = write_cloud(request.output, merged)
     colours = "coloured" if coloured else "without colours (no image is known)"
     return f"{points:,} points, {colours}", notes
 
@@ -118,22 +118,14 @@ def _parts(
             yield part if pose is None else part.transform(pose)
 
 
-def _merge(
-    request: CloudRequest, parts: Iterator[PointCloud], coloured: bool
-) -> Iterator[PointCloud]:
-    """The parts, or their points merged. Raises InputError if there is none."""
-    grid = None if request.voxel is None else VoxelGrid(request.voxel)
+def _some_points(request: CloudRequest, parts: Iterator[PointCloud]) -> Iterator[PointCloud]:
+    """The parts. Raises InputError at the end if there was no point."""
     empty = True
     for part in parts:
         empty &= not len(part.xyz)
-        if grid is None:
-            yield part
-        else:
-            grid.add(part)
+        yield part
     if empty:
         raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
-    if grid is not None:
-        yield grid.cloud(coloured=coloured)
 
 
 def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArray[np.float32]:

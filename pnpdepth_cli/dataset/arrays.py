@@ -1,4 +1,4 @@
-"""Parts of a frame from their files: images, masks, and depth of an image's view."""
+"""Parts of a frame from their files: image, camera, masks, and depth of an image's view."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
 from pnpdepth_cli.errors import FileFormatError, SizeError
 from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
 from pnpdepth_cli.io.file_bytes import (
     check_value_count,
@@ -19,9 +21,16 @@ from pnpdepth_cli.io.file_bytes import (
     read_bytes,
     size_of_regular_file,
 )
-from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.io.rgb import read_exr_colour, read_rgb, read_video_frame, sizes_of
+from pnpdepth_cli.io.formats import DepthFile, Reading
+from pnpdepth_cli.io.rgb import (
+    read_exr_colour,
+    read_focal_length,
+    read_rgb,
+    read_video_frame,
+    sizes_of,
+)
 
+_OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
 _ASPECT_TOLERANCE = 0.02
 """Relative difference of aspect ratios of images of one view."""
 
@@ -130,7 +139,7 @@ def move_depth(
     return np.where(np.isinf(moved), np.float32(0), moved)
 
 
-def raw_depth(path: Path, image: ImageSource | None) -> NDArray[np.float32] | None:
+def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
     """Returns depth (H, W) of a file without a header, as ETH3D has it; None for other files.
 
     It holds float32 metres, row by row, of its image's size, and is named as that, *.JPG.
@@ -141,4 +150,60 @@ def raw_depth(path: Path, image: ImageSource | None) -> NDArray[np.float32] | No
     if size_of_regular_file(path) != 4 * math.prod(size):
         return None
     check_value_count(path, math.prod(size), value_bytes=4)
-    return known_metres(np.fromfile(path, "<f4").reshape(size))
+    values = known_metres(np.fromfile(path, "<f4").reshape(size))
+    return DepthFile(values=values, reading=Reading("float32 without a header"))
+
+
+def camera_of_file(
+    path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
+) -> tuple[Camera, list[str]]:
+    """Returns the camera of a calibration file for an image (H, W) of this file, and warnings.
+
+    Raises:
+        InputError: The file is no calibration.
+        SizeError: It is of another image.
+    """
+    camera = read_calibration(path, number).camera
+    notes = check_size(path, camera, size, image)
+    return replace(camera, source=f"{path}: {camera.source}"), notes
+
+
+def check_size(
+    path: Path, camera: Camera, size: tuple[int, int], image: Path | None = None
+) -> list[str]:
+    """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
+
+    Raises:
+        SizeError: They cannot belong together.
+    """
+    name = f"{image} is" if image else "the image is"
+    if camera.size is not None and camera.size != size:
+        height, width = camera.size
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
+            " image at that size"
+        )
+    x, y = camera.intrinsics[:2, 2]
+    if not (0 <= x < size[1] and 0 <= y < size[0]):
+        raise SizeError(
+            f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
+            f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
+        )
+    if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
+        return [
+            f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
+            f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"
+        ]
+    return []
+
+
+def camera_of_exif(image: Path, size: tuple[int, int]) -> tuple[Camera, list[str]] | None:
+    """Returns the camera of EXIF, without distortion, and a line for a person; None for none."""
+    if (focal := read_focal_length(image, size)) is None:
+        return None
+    (focal_px, source), (height, width) = focal, size
+    intrinsics = np.array(
+        [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    )
+    note = f"camera: {focal_px:.1f} pixels of focal length, no distortion ({source})"
+    return Camera(intrinsics=intrinsics, size=size, source=source), [note]

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.arrays import read_image, record_of
@@ -19,7 +18,7 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.accumulation import (
     Keypoints,
-    NeighbourScan,
+    Scan,
     accumulate,
     keypoints_of,
     motion_of_images,
@@ -65,7 +64,7 @@ def read_neighbours(
             " column calib in a list"
         )
     own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
-    scans, records, notes = list[NeighbourScan](), list[FileRecord](), list[str]()
+    scans, records, notes = dict[int, list[Scan]](), list[FileRecord](), list[str]()
     for each in files.neighbours:
         # The neighbour's points, and its motion, from poses or from the images.
         points, source = points_of(each.files), each.files.sparse or each.files.gt
@@ -77,7 +76,7 @@ def read_neighbours(
         else:
             motion, basis = np.array(each.motion), each.poses
             # Poses of the nearest neighbour are compared with the images.
-            if each.apart == 1 and all(scan.apart > 1 for scan in scans):
+            if each.apart == 1 and 1 not in scans:
                 off = _off_images(files, each, points, camera)
                 notes += [off] if off else []
         # A neighbour of known motion joins.
@@ -87,7 +86,7 @@ def read_neighbours(
                 f" motion is unknown: {basis}"
             )
         else:
-            scans.append(NeighbourScan(points=points, motion=motion, apart=each.apart))
+            scans.setdefault(each.apart, []).append((points, motion))
         record = replace(
             record_of(source),
             poses=poses,
@@ -121,15 +120,9 @@ def _off_images(
     off_px = float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)))
     if off_px <= _CONTRADICTION * points.size[1]:
         return None
-    given, other = (
-        f"{np.linalg.norm(m[:, 3]):.2f} m and"
-        f" {np.degrees(Rotation.from_matrix(m[:, :3]).magnitude()):.2f}°"
-        for m in motions
-    )
     return (
-        f"warning: the poses contradict the images: from {_name_of(neighbour.files)} on, the camera"
-        f" moved {given} by the poses, {other} by {basis}, which puts points {off_px:.0f} px"
-        " elsewhere; give poses of these frames, or none"
+        f"warning: the poses contradict the images: the motion from {_name_of(neighbour.files)} on,"
+        f" by {basis}, puts points {off_px:.0f} px elsewhere; give poses of these frames, or none"
     )
 
 

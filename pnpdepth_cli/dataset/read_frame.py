@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.arrays import apply_masks, move_depth, raw_depth, read_image, record_of
+from pnpdepth_cli.dataset.arrays import (
+    apply_masks,
+    camera_of_exif,
+    camera_of_file,
+    move_depth,
+    raw_depth,
+    read_image,
+    record_of,
+)
 from pnpdepth_cli.dataset.colmap_points import read_colmap_points
-from pnpdepth_cli.dataset.frame_camera import camera_of_exif, camera_of_file
-from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles, ImageSource
+from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -24,26 +30,16 @@ from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
-from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import METRES, SparsePoints
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
-from pnpdepth_cli.sensors.samplers import sample_points
+from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.settings import Settings
 
 # Of the ground truth's pixels equal to the sparse depth gives a warning. KITTI's ground truth holds
 # the points of its own scan by design, which is less than half of it.
 _LEAK_FRACTION = 0.5
-
-
-class _Pixels(NamedTuple):
-    """An image or ground truth, as it was read."""
-
-    values: NDArray[np.float32]  # (H, W, 3) or (H, W), in the part that the protocol keeps
-    size: tuple[int, int]  # (H, W) of the whole
-    record: FileRecord
-    notes: list[str]
-    reading: Reading | None = None  # of ground truth
 
 
 def read_frame(
@@ -69,17 +65,21 @@ def read_frame(
     if files.min_confidence is not None and files.sparse_mask is None:
         raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
     # The image, and the ground truth, which has its size.
-    image, truth = _read_pixels(files, options)
-    size = None if image is None else image.size
+    rgb, truth, found = _read_pixels(files, options)
+    whole = rgb if truth is None else truth.values
+    size = None if whole is None else (whole.shape[0], whole.shape[1])
     # The sparse depth, from a file or sampled from the ground truth.
     if files.sparse is None:
-        sparse = _sample_sparse(files, options, image, truth, seed)
+        sparse = _sample_sparse(files, options, rgb, truth, seed)
     else:
         sparse = _read_sparse(files, options, size)
     given = sparse.points.tensors()
-    compared = [] if truth is None else _compare(files, truth, sparse, given)
-    size = size or (given.size if truth is None else truth.size)
+    gt, compared = None, list[str]()
+    if truth is not None:
+        gt = files.part.apply(truth.values)
+        compared = _compare(files, gt, truth.reading, sparse, given)
     # The camera, and with it the points of neighbouring frames.
+    size = size or given.size
     camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)
     used, held_out = _hold_out(given, holdout, seed)
     points, neighbours, lost = read_neighbours(
@@ -90,8 +90,9 @@ def read_frame(
     stated = sparse.calibrated or files.one_view or options.registration == "off"
     one_view = contradicted or stated
     # What a record and a person should know.
-    sources = {"image": image, "sparse": sparse, "gt": truth}
-    notes = [note for part in sources.values() if part is not None for note in part.notes]
+    found["sparse"] = sparse.record, [*sparse.notes]
+    sources = {name: found[name] for name in ("image", "sparse", "gt") if name in found}
+    notes = [note for _, lines in sources.values() for note in lines]
     notes += (*compared, *of_camera, *lost)
     if files.masks and truth is None:
         notes.append(
@@ -99,15 +100,15 @@ def read_frame(
             " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
         )
     return Frame(
-        rgb=None if image is None else tensor_of(image.values),
+        rgb=None if rgb is None else tensor_of(np.ascontiguousarray(files.part.apply(rgb))),
         points=points,
         given=given,
         held_out=held_out,
         register=None if one_view else registration_to_make(options.registration, Settings()),
         one_view=one_view,
-        gt=None if truth is None else truth.values,
+        gt=None if gt is None else np.ascontiguousarray(gt),
         depth_scale=sparse.reading.scale,
-        sources={name: part.record for name, part in sources.items() if part is not None},
+        sources={name: record for name, (record, _) in sources.items()},
         neighbours=tuple(neighbours),
         notes=tuple(notes),
         unit=sparse.unit,
@@ -117,77 +118,63 @@ def read_frame(
 
 
 def _read_pixels(
-    files: FrameFiles, options: ReadOptions, size: tuple[int, int] | None = None
-) -> tuple[_Pixels | None, _Pixels | None]:
-    """The image, and the ground truth of its size, or of (H, W) without an image."""
-    image = truth = None
+    files: FrameFiles, options: ReadOptions
+) -> tuple[NDArray[np.float32] | None, DepthFile | None, dict[str, tuple[FileRecord, list[str]]]]:
+    """The image (H, W, 3) in 0..1, ground truth of its size, and records and lines for a person."""
+    rgb = truth = size = None
+    found = dict[str, tuple[FileRecord, list[str]]]()
     if files.image is not None:
-        image = _read_image(files, files.image)
-        size = image.size
+        notes = list[str]()
+        if isinstance(files.image, Path):
+            image = read_rgb(files.image, upright=files.sparse is None or not files.sparse.is_dir())
+            rgb, notes = image.values, [f"image: {image.note}"] if image.note else []
+        else:
+            rgb = read_image(files.image)
+        size, found["image"] = (rgb.shape[0], rgb.shape[1]), (record_of(files.image), notes)
     if files.gt is not None:
-        truth = _read_ground_truth(files, options, files.gt, size)
-        if image is not None and image.size != truth.size:
-            raise _size_error(files, truth.size, image.size)
+        truth, record, lines = _read_ground_truth(files, options, files.gt, size)
+        found["gt"] = record, lines
+        own = truth.values.shape
+        if size is not None and size != own:
+            raise SizeError(
+                f"ground truth {files.gt} is {own[1]}×{own[0]} but the image is {size[1]}×{size[0]}"
+            )
         if not (truth.values > 0).any():
             raise InputError(f"ground truth {files.gt} has no pixel with known depth")
-    return image, truth
-
-
-def _read_image(files: FrameFiles, source: ImageSource) -> _Pixels:
-    if isinstance(source, Path):
-        upright = files.sparse is None or not files.sparse.is_dir()
-        image = read_rgb(source, upright=upright)
-        values, notes = image.values, [f"image: {image.note}"] if image.note else []
-    else:
-        values, notes = read_image(source), []
-    return _pixels(files, values, record_of(source), notes)
+    return rgb, truth, found
 
 
 def _read_ground_truth(
     files: FrameFiles, options: ReadOptions, source: Path, size: tuple[int, int] | None
-) -> _Pixels:
+) -> tuple[DepthFile, FileRecord, list[str]]:
     """The ground truth of an image (H, W): a projected scan, or a depth map."""
     scale, of_scan = options.depth_scale or files.gt_scale, options.scan.over(files)
     if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
         scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
         notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
-        return _pixels(files, as_depth_image(scan.points), scan.record, notes, scan.reading)
+        truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
+        return truth, scan.record, notes
     # The option is the scale of the scan, if there is one, unless the map has none of its own.
-    if (raw := raw_depth(source, files.image)) is not None:
-        values, reading = raw, Reading("float32 without a header")
-    else:
-        file = read_depth(source, scale=scale)
-        if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
-            own = read_depth(source, scale=files.gt_scale)
-            file = file if own.reading.assumed else own
-        values, reading = file.values, file.reading
+    file = raw_depth(source, files.image) or read_depth(source, scale=scale)
+    if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
+        own = raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
+        file = file if own.reading.assumed else own
     # Pixels that a mask or the gate rules out are unknown.
-    values = apply_masks(values, files.masks)
+    values, reading = apply_masks(file.values, files.masks), file.reading
     if files.gt_other_size and size is not None and values.shape != size:
         values = move_depth(source, values, size)
     option = "--depth-scale" if files.sparse is None else "gt_scale of a list"
     values, notes = plausible_map(values, reading, "gt", option, scale)
     described = describe_range(values, reading, noun="pixels", option=option)
-    notes = [f"gt: {described}", *notes]
-    return _pixels(files, values, record_of(source, reading), notes, reading)
-
-
-def _pixels(
-    files: FrameFiles,
-    values: NDArray[np.float32],
-    record: FileRecord,
-    notes: list[str],
-    reading: Reading | None = None,
-) -> _Pixels:
-    part, size = np.ascontiguousarray(files.part.apply(values)), (values.shape[0], values.shape[1])
-    return _Pixels(part, size, record, notes, reading)
+    truth = DepthFile(values=values, reading=reading)
+    return truth, record_of(source, reading), [f"gt: {described}", *notes]
 
 
 def _sample_sparse(
     files: FrameFiles,
     options: ReadOptions,
-    image: _Pixels | None,
-    truth: _Pixels | None,
+    rgb: NDArray[np.float32] | None,
+    truth: DepthFile | None,
     seed: int,
 ) -> SparseDepth:
     """Points sampled from the ground truth."""
@@ -198,13 +185,13 @@ def _sample_sparse(
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
     seed = seed if options.sample_seed is None else options.sample_seed
-    rgb = None if image is None else image.values
+    gt, image = files.part.apply(truth.values), None if rgb is None else files.part.apply(rgb)
     try:
-        points = sample_points(truth.values, options.sample, seed, image=rgb)
+        points = sample_points(gt, options.sample, seed, image=image)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
     how = f"{options.sample.kind} of the ground truth, seed {seed}"
-    reading = Reading(how, truth.reading and truth.reading.scale)
+    reading = Reading(how, truth.reading.scale)
     sampling = Sampling(**asdict(options.sample), seed=seed)
     return SparseDepth(
         points=points,
@@ -274,8 +261,8 @@ def _points_of(files: FrameFiles, options: ReadOptions, size: tuple[int, int], s
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
         return _read_sparse(files, options, size).points
-    image, truth = _read_pixels(files, options, size)
-    return _sample_sparse(files, options, image, truth, seed).points
+    rgb, truth, _ = _read_pixels(files, options)
+    return _sample_sparse(files, options, rgb, truth, seed).points
 
 
 def _hold_out(
@@ -295,26 +282,26 @@ def _hold_out(
 
 
 def _compare(
-    files: FrameFiles, truth: _Pixels, sparse: SparseDepth, points: SparsePoints
+    files: FrameFiles,
+    gt: NDArray[np.float32],
+    reading: Reading,
+    sparse: SparseDepth,
+    points: SparsePoints,
 ) -> list[str]:
     """Warnings on ground truth and sparse depth that seem to be of two scales, or one."""
-    gt = truth.values
     if sparse.unit != METRES:
         raise UsageError(
             f"the ground truth {files.gt} is in metres but the sparse depth in {sparse.unit}; give"
             " --unit-scale, or leave out --gt"
         )
-    if gt.shape != points.size:
-        raise _size_error(files, gt.shape, points.size)
     if files.sparse is None:
         # No file beside the ground truth decides a scale that is assumed.
-        of_truth = truth.reading
-        if of_truth is None or not of_truth.assumed:
+        if not reading.assumed:
             return []
         return [
-            f"warning: the scale of the ground truth ({of_truth.source}) is assumed, and with it"
-            f" the metres of all errors; --depth-scale 1000 if it holds millimetres, --depth-scale"
-            f" {of_truth.scale:g} if it is right"
+            f"warning: the scale of the ground truth ({reading.source}) is assumed, and with it the"
+            f" metres of all errors; --depth-scale 1000 if it holds millimetres, --depth-scale"
+            f" {reading.scale:g} if it is right"
         ]
     notes = list[str]()
     depth, known = points.scatter()[0, 0].numpy(), int((gt > 0).sum())
@@ -325,12 +312,5 @@ def _compare(
             " are the sparse depth itself, so errors against it show nothing; give another --gt,"
             " or keep points out with --holdout"
         )
-    by_option = {"--depth-scale": sparse.reading, "gt_scale of a list": truth.reading}
+    by_option = {"--depth-scale": sparse.reading, "gt_scale of a list": reading}
     return notes + check_same_scale(depth, gt, by_option)
-
-
-def _size_error(files: FrameFiles, size: tuple[int, ...], image_size: tuple[int, int]) -> SizeError:
-    return SizeError(
-        f"ground truth {files.gt} is {size[1]}×{size[0]} but the image is"
-        f" {image_size[1]}×{image_size[0]}"
-    )

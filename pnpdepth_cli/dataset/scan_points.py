@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.dataset.frame_camera import check_size
+from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
@@ -165,39 +165,29 @@ def choose_camera(
         frames: Images (H, W, 3) in 0..1, each with a scan (N, 3).
         topic: Topic of the images, where it is known.
     """
-    named = "image_rect" in topic
     cameras = {
         name: Calibration(camera=camera, scanner=raw.scanner and of_raw @ raw.scanner)
         for name, (camera, of_raw) in raw.rectified.items()
     }
-    candidates = cameras if named else {"K and distortion": raw} | cameras
-    scores = _mean_agreements(frames, candidates) if len(candidates) > 1 else {}
-    choice = first = next(iter(candidates))
-    best = max(scores, key=lambda name: scores[name], default=first)
-    if best != first and scores[best] - scores[first] > _CLEARLY_BETTER:
-        choice = best
-    why = f"the topic {topic}" if named else "the usual meaning of camera_info"
-    if scores and (choice != first or not named):
-        compared = ", ".join(f"{name} {score:+.2f}" for name, score in scores.items())
+    candidates = cameras if "image_rect" in topic else {"K and distortion": raw} | cameras
+    choice = next(iter(candidates))
+    own, why = candidates[choice], topic or "the usual meaning of camera_info"
+    # How well jumps of depth meet edges, in the mean of the frames.
+    scores = list[dict[str, float]]()
+    for rgb, xyz in frames if own.scanner and len(candidates) > 1 else ():
+        assert own.scanner is not None
+        with suppress(NoPointsError):
+            points = project_velodyne(xyz, own.camera, own.scanner, rgb.shape[:2])
+            scores.append(_agreements(points, rgb, own, candidates))
+    if scores:
+        mean = {name: float(np.mean([each[name] for each in scores])) for name in candidates}
+        best = max(mean, key=lambda name: mean[name])
+        choice = best if mean[best] - mean[choice] > _CLEARLY_BETTER else choice
+        compared = ", ".join(f"{name} {score:+.2f}" for name, score in mean.items())
         why = f"image edges at jumps of depth: {compared}"
     images = "rectified" if choice in cameras else "raw"
     note = f"camera: {images} images, by {choice} ({why}); --calib gives another"
     return candidates[choice], note
-
-
-def _mean_agreements(
-    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
-    candidates: Mapping[str, Calibration],
-) -> dict[str, float]:
-    """How well jumps of depth meet edges in the mean of frames, by calibration; none without."""
-    first = next(iter(candidates.values()))
-    found = list[dict[str, float]]()
-    for rgb, xyz in frames if first.scanner else ():
-        assert first.scanner is not None
-        with suppress(NoPointsError):
-            points = project_velodyne(xyz, first.camera, first.scanner, rgb.shape[:2])
-            found.append(_agreements(points, rgb, first, candidates))
-    return {name: float(np.mean([each[name] for each in found])) for name in candidates if found}
 
 
 def _agreements(
@@ -273,10 +263,10 @@ def _better_reading(
         return []
     # Other axes, cameras and turns, and how much better each must be.
     readings, needed = {"": own}, {"": 0.0}
-    for axis, name in ((1, "y"), (2, "z")):
-        mirror = Extrinsics(np.diag(np.where(np.arange(3) == axis, -1.0, 1.0)), np.zeros(3))
+    for name, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
         text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
-        readings[text], needed[text] = replace(own, scanner=scanner @ mirror), _OTHER_READING
+        mirrored = scanner @ Extrinsics(np.diag(signs), np.zeros(3))
+        readings[text], needed[text] = replace(own, scanner=mirrored), _OTHER_READING
     for number in range(_CAMERAS) if options.extrinsics is None else ():
         with suppress(UsageError):  # there is no such camera
             text = f"with --camera {number}"

@@ -9,8 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.arrays import check_same_view, moved_note, read_levels, record_of
-from pnpdepth_cli.dataset.frame_camera import camera_of_file
+from pnpdepth_cli.dataset.arrays import (
+    camera_of_file,
+    check_same_view,
+    moved_note,
+    read_levels,
+    record_of,
+)
 from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_values
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import NoPointsError, UsageError

@@ -20,9 +20,8 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,13 +61,10 @@ _REPROJECTION_PX = 2.0
 _JUMP = 1.1  # ratio of depths of the points around a keypoint
 
 
-@dataclass(frozen=True, kw_only=True)
-class NeighbourScan:
-    """The points of another frame of the sequence."""
-
-    points: Points  # in the other frame's image
-    motion: Floats  # (3, 4) from the other camera's coordinates to this one's, metres
-    apart: int  # frames between the two, at least 1
+Scan = tuple[Points, Floats]
+"""The points of another frame in its image, and (3, 4) the motion from its camera to this one."""
+Keypoints = tuple[Floats, NDArray[np.float32]]
+"""(K, 2) pixel coordinates and (K, 128) descriptors of SIFT."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,16 +83,18 @@ def _spacing_px(points: Points) -> float:
     return float(np.sqrt(points.size[0] * points.size[1] / len(points)))
 
 
-def accumulate(points: Points, neighbours: Sequence[NeighbourScan], camera: Camera) -> Points:
-    """Returns the frame's own points followed by those of its neighbours that agree with them."""
+def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera: Camera) -> Points:
+    """Returns the frame's own points followed by those of its neighbours that agree with them.
+
+    The neighbours are by the number of frames, at least 1, that are between them and this one.
+    """
     surface, result = surface_of(points, camera), points
-    for apart in sorted({scan.apart for scan in neighbours}):
+    for apart, scans in sorted(neighbours.items()):
         moved = []
-        for scan in neighbours:
-            if scan.apart == apart:
-                xyz = unproject(camera, scan.points.xy, scan.points.depth)
-                motion = refine_motion(surface, xyz, scan.motion, camera)
-                moved.append(xyz @ motion[:, :3].T + motion[:, 3])
+        for other, motion in scans:
+            xyz = unproject(camera, other.xy, other.depth)
+            refined = refine_motion(surface, xyz, motion, camera)
+            moved.append(xyz @ refined[:, :3].T + refined[:, 3])
         result = _add(result, np.concatenate(moved), surface, camera, apart)
     return result
 
@@ -175,21 +173,14 @@ def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDA
     return moved[near], index[near]
 
 
-class Keypoints(NamedTuple):
-    """SIFT keypoints of an image: (K, 2) pixel coordinates and (K, 128) descriptors."""
-
-    xy: Floats
-    descriptors: NDArray[np.float32]
-
-
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
     """Returns the keypoints of an image (H, W, 3) in 0…1."""
     grey = cv2.cvtColor((rgb * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     # OpenCV's annotations lack SIFT
     keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
     if descriptors is None:
-        return Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    return Keypoints(np.array([each.pt for each in keypoints], np.float64), descriptors)
+        descriptors = np.empty((0, 128), np.float32)
+    return np.array([each.pt for each in keypoints], np.float64).reshape(-1, 2), descriptors
 
 
 def motion_of_images(
@@ -227,11 +218,12 @@ def motion_of_images(
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
     """(M, 2) keypoints of the other image, and (M, 2) their partners in this one."""
-    if min(len(here.xy), len(there.xy)) < 2:
+    (to, of_here), (at, of_there) = here, there
+    if min(len(to), len(at)) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(there.descriptors, here.descriptors, k=2)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(of_there, of_here, k=2)
     clear = [best for best, second in pairs if best.distance < _RATIO * second.distance]
-    return there.xy[[m.queryIdx for m in clear]], here.xy[[m.trainIdx for m in clear]]
+    return at[[match.queryIdx for match in clear]], to[[match.trainIdx for match in clear]]
 
 
 def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:

@@ -136,7 +136,7 @@ def _normals(points: Floats, known: Mask) -> Floats:
     across = _difference(points, known, 1)
     normals = np.cross(_difference(points, known, 0), across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), 0)
+    normals /= np.where(length > 0, length, 1)
     away = (normals * points).sum(axis=2, keepdims=True) > 0
     return np.where(away, -normals, normals)
 
@@ -151,36 +151,28 @@ def _difference(points: Floats, known: Mask, axis: int) -> Floats:
     return np.moveaxis(after - before, 0, axis)
 
 
-class VoxelGrid:
-    """Merges clouds: one point per occupied cube of this side, the mean of all points in it."""
+def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
+    """Returns one point per occupied cube of this side, the mean of all points of clouds in it.
 
-    def __init__(self, side: float) -> None:
-        self._side = side
-        self._cells = np.zeros((0, 3), np.int64)
-        self._sums = np.zeros((0, 10))  # xyz, rgb, normal, count
-
-    def add(self, cloud: PointCloud) -> None:
-        """Adds the points of a cloud in the grid's coordinates."""
-        cells = np.floor(cloud.xyz / self._side).astype(np.int64)
+    Points are sorted by cube; they have colours if all clouds do.
+    """
+    cells, sums, coloured = np.zeros((0, 3), np.int64), np.zeros((0, 10)), True
+    for cloud in clouds:
+        coloured &= cloud.rgb is not None
         rgb = np.zeros(cloud.xyz.shape) if cloud.rgb is None else cloud.rgb
         ones = np.ones((len(cloud.xyz), 1))
-        values = np.concatenate([cloud.xyz, rgb, cloud.normals, ones], axis=1)
-        cells = np.concatenate([self._cells, cells])
-        values = np.concatenate([self._sums, values])
-        self._cells, inverse = np.unique(cells, axis=0, return_inverse=True)
-        self._sums = np.zeros((len(self._cells), values.shape[1]))
-        np.add.at(self._sums, inverse.reshape(-1), values)
-
-    def cloud(self, *, coloured: bool) -> PointCloud:
-        """Returns the merged cloud, sorted by cell."""
-        mean = self._sums[:, :9] / self._sums[:, 9:]
-        length = np.linalg.norm(mean[:, 6:], axis=1, keepdims=True)
-        normals = np.where(length > 0, mean[:, 6:] / np.where(length > 0, length, 1), 0)
-        return PointCloud(
-            xyz=mean[:, :3].astype(np.float32),
-            rgb=np.rint(mean[:, 3:6]).astype(np.uint8) if coloured else None,
-            normals=normals.astype(np.float32),
-        )
+        values = np.concatenate([sums, np.hstack([cloud.xyz, rgb, cloud.normals, ones])])
+        own = np.floor(cloud.xyz / side).astype(np.int64)
+        cells, index = np.unique(np.concatenate([cells, own]), axis=0, return_inverse=True)
+        sums = np.zeros((len(cells), 10))
+        np.add.at(sums, index.reshape(-1), values)
+    xyz, rgb, normals = np.split(sums[:, :9] / sums[:, 9:], 3, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointCloud(
+        xyz=xyz.astype(np.float32),
+        normals=(normals / np.where(length > 0, length, 1)).astype(np.float32),
+        rgb=np.rint(rgb).astype(np.uint8) if coloured else None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from PIL import Image
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.sparse.make import sample_depth
+from pnpdepth_cli.commands.make_sparse import sample_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
@@ -185,7 +185,7 @@ def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
     assert result.pixels == np.count_nonzero(truth)
     assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
     files = {"depth": tmp_path / "gt.npy", "output": tmp_path / "sparse.npy"}
-    drawn = sample_depth(pattern=SamplePattern(count=3000), **files).points
+    drawn, _, _ = sample_depth(pattern=SamplePattern(count=3000), **files)
     assert drawn.depth.max() <= truth.max()
 
 

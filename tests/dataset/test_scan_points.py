@@ -22,7 +22,7 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.scans import read_scan
 from tests.bags import View, write_bag
 from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
-from tests.commands.sparse.test_bags import written
+from tests.commands.test_bag_frames import written
 
 SIZE = (240, 320)
 K = np.array([[290.0, 0, 170], [0, 290, 112], [0, 0, 1]])

@@ -13,7 +13,6 @@ from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.accumulation import (
     Keypoints,
-    NeighbourScan,
     accumulate,
     keypoints_of,
     motion_of_images,
@@ -62,7 +61,7 @@ def from_ahead(metres: float) -> NDArray[np.float64]:
 
 def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
     own, ahead = room((0, 0, 0), None, 0), room((0, 0, 0.5), None, 1)
-    both = accumulate(own, [NeighbourScan(points=ahead, motion=from_ahead(0.5), apart=1)], CAMERA)
+    both = accumulate(own, {1: [(ahead, from_ahead(0.5))]}, CAMERA)
     assert both.xy[: len(own)].tobytes() == own.xy.tobytes()
     assert both.depth[: len(own)].tobytes() == own.depth.tobytes()
     moved = both.xy[len(own) :]
@@ -73,7 +72,7 @@ def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
 
 def test_points_of_a_moved_object_are_dropped() -> None:
     own, later = room((0, 0, 0), -1.0, 0), room((0, 0, 0), 1.0, 1)
-    both = accumulate(own, [NeighbourScan(points=later, motion=STILL, apart=1)], CAMERA)
+    both = accumulate(own, {1: [(later, STILL)]}, CAMERA)
     moved, depth = both.xy[len(own) :], both.depth[len(own) :]
     on_old_box = (np.abs((moved[:, 0] - 79.5) / 150 * 4 - 1) < 0.4) & (
         np.abs((moved[:, 1] - 59.5) / 150 * 4) < 0.4
@@ -85,9 +84,8 @@ def test_points_of_a_moved_object_are_dropped() -> None:
 
 def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     own, one, two = (room((0, 0, 0), None, seed) for seed in range(3))
-    near = NeighbourScan(points=one, motion=STILL, apart=1)
-    far = NeighbourScan(points=two, motion=STILL, apart=2)
-    with_near, with_both = (accumulate(own, each, CAMERA) for each in ([near], [far, near]))
+    near, far = {1: [(one, STILL)]}, {2: [(two, STILL)]}
+    with_near, with_both = (accumulate(own, each, CAMERA) for each in (near, far | near))
     kept = with_both.xy[: len(with_near)]
     assert kept.tobytes() == with_near.xy.tobytes()
     more = with_both.xy[len(with_near) :]
@@ -137,8 +135,8 @@ def seen_from(points: Points, shift: tuple[float, float, float]) -> tuple[Keypoi
     """Keypoints at the points, as matched in a camera that has moved, and in their own image."""
     descriptors = np.random.default_rng(0).random((len(points), 128)).astype(np.float32)
     moved = unproject(CAMERA, points.xy, points.depth) + np.array(shift)
-    here = Keypoints(xy=pixels_of(CAMERA, moved), descriptors=descriptors)
-    return here, Keypoints(xy=points.xy.astype(np.float64), descriptors=descriptors)
+    at = points.xy.astype(np.float64)
+    return (pixels_of(CAMERA, moved), descriptors), (at, descriptors)
 
 
 def test_a_motion_beyond_the_median_depth_is_refused() -> None:

@@ -16,10 +16,10 @@ from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,
-    VoxelGrid,
     cloud_from_depth,
     consistent_depth,
     depth_edges,
+    merge_in_voxels,
     neighbouring_views,
 )
 
@@ -98,10 +98,7 @@ def test_merged_clouds_have_one_mean_point_per_voxel() -> None:
         )
         for _ in range(3)
     ]
-    grid, every = VoxelGrid(0.5), joined(clouds)
-    for cloud in clouds:
-        grid.add(cloud)
-    merged = grid.cloud(coloured=True)
+    merged, every = merge_in_voxels(clouds, 0.5), joined(clouds)
     cells = np.floor(every.xyz / 0.5)
     assert len(merged.xyz) == len(np.unique(cells, axis=0))
     first = (cells == np.floor(merged.xyz[0] / 0.5)).all(axis=1)

@@ -18,7 +18,6 @@ from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.lidar import FORWARD_LEFT_UP
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.projection import (
     edge_agreement,
@@ -29,7 +28,7 @@ from pnpdepth_cli.sensors.projection import (
     occluded_in_map,
     project_velodyne,
 )
-from pnpdepth_cli.sensors.samplers import sample_points
+from pnpdepth_cli.sensors.simulation import FORWARD_LEFT_UP, sample_points
 from pnpdepth_cli.settings import Settings
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])

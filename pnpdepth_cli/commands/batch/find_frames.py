@@ -57,7 +57,7 @@ def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     """
     if not is_bag(request.source):
         return request
-    from pnpdepth_cli.commands.sparse.bag_frames import has_frames, write_frames
+    from pnpdepth_cli.commands.bag_frames import has_frames, write_frames
 
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None

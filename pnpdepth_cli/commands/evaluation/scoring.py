@@ -18,8 +18,7 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.results import ResultFrame
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
-from pnpdepth_cli.dataset.arrays import apply_masks, raw_depth, read_image
-from pnpdepth_cli.dataset.frame_camera import camera_of_file
+from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
@@ -32,7 +31,7 @@ from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.pixels import pixel_index
-from pnpdepth_cli.sensors.samplers import sample_points
+from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.stages import AFTER, GT
 
 Depth = NDArray[np.float32]
@@ -132,7 +131,7 @@ def _read_truth(
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
     if (raw := raw_depth(frame.gt, frame.image)) is not None:
-        values, reading = raw, Reading("float32 without a header")
+        values, reading = raw.values, raw.reading
     else:
         values, reading = _read(frame.gt, scale, request)
     values = apply_masks(values, frame.masks)

@@ -3,25 +3,62 @@
     layout, frames, unmatched = list_frames(Path("KITTI/object"))     # layout guessed
     layout, frames, unmatched = list_frames(Path("frames"), "pairs")  # layout named
 
-A new layout is a row of `rows`, or a `Layout` in `TABLE`, with its name in `choices.LAYOUTS`; or an
-entry point of the group `pnpdepth.layouts`.
+A new layout is a row of `TABLE`, or another `Layout` in it, with its name in `choices.LAYOUTS`; or
+an entry point of the group `pnpdepth.layouts`. The rows are:
+
+`7scenes`: frame-000000.color.png and frame-000000.depth.png, in the folder or in its seq-*/.
+`arkitscenes`: the upsampling set, <video>/ with wide/ (color/, lowres_wide/), the phone's
+lowres_depth/ with confidence/, and the laser scanner's highres_depth/, in millimetres.
+`diode`: NAME.png, NAME_depth.npy in metres and NAME_depth_mask.npy in <scene>/<scan>/.
+`ibims`: iBims-1 as images: rgb/ depth/ mask_invalid/ mask_transp/; a depth of 65535 is 50 m.
+`image-depth`: image/ (or images/) and depth/, ground truth; a calib.txt beside them is of all.
+`kitti-object`: image_2/ velodyne/ calib/, in training/ or testing/.
+`pairs`: rgb/ and sparse/, and optionally gt/ and calib/, with files of the same stems. Folders in
+them are searched too: rgb/drive_1/000.png belongs to sparse/drive_1/000.png. calib/ has one file
+per frame; a calib.txt beside the folders applies to all.
+`scannet`: exported scans, color/ depth/ intrinsic/ in one or more scene*/; depth in millimetres,
+smaller than the images.
+`void`: <sequence>/ with image/ sparse_depth/ validity_map/ ground_truth/ and K.txt, below a
+sequence, data/, a density or the release; where test_image.txt lists the test split, only its
+frames.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
-from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest, rows
-from pnpdepth_cli.dataset.layouts.layout import Layout
+from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest
+from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.file_bytes import read_bytes
 
 __all__ = ["LAYOUTS", "Layout", "list_frames"]
 
+
+def _prefix_with_place(mark: str) -> Callable[[Path, Path, str], str]:
+    """A function that puts the place's name and a mark before the stem, if it is not the root."""
+    return lambda root, place, stem: stem if place == root else f"{place.name}{mark}{stem}"
+
+
+def _below(root: Path, place: Path, stem: str) -> str:
+    return (place.relative_to(root) / stem).as_posix()
+
+
+def _of_void(place: Path) -> Callable[[FrameFiles], FrameFiles | None]:
+    """Keeps the frames of the test split, or all where no split is listed."""
+    split = place.parent.parent / "test_image.txt"
+    if place.parent.name != "data" or not split.is_file():
+        return replace
+    words = read_bytes(split).decode("utf-8", "replace").split()
+    wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
+    return lambda frame: frame if frame.name in wanted else None
+
+
 TABLE: dict[str, Layout] = {
-    **rows.ROWS,
     "manifest": manifest.MANIFEST,
     "kitti-odometry": kitti.ODOMETRY,
     "kitti-depth": kitti.DEPTH,
@@ -30,13 +67,93 @@ TABLE: dict[str, Layout] = {
     "colmap": indexed.COLMAP,
     "stray-scanner": indexed.STRAY_SCANNER,
     "record3d": indexed.RECORD3D,
+    "7scenes": row(
+        {"image": r"(frame-[^.]+)\.color.IMAGE", "gt": r"(frame-[^.]+)\.depth.png"},
+        below="|seq-*/",
+        marks=("frame-*.color.*",),
+        name=_prefix_with_place("_"),
+        calib="camera-intrinsics.txt",
+        shared=FrameFiles(gt_scale=1000.0),
+    ),
+    "arkitscenes": row(
+        {
+            "image": "wide|color|lowres_wide/*.png",
+            "sparse": "lowres_depth/*.png",
+            "sparse_mask": "confidence/*.png?",
+            "gt": "highres_depth/*.png?",
+        },
+        below="|*/|*/*/",
+        name=_prefix_with_place("/"),
+        shared=FrameFiles(sparse_scale=1000.0, gt_scale=1000.0, gt_other_size=True, one_view=True),
+    ),
+    "diode": row(
+        {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
+        below="|*/|*/*/|*/*/*/|*/*/*/*/",
+        marks=("*_depth_mask.npy", "*_depth.npy"),
+        name=_below,
+    ),
+    "eth3d": row(
+        {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
+        below="|*/|*/*/",
+        marks=("ground_truth_depth",),
+        name=_prefix_with_place("/"),
+    ),
+    "ibims": row(
+        {
+            "image": "rgb/*.png",
+            "gt": "depth/*.png",
+            "mask": "mask_invalid/*.png?",
+            "mask of transparent things": "mask_transp/*.png?",
+        },
+        marks=("mask_invalid", "mask_transp"),
+        name=_below,
+        shared=FrameFiles(gt_scale=65535 / 50),
+    ),
+    "image-depth": row(
+        {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"},
+        name=_below,
+        calib="calib.txt",
+    ),
+    "kitti-object": row(
+        {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
+        below="|training/|testing/",
+        name=_prefix_with_place("_"),
+        shared=FrameFiles(camera=2),
+    ),
+    "pairs": row(
+        {
+            "image": "rgb/**.IMAGE",
+            "sparse": "sparse/**.SPARSE",
+            "gt": "gt/**.DEPTH?",
+            "calib": "calib/**.CALIB?",
+        },
+        name=_below,
+        calib="calib.txt",
+    ),
+    "scannet": row(
+        {"image": "color/*.IMAGE", "gt": "depth/*.png"},
+        below="|*/|*/*/",
+        marks=("intrinsic",),
+        name=_prefix_with_place("/"),
+        calib="intrinsic/intrinsic_color.txt",
+        shared=FrameFiles(gt_scale=1000.0, gt_other_size=True),
+    ),
+    "void": row(
+        {
+            "image": "image/*.png",
+            "sparse": "sparse_depth/*.png",
+            "sparse_mask": "validity_map/*.png?",
+            "gt": "ground_truth/*.png?",
+        },
+        below="|*/|data/*/|*/data/*/",
+        marks=("sparse_depth", "ground_truth"),
+        name=_below,
+        calib="K.txt",
+        more=_of_void,
+        shared=FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True),
+    ),
 }
 """The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
-
-
-def _match(root: Path, name: str | None) -> str | None:
-    names = LAYOUTS if name is None else (name,)
-    return next((layout for layout in names if LAYOUTS[layout].matches(root)), None)
 
 
 def list_frames(
@@ -52,8 +169,14 @@ def list_frames(
         InputError: The folder matches no layout, or cannot be read.
     """
     try:
-        folders, layout = _data_sets(root, name)
-        found = [(folder, each) for folder in folders for each in LAYOUTS[layout].frames(folder)]
+        folders = _data_sets(root, [*LAYOUTS] if name is None else [name])
+        layouts = sorted({*folders.values()})
+        if len(layouts) > 1:
+            raise InputError(
+                f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of them,"
+                " or name the layout"
+            )
+        found = [(path, each) for path in folders for each in LAYOUTS[layouts[0]].frames(path)]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
@@ -63,40 +186,20 @@ def list_frames(
         if isinstance(each, FrameFiles)
     ]
     lost = dict.fromkeys(each for _, each in found if isinstance(each, Unmatched))
-    return layout, frames, list(lost)
+    return layouts[0], frames, list(lost)
 
 
-def _data_sets(root: Path, name: str | None) -> tuple[list[Path], str]:
-    """The folder, or those in it that are of one layout, and that layout."""
+def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
+    """The layout of the folder, or else of those in it, by their paths; at least one."""
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
-    if (layout := _match(root, name)) is not None:
-        return [root], layout
-    # The folders in it may be data sets of one layout.
     inside = sorted(root.iterdir()) if root.is_dir() else []
-    folders = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
-    found = {path: each for path in folders if (each := _match(path, name)) is not None}
-    layouts = sorted(set(found.values()))
-    if len(layouts) > 1:
-        raise InputError(
-            f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of them, or"
-            " name the layout"
-        )
-    if found:
-        return list(found), layouts[0]
-    # Why there is none.
-    if root.suffix.lower() == ".r3d":
-        raise InputError(
-            f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
-            " RGB' in Record3D, and give the folder EXR_RGBD"
-        )
-    if name is None:
-        raise InputError(
-            f"{root} does not look like any layout ({', '.join(LAYOUTS)}); name one to see what it"
-            " needs, or put images into rgb/ and their sparse depth into sparse/, with equal names,"
-            " or give a CSV list with the columns image and sparse"
-        )
-    needed = ", ".join(LAYOUTS[name].needs)
+    below = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
+    for folders in ([root], below):
+        layouts = {p: next((n for n in names if LAYOUTS[n].matches(p)), None) for p in folders}
+        if found := {path: name for path, name in layouts.items() if name is not None}:
+            return found
     raise InputError(
-        f"{root} does not look like {name!r}" + (f", which needs {needed}" if needed else "")
+        f"{root} does not look like {', '.join(names)}; put images into rgb/ and their sparse"
+        " depth into sparse/, with equal names, or give a CSV list with columns image and sparse"
     )

@@ -102,9 +102,9 @@ def _timed_files(path: Path, count: int) -> list[list[Timed]]:
             row = []
         finite = all(math.isfinite(time_s) for time_s, _ in row)
         if len(row) != count or not finite or (count == 2 and sum(map(_is_depth, row)) != 1):
-            both = " of rgb, and a time and a path of depth" if count == 2 else ""
             raise FileFormatError(
-                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path{both}"
+                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path for each"
+                " image and depth"
             )
         rows.append(row)
     return rows
@@ -128,7 +128,7 @@ def _nearest_pairs(images: list[Timed], depths: list[Timed]) -> list[list[Timed]
     ]
 
 
-TUM = Layout(matches=_is_tum, frames=_frames_of_tum, needs=("rgb.txt", "depth.txt"))
+TUM = Layout(matches=_is_tum, frames=_frames_of_tum)
 
 
 def _colmap_models(root: Path) -> list[Path]:
@@ -170,7 +170,7 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
         yield FrameFiles(name=stem, image=path, sparse=model.folder, pose=pose)
 
 
-COLMAP = Layout(matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/*/cameras.*"))
+COLMAP = Layout(matches=_colmap_models, frames=_of_colmap)
 
 
 def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:
@@ -213,13 +213,12 @@ STRAY_SCANNER = row(
     marks=("camera_matrix.csv", _ODOMETRY),
     calib="camera_matrix.csv",
     more=_of_stray_scanner,
-    sparse_scale=1000.0,
-    one_view=True,
+    shared=FrameFiles(sparse_scale=1000.0, one_view=True),
 )
 RECORD3D = row(
     {"image": r"rgb/(\d+).IMAGE", "sparse": r"depth/(\d+).exr"},
     marks=(_METADATA,),
     calib=_METADATA,
     more=_of_record3d,
-    one_view=True,
+    shared=FrameFiles(one_view=True),
 )

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose
 from pnpdepth_cli.dataset.layouts.layout import Layout, Part, join_parts, row
@@ -33,6 +32,7 @@ _RAW = ("", "raw/", "kitti_raw/")
 """Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
+_OF_MAPS = FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True)
 
 
 def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
@@ -61,8 +61,7 @@ ODOMETRY = row(
     name=lambda root, place, stem: f"{place.name}_{stem}",
     calib="calib.txt",
     more=_of_sequence,
-    camera=2,
-    part=ODOMETRY_PART,
+    shared=FrameFiles(camera=2, part=ODOMETRY_PART),
 )
 
 
@@ -90,9 +89,7 @@ _SELECTION = row(
     },
     marks=("velodyne_raw",),
     calib=_CALIBRATION,
-    sparse_scale=256.0,
-    gt_scale=256.0,
-    one_view=True,
+    shared=_OF_MAPS,
 )
 
 
@@ -120,12 +117,11 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "image": Part(images, "*.IMAGE"),
             "gt": Part(_truth_of(drive, camera), "*.png?"),
         }
-        fields = {"sparse_scale": 256.0, "gt_scale": 256.0, "one_view": True}
-        calib = _calibration_of(images.parents[1])
-        yield from _frames_of_camera(drive, camera, parts, calib=calib, **fields)
+        shared = replace(_OF_MAPS, calib=_calibration_of(images.parents[1]))
+        yield from _frames_of_camera(drive, camera, parts, shared)
 
 
-DEPTH = Layout(matches=_is_depth, frames=_frames_of_depth, needs=_SELECTION.needs)
+DEPTH = Layout(matches=_is_depth, frames=_frames_of_depth)
 
 
 def _raw_cameras(root: Path) -> list[Path]:
@@ -146,22 +142,18 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "sparse": Part(drive / _SCANS, "*.bin"),
             "gt": Part(_truth_of(drive, camera.name), "*.png?"),
         }
-        yield from _frames_of_camera(drive, camera.name, parts, calib=calibration, gt_scale=256.0)
+        shared = FrameFiles(calib=calibration, gt_scale=256.0)
+        yield from _frames_of_camera(drive, camera.name, parts, shared)
 
 
 def _frames_of_camera(
-    drive: Path, camera: str, parts: Mapping[str, Part], **fields: Any
+    drive: Path, camera: str, parts: Mapping[str, Part], shared: FrameFiles
 ) -> Iterator[FrameFiles | Unmatched]:
-    for found in join_parts(parts):
+    for found in join_parts(parts, replace(shared, camera=int(camera[-1]))):
         if isinstance(found, Unmatched):
             yield found
         else:
-            name = f"{drive.name}_{found.name}_{camera}"
-            yield replace(found, name=name, camera=int(camera[-1]), **fields)
+            yield replace(found, name=f"{drive.name}_{found.name}_{camera}")
 
 
-RAW = Layout(
-    matches=_raw_cameras,
-    frames=_frames_of_raw,
-    needs=(_SCANS, f"{_CAMERAS}/data", _CALIBRATION),
-)
+RAW = Layout(matches=_raw_cameras, frames=_frames_of_raw)

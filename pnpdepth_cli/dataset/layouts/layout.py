@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
@@ -29,8 +29,7 @@ _SUFFIXES = {
 }
 """What a pattern of file names may end with, for any of these."""
 
-Files = dict[str, Path]
-"""Files of one frame, by field of `FrameFiles`."""
+_NO_FIELDS = FrameFiles()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +39,6 @@ class Layout:
     matches: Callable[[Path], object]  # true for a folder or file of this layout
     frames: Callable[[Path], Iterable[FrameFiles | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
-    needs: tuple[str, ...] = ()
-    """Patterns of what the folder or one in it holds, for the message of an unknown folder."""
 
 
 class Part(NamedTuple):
@@ -65,7 +62,7 @@ class Part(NamedTuple):
         paths = (self.folder.with_name(self.folder.name + suffix) for suffix in VIDEO_SUFFIXES)
         return next((path for path in paths if path.is_file()), None)
 
-    def files(self) -> tuple[Files, list[Unmatched]]:
+    def files(self) -> tuple[dict[str, Path], list[Unmatched]]:
         """Returns the files by stem, sorted by number, and what belongs to no frame."""
         stem, _, suffix = self.names.removesuffix("?").rpartition(".")
         suffixes = _SUFFIXES.get(suffix, (f".{suffix}",))
@@ -83,18 +80,21 @@ class Part(NamedTuple):
         return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
-def join_parts(parts: Mapping[str, Part]) -> Iterator[FrameFiles | Unmatched]:
-    """Yields the frames, which the first part has, named by their stems; and files of none."""
-    # A part may be a video, which has each frame by its number.
-    videos = {field: video for field, part in parts.items() if (video := part.video)}
-    parts = {field: part for field, part in parts.items() if field not in videos}
+def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
+    """Yields the frames, which the first part has, named by their stems; and files of none.
+
+    `shared` is a frame whose fields all frames have.
+    """
+    # The images may be a video, which has each frame by its number.
+    video = parts["image"].video
+    parts = {field: part for field, part in parts.items() if field != "image" or video is None}
     first, *others = parts
     needed = [field for field in others if not parts[field].optional]
     for field in needed:
         if not (folder := parts[field].folder).is_dir():
             yield Unmatched(path=parts[first].folder, why=f"has no {folder}; add it")
             return
-    files = dict[str, Files]()
+    files = dict[str, dict[str, Path]]()
     for field, part in parts.items():
         files[field], unreadable = part.files()
         yield from unreadable
@@ -108,16 +108,23 @@ def join_parts(parts: Mapping[str, Part]) -> Iterator[FrameFiles | Unmatched]:
         own = {field: found[stem] for field, found in files.items() if stem in found}
         if not own.keys() >= set(needed):
             continue
-        number = re.search(r"\d+$", stem)
-        if videos and number is None:
-            why = f"has no number of a frame of {next(iter(videos.values()))} in its name"
-            yield Unmatched(path=own[first], why=why)
-            continue
-        masks = tuple(own.pop(field) for field in [*own] if field.startswith("mask"))
-        fields: dict[str, Any] = {**own}
-        for field, path in videos.items():
-            fields[field] = VideoFrame(path=path, index=int(number[0] if number else 0))
-        yield FrameFiles(name=stem, masks=masks, **fields)
+        image: Path | VideoFrame | None = own.get("image")
+        if video is not None:
+            if (number := re.search(r"\d+$", stem)) is None:
+                why = f"has no number of a frame of {video} in its name"
+                yield Unmatched(path=own[first], why=why)
+                continue
+            image = VideoFrame(path=video, index=int(number[0]))
+        yield replace(
+            shared,
+            name=stem,
+            image=image,
+            sparse=own.get("sparse"),
+            sparse_mask=own.get("sparse_mask"),
+            gt=own.get("gt"),
+            calib=own.get("calib", shared.calib),
+            masks=tuple(path for field, path in own.items() if field.startswith("mask")),
+        )
 
 
 def row(
@@ -128,7 +135,7 @@ def row(
     marks: tuple[str, ...] = (),
     calib: str = "",
     more: Callable[[Path], Callable[[FrameFiles], FrameFiles | None]] | None = None,
-    **fields: Any,
+    shared: FrameFiles = _NO_FIELDS,
 ) -> Layout:
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
 
@@ -142,39 +149,33 @@ def row(
         calib: File in a place, the calibration of frames without one of their own.
         more: Function of a place. It gives a function of a frame, named by its stem, that returns
             it with further fields, or None for one that is not wanted.
-        fields: Fields that all frames have.
+        shared: A frame whose fields all frames have.
     """
     needed = [text.rpartition("/")[0] for text in parts.values() if not text.endswith("?")]
     probe = marks[0] if marks else needed[-1].split("|")[0]
 
+    def is_place(place: Path) -> bool:
+        there = (p.optional or p.folder.is_dir() or p.video for p in parts_in(place).values())
+        return all(there) and all(next(place.glob(mark), None) for mark in marks)
+
     def find(root: Path) -> list[Path]:
         found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
-        return sorted(
-            place
-            for place in found
-            if all(
-                part.optional or part.folder.is_dir() or part.video
-                for part in parts_in(place).values()
-            )
-            and all(next(place.glob(mark), None) for mark in marks)
-        )
+        return sorted(filter(is_place, found))
 
     def parts_in(place: Path) -> dict[str, Part]:
         return {field: _part(place, text) for field, text in parts.items()}
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
         for place in find(root):
-            shared = place / calib if calib and (place / calib).is_file() else None
+            own = place / calib if calib and (place / calib).is_file() else None
             complete = more(place) if more else replace
-            for found in join_parts(parts_in(place)):
+            for found in join_parts(parts_in(place), replace(shared, calib=own)):
                 if isinstance(found, Unmatched):
                     yield found
                 elif (frame := complete(found)) is not None:
-                    named = name(root, place, frame.name)
-                    yield replace(frame, name=named, calib=frame.calib or shared, **fields)
+                    yield replace(frame, name=name(root, place, frame.name))
 
-    missing = (*(folders.split("|")[0] for folders in needed), *marks)
-    return Layout(matches=find, frames=frames, needs=tuple(dict.fromkeys(filter(None, missing))))
+    return Layout(matches=find, frames=frames)
 
 
 def _part(place: Path, text: str) -> Part:

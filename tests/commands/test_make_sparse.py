@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.sparse.make import (
-    SparseSummary,
+from pnpdepth_cli.commands.make_sparse import (
+    Written,
     lidar_of,
     project_scan,
     sample_depth,
@@ -35,9 +35,9 @@ def frame(tmp_path: Path) -> ScanOnDisk:
     return scan_on_disk(tmp_path)
 
 
-def recorded(summary: SparseSummary) -> dict[str, Any]:
+def recorded(written: Written) -> dict[str, Any]:
     """The record beside what was written."""
-    content: dict[str, Any] = json.loads(summary.files[-1].read_text())
+    content: dict[str, Any] = json.loads(written[2][0].with_suffix(".json").read_text())
     return content
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.requests import check_outputs
-from pnpdepth_cli.dataset.arrays import record_of
-from pnpdepth_cli.dataset.frame_camera import check_size
+from pnpdepth_cli.dataset.arrays import check_size, record_of
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
@@ -26,59 +24,50 @@ from pnpdepth_cli.io.file_bytes import plain, write_json
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.visualisation import overlay
-from pnpdepth_cli.sensors.lidar import LIDARS, Lidar, ideal_lidar, simulate_lidar
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
-from pnpdepth_cli.sensors.samplers import sample_points
+from pnpdepth_cli.sensors.simulation import (
+    LIDARS,
+    Lidar,
+    ideal_lidar,
+    sample_points,
+    simulate_lidar,
+)
+
+Written = tuple[Points, list[str], list[Path]]
+"""The points, lines for a person, and the files that were written."""
 
 
-class SparseSummary(NamedTuple):
-    """What was written."""
-
-    points: Points
-    notes: Sequence[str]
-    """Lines for a person."""
-    files: Sequence[Path]
-
-
-def _overlay(output: Path) -> Path:
-    """The image with the points, of a scan that is projected."""
-    return output.with_name(f"{output.stem}_overlay.png")
-
-
-def _check(
+def _outputs(
     output: Path, inputs: Iterable[Path | None], overwrite: bool, *, drawn: bool = False
-) -> None:
-    """Raises OutputError for files that cannot be written, or that replace an input."""
+) -> dict[str, Path]:
+    """The files to write. Raises OutputError if one cannot be written, or replaces an input."""
     if output.suffix.lower() not in SPARSE_SUFFIXES:
         raise OutputError(
             f"{output}: sparse depth is written as one of {', '.join(SPARSE_SUFFIXES)}"
         )
-    written = [output, output.with_suffix(".json"), *[_overlay(output)] * drawn]
-    check_outputs(written, [path for path in inputs if path], overwrite=overwrite)
+    files = {"sparse": output, "record": output.with_suffix(".json")}
+    if drawn:
+        files["overlay"] = output.with_name(f"{output.stem}_overlay.png")
+    check_outputs(files.values(), [path for path in inputs if path], overwrite=overwrite)
+    return files
 
 
 def _write(
-    command: str,
-    output: Path,
+    files: dict[str, Path],
     points: Points,
     settings: Mapping[str, object],
     inputs: Mapping[str, FileRecord],
-    notes: Sequence[str],
+    notes: list[str],
     *,
     rgb: NDArray[np.float32] | None = None,
-) -> SparseSummary:
-    """Writes the sparse depth, its record, and with an image (H, W, 3) in 0..1 the overlay."""
-    # The points, as a map or a list, and over the image.
-    make_folder(output.parent)
-    image, record = as_depth_image(points), output.with_suffix(".json")
-    write_sparse(output, points.xy, points.depth, image)
+) -> Written:
+    """Writes the sparse depth, over an image (H, W, 3) in 0..1 if there is one, and its record."""
+    make_folder(files["sparse"].parent)
+    image = as_depth_image(points)
+    write_sparse(files["sparse"], points.xy, points.depth, image)
     if rgb is not None:
-        overlay(rgb, points.xy, points.depth, _overlay(output))
-    drawn = None if rgb is None else _overlay(output)
-    outputs = {"sparse": output, "overlay": drawn, "record": record}
-    # The record.
+        overlay(rgb, points.xy, points.depth, files["overlay"])
     content = {
-        "command": command,
         "version": __version__,
         **settings,
         "inputs": {name: part.to_json() for name, part in inputs.items()},
@@ -90,11 +79,11 @@ def _write(
             "dropped": dict(points.dropped),
         },
         "size": [points.size[1], points.size[0]],
-        "notes": list(notes),
-        "outputs": plain(outputs),
+        "notes": notes,
+        "outputs": plain(files),
     }
-    write_json(record, content)
-    return SparseSummary(points, notes, [path for path in outputs.values() if path])
+    write_json(files["record"], content)
+    return points, notes, [*files.values()]
 
 
 def project_scan(
@@ -105,15 +94,17 @@ def project_scan(
     *,
     depth_scale: float | None = None,
     overwrite: bool = False,
-) -> SparseSummary:
+) -> Written:
     """Writes the scan's points that the camera of the image sees; returns what was written."""
-    _check(output, (scan, image, options.calib, options.extrinsics), overwrite, drawn=True)
+    files = _outputs(
+        output, (scan, image, options.calib, options.extrinsics), overwrite, drawn=True
+    )
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=depth_scale)
-    inputs = {"image": record_of(image), "scan": projected.record}
-    settings = plain(asdict(options))
-    return _write("project", output, projected.points, settings, inputs, projected.notes, rgb=rgb)
+    records = {"image": record_of(image), "scan": projected.record}
+    settings = {"command": "project", **plain(asdict(options))}
+    return _write(files, projected.points, settings, records, [*projected.notes], rgb=rgb)
 
 
 def sample_depth(
@@ -125,9 +116,9 @@ def sample_depth(
     seed: int = 0,
     depth_scale: float | None = None,
     overwrite: bool = False,
-) -> SparseSummary:
+) -> Written:
     """Writes points of a dense depth map; returns what was written."""
-    _check(output, (depth, image), overwrite)
+    files = _outputs(output, (depth, image), overwrite)
     dense, notes = _dense(depth, depth_scale)
     rgb, inputs = None, {"depth": record_of(depth)}
     if image is not None:
@@ -137,8 +128,8 @@ def sample_depth(
     if pattern.kind == "features" and len(points) < wanted:
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
-    settings = {"pattern": asdict(pattern), "seed": seed}
-    return _write("sample", output, points, settings, inputs, notes)
+    settings = {"command": "sample", "pattern": asdict(pattern), "seed": seed}
+    return _write(files, points, settings, inputs, notes)
 
 
 def simulate_scan(
@@ -150,18 +141,18 @@ def simulate_scan(
     seed: int = 0,
     depth_scale: float | None = None,
     overwrite: bool = False,
-) -> SparseSummary:
+) -> Written:
     """Writes the points of a sensor at the camera's place; returns what was written."""
-    _check(output, (depth, calib), overwrite)
+    files = _outputs(output, (depth, calib), overwrite)
     dense, notes = _dense(depth, depth_scale)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     points = simulate_lidar(dense, calibration.camera, sensor, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
-    settings = {"sensor": plain(asdict(sensor)), "seed": seed}
+    settings = {"command": "simulate", "sensor": plain(asdict(sensor)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
-    return _write("simulate", output, points, settings, inputs, notes)
+    return _write(files, points, settings, inputs, notes)
 
 
 def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:

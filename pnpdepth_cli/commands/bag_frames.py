@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from pnpdepth_cli.io.bags import (
     ODOMETRY,
     POSES,
     Bag,
+    Message,
     check_topics,
     choose_topic,
     open_bag,
@@ -168,7 +168,10 @@ def _clear(request: FramesRequest) -> None:
 def _write_pairs(
     request: FramesRequest, bag: Bag, sensors: Sensors, offset: float
 ) -> tuple[list[float], int, Counter[str]]:
-    """Writes images with their scans; returns times, images without a scan, dropped points."""
+    """Writes images with their scans; returns times, images without a scan, dropped points.
+
+    The files are rgb/NAME and sparse/NAME; the name is the image's time.
+    """
     lost, times, dropped = 0, list[float](), Counter[str]()
     first, last = request.between or (0, math.inf)
     numbers = itertools.count()
@@ -186,24 +189,17 @@ def _write_pairs(
             lost += 1
             continue
         dropped.update(counts)
-        _write_frame(request.output, sensors, image, values)
         times.append(image.time_s)
+        name = f"{image.time_s:.6f}".replace(".", "_")
+        suffix, data = image_file(image.message, sensors.images)
+        with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
+            temporary.write_bytes(data)
+        sparse = request.output / "sparse" / name
+        if sensors.is_map:
+            write_depth(sparse.with_suffix(".exr"), values)
+        else:
+            write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
     return times, lost, dropped
-
-
-def _write_frame(
-    folder: Path, sensors: Sensors, image: Stamped, values: NDArray[np.float32]
-) -> None:
-    """Writes rgb/NAME and sparse/NAME; the name is the image's time."""
-    name = f"{image.time_s:.6f}".replace(".", "_")
-    suffix, data = image_file(image.message, sensors.images)
-    with atomic_path(folder / "rgb" / f"{name}{suffix}") as temporary:
-        temporary.write_bytes(data)
-    sparse = folder / "sparse" / name
-    if sensors.is_map:
-        write_depth(sparse.with_suffix(".exr"), values)
-    else:
-        write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
 
 
 def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: Say) -> str:
@@ -218,11 +214,10 @@ def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: 
         return camera
     calibration, source, camera = of_bag[0], str(topic), of_bag[1] or camera
     # The pose of the scanner, from static transforms.
-    scanner = None if calibration.scanner else static_pose(bag, camera, points)
-    if scanner is not None:
+    if (scanner := static_pose(bag, camera, points)) is not None:
         source += f", and /tf_static from {camera} to {points}"
         calibration = replace(calibration, scanner=scanner)
-    if calibration.scanner is None and not sensors.is_map:
+    if scanner is None and not sensors.is_map:
         say(
             f"warning: {bag.path} has no static transform from {camera} to {points}; refine"
             " with --extrinsics FILE"
@@ -242,8 +237,7 @@ def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: 
 def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Yields the image and the points of a few frames."""
     scans = sorted((folder / "sparse").iterdir())
-    positions = np.linspace(0, len(scans) - 1, min(_COMPARED_FRAMES, len(scans)))
-    for scan in (scans[round(position)] for position in positions):
+    for scan in scans[:: math.ceil(len(scans) / _COMPARED_FRAMES)]:
         (image,) = (folder / "rgb").glob(f"{scan.stem}.*")
         yield read_rgb(image).values, read_scan(scan).points
 
@@ -337,17 +331,16 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
         if points not in registered and of_depth is None:
             say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
         return same
-    if (
+    one_camera = (
         points in registered
         and of_images is not None
         and of_images.size == of_depth.size
         and np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
-    ):
-        return same
-    return replace(same, depth_camera=of_depth)
+    )
+    return same if one_camera else replace(same, depth_camera=of_depth)
 
 
-def measurement(sensors: Sensors, message: Any) -> tuple[NDArray[np.float32], dict[str, int]]:
+def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32], dict[str, int]]:
     """Returns depth (H, W) of the images' camera, or points (N, 3); and counts of what is none.
 
     Raises:

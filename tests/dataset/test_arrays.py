@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.dataset.frame_camera import camera_of_file
+from pnpdepth_cli.dataset.arrays import camera_of_file
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import SizeError, UsageError

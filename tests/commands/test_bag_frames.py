@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("rosbags")
 
 from pnpdepth_cli.cli.main import run
+from pnpdepth_cli.commands.bag_frames import RECORD, write_frames
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames, unpack
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import FramesRequest
-from pnpdepth_cli.commands.sparse.bag_frames import RECORD, write_frames
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points

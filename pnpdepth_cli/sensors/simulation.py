@@ -1,6 +1,6 @@
-"""Rotating LiDARs, and the points that one would measure in a scene of known dense depth.
+"""Sparse depth made of dense depth: sampled by a pattern, or measured by a simulated LiDAR.
 
-The paper's four are there by data sheet, and as the paper has them.
+The paper's four LiDARs are there by data sheet, and as the paper has them.
 
 A rotating LiDAR fires all its beams at every azimuth step. Elevations are degrees above the
 horizontal; its coordinates are x forward, y left, z up.
@@ -10,13 +10,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.errors import NoPointsError, UsageError
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import DropCounter, Floats, Points, pixel_index
+
+Pixels = NDArray[np.intp]
+"""(N,) row-major indices of pixels."""
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's coordinates to those of a camera facing the same way."""
@@ -45,10 +50,8 @@ class Lidar:
             std = np.radians(self.angle_noise_deg)
             elevation = elevation + rng.normal(0, std, elevation.shape)
             azimuth = azimuth + rng.normal(0, std, azimuth.shape)
-        level = np.cos(elevation)
-        return np.column_stack(
-            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        )
+        x, y = np.cos(elevation) * (np.cos(azimuth), np.sin(azimuth))
+        return np.column_stack([x, y, np.sin(elevation)])
 
 
 def evenly_spaced(top_deg: float, step_deg: float, beams: int) -> tuple[float, ...]:
@@ -156,3 +159,92 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
             " intrinsics"
         )
     return drops.points(points, xy, size)
+
+
+def sample_points(
+    depth: NDArray[np.float32],
+    pattern: SamplePattern,
+    seed: int,
+    *,
+    image: NDArray[np.float32] | None = None,
+) -> Points:
+    """Returns points sampled from a dense depth map; the same seed gives the same points.
+
+    Args:
+        depth: (H, W) metres, 0 = unknown.
+        pattern: Pattern of the pixels that are sampled.
+        seed: Random seed of the pattern.
+        image: (H, W, 3) in 0..1 of the same view, for `features`.
+
+    Raises:
+        NoPointsError: The depth map or the pattern leaves no point.
+        UsageError: More points are asked for than are known.
+        SizeError: Image and depth differ in size.
+    """
+    size = (depth.shape[0], depth.shape[1])
+    if image is not None and image.shape[:2] != size:
+        raise SizeError(
+            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
+        )
+    known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
+    if not known.size:
+        raise NoPointsError("the depth map has no pixel with known depth to sample from")
+    wanted = pattern.wanted(known.size)
+    # The known pixels of the pattern.
+    match pattern.kind:
+        case "uniform":
+            if wanted > known.size:
+                raise UsageError(f"{wanted:,} points of {known.size:,} known pixels; ask for fewer")
+            chosen = np.random.default_rng(seed).choice(known, wanted, replace=False)
+        case "shuffle":  # as Marigold-DC does, by numpy's legacy generator
+            rows = known[:, None].copy()  # rows of an array are shuffled unlike a flat one
+            np.random.RandomState(seed).shuffle(rows)
+            chosen = rows[:wanted, 0]
+        case "grid":
+            chosen = np.intersect1d(_grid(pattern.fraction or wanted / depth.size, size), known)
+        case "lines":
+            chosen = known[np.isin(known // size[1], _lines(pattern.wanted(size[0]), size[0]))]
+        case _:
+            corners = _corners(image, wanted)
+            chosen = corners[np.isin(corners, known)][:wanted]
+    # Their depths.
+    chosen = np.sort(chosen)
+    if not chosen.size:
+        raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
+    row, column = np.divmod(chosen, size[1])
+    return Points(
+        xy=np.stack([column, row], axis=1).astype(np.float32),
+        depth=depth.ravel()[chosen].astype(np.float32),
+        size=size,
+    )
+
+
+def _grid(fraction: float, size: tuple[int, int]) -> Pixels:
+    """The nodes of a square grid that are this fraction of all pixels."""
+    spacing: float = max(1.0, fraction**-0.5)
+    rows, columns = (
+        np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing).clip(max=side - 1)
+        for side in size
+    )
+    nodes: Pixels = (rows[:, None] * size[1] + columns).astype(np.intp).ravel()
+    return nodes
+
+
+def _lines(count: int, height: int) -> Pixels:
+    """The numbers of evenly spaced rows."""
+    if count > height:
+        raise UsageError(f"{count:,} lines do not fit {height:,} rows; ask for fewer")
+    return np.floor((np.arange(count) + 0.5) * height / count).astype(np.intp)
+
+
+def _corners(image: NDArray[np.float32] | None, wanted: int) -> Pixels:
+    """The pixels of ORB corners, the strongest first, as structure from motion has its points."""
+    if image is None:
+        raise UsageError("pattern 'features' needs the image that the depth belongs to")
+    grey = cv2.cvtColor(image.clip(0, 1), cv2.COLOR_RGB2GRAY)
+    # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
+    detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
+    corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
+    xy = np.array([c.pt for c in sorted(corners, key=lambda corner: -corner.response)])
+    column, row = np.rint(xy.reshape(-1, 2)).astype(np.intp).T
+    return np.array([*dict.fromkeys((row * image.shape[1] + column).tolist())], np.intp)

@@ -1,1 +1,0 @@
-"""The commands that make sparse depth: project, sample and simulate."""
