@@ -19,13 +19,17 @@ from pnpdepth_cli.dataset.arrays import (
     read_image,
     record_of,
 )
-from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
-from pnpdepth_cli.dataset.sparse_depth import SparseDepth, depth_of_distances, read_map_points
+from pnpdepth_cli.dataset.sparse_depth import (
+    SparseDepth,
+    depth_of_distances,
+    read_colmap_points,
+    read_map_points,
+)
 from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of

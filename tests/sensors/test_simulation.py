@@ -11,7 +11,6 @@ from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.simulation import (
     LIDARS,
-    Lidar,
     ideal_lidar,
     sample_points,
     simulate_lidar,
@@ -19,70 +18,46 @@ from pnpdepth_cli.sensors.simulation import (
 
 
 @pytest.mark.parametrize(
-    ("name", "beams", "top", "bottom"),
+    ("name", "beams", "top", "bottom", "percent"),
     [
-        ("vlp-16", 16, 15.0, -15.0),
-        ("vlp-32c", 32, 15.0, -25.0),
-        ("hdl-32e", 32, 10.67, -30.67),
-        ("hdl-64e", 64, 2.0, -24.33),
+        ("vlp-16", 16, 15.0, -15.0, 5.3),
+        ("vlp-32c", 32, 15.0, -25.0, 28.8),
+        ("hdl-32e", 32, 10.67, -30.67, 10.3),
+        ("hdl-64e", 64, 2.0, -24.33, 18.7),
     ],
 )
-def test_a_sensor_has_the_beams_of_its_data_sheet_from_the_top(
-    name: str, beams: int, top: float, bottom: float
+def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_samples(
+    name: str, beams: int, top: float, bottom: float, percent: float
 ) -> None:
     angles = np.array(LIDARS[name].elevations_deg)
     assert len(angles) == beams
     assert (np.diff(angles) < 0).all()
     assert (angles[0], angles[-1]) == pytest.approx((top, bottom), abs=0.01)
+    # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
+    synthia = Camera(intrinsics=np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]]))
+    depth = np.full((304, 512), 10.0)
+    points = simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0)
+    assert 100 * len(points) / depth.size == pytest.approx(percent, rel=0.1)
 
 
-def test_a_lidar_of_ones_own_has_evenly_spaced_beams_and_no_noise() -> None:
-    own = ideal_lidar(5, 15, -25)
-    assert own == Lidar(
-        name="5 beams", elevations_deg=(15, 5, -5, -15, -25), azimuth_step_deg=0.2, max_range=np.inf
-    )
+def test_a_lidar_of_ones_own_has_evenly_spaced_beams() -> None:
+    assert ideal_lidar(5, 15, -25).elevations_deg == (15, 5, -5, -15, -25)
     assert ideal_lidar(1, 3, 3).elevations_deg == (3,)
-    for top, bottom in ((-25, 15), (3, 3), (np.nan, 0)):
+    for beams, top, bottom in ((5, -25, 15), (5, 3, 3), (5, np.nan, 0), (2, 91, 0)):
         with pytest.raises(UsageError):
-            ideal_lidar(5, top, bottom)
-    with pytest.raises(UsageError):
-        ideal_lidar(2, 91, 0)
+            ideal_lidar(beams, top, bottom)
 
 
-K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
-CAMERA = Camera(intrinsics=K)
-IDEAL = Lidar(
-    name="ideal", elevations_deg=tuple(range(-14, 15, 2)), azimuth_step_deg=0.2, max_range=100
-)
-
-
-def test_without_noise_every_point_lies_on_the_depth_map() -> None:
+def test_without_noise_every_point_lies_on_known_depth() -> None:
+    camera = Camera(intrinsics=np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]))
     depth = np.random.default_rng(0).uniform(2, 50, (240, 320)).astype(np.float32)
-    got = simulate_lidar(depth, CAMERA, IDEAL, seed=0)
+    depth[:, :160] = 0
+    got = simulate_lidar(depth, camera, ideal_lidar(15, 14, -14), seed=0)
     column, row = np.floor(got.xy + 0.5).astype(int).T
     np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
     assert len(got.depth) > 1000
-
-
-def test_unknown_depth_gives_no_points() -> None:
-    with pytest.raises(NoPointsError, match="ideal"):
-        simulate_lidar(np.zeros((240, 320)), CAMERA, IDEAL, seed=0)
-    half = np.full((240, 320), 5.0)
-    half[:, :160] = 0
-    assert simulate_lidar(half, CAMERA, IDEAL, seed=0).xy[:, 0].min() >= 159.5
-
-
-PAPER_PERCENT = {"vlp-16": 5.3, "vlp-32c": 28.8, "hdl-32e": 10.3, "hdl-64e": 18.7}
-
-
-def test_the_papers_sensors_give_about_its_fractions_of_samples() -> None:
-    # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
-    intrinsics = np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]])
-    synthia = Camera(intrinsics=intrinsics)
-    depth = np.full((304, 512), 10.0)
-    for name, percent in PAPER_PERCENT.items():
-        points = simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0)
-        assert 100 * len(points) / depth.size == pytest.approx(percent, rel=0.1), name
+    with pytest.raises(NoPointsError, match="15 beams"):
+        simulate_lidar(0 * depth, camera, ideal_lidar(15, 14, -14), seed=0)
 
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
@@ -95,13 +70,10 @@ def checkerboard() -> np.ndarray:
     return np.repeat(board[:, :, None], 3, axis=2)
 
 
-def pattern(kind: str) -> SamplePattern:
-    return SamplePattern(kind=kind, count=9 if kind == "lines" else 40)
-
-
 @pytest.mark.parametrize("kind", PATTERNS)
 def test_every_pattern_gives_known_pixels_once_with_their_own_depth(kind: str) -> None:
-    got = sample_points(HOLES, pattern(kind), 1, image=checkerboard())
+    pattern = SamplePattern(kind=kind, count=9 if kind == "lines" else 40)
+    got = sample_points(HOLES, pattern, 1, image=checkerboard())
     column, row = got.xy.astype(int).T
     assert np.array_equal(got.xy, np.column_stack([column, row]))
     assert np.array_equal(got.depth, HOLES[row, column])
@@ -134,8 +106,6 @@ def test_lines_keeps_whole_rows() -> None:
     assert len(got.depth) == 4 * 80
     every = sample_points(DEPTH, SamplePattern(kind="lines", count=60), 0)
     assert np.array_equal(every.depth, DEPTH.ravel())
-    with pytest.raises(UsageError):
-        sample_points(DEPTH, SamplePattern(kind="lines", count=61), 0)
 
 
 def test_features_lie_at_the_corners_of_the_image() -> None:
@@ -151,16 +121,22 @@ def test_features_lie_at_the_corners_of_the_image() -> None:
     assert (away.min(axis=0) <= 6).all()
 
 
-def test_what_the_depth_map_cannot_give_is_refused() -> None:
-    with pytest.raises(NoPointsError):
-        sample_points(np.zeros((5, 5), np.float32), SamplePattern(count=1), 0)
-    plain = np.full((60, 80, 3), 0.5, np.float32)
-    with pytest.raises(NoPointsError):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=plain)
-    with pytest.raises(UsageError):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0)
-    with pytest.raises(UsageError):
-        sample_points(DEPTH, SamplePattern(count=4801), 0)
-    image = np.zeros((30, 40, 3), np.float32)
-    with pytest.raises(SizeError, match=r"\b40×30"):
-        sample_points(DEPTH, SamplePattern(kind="features", count=3), 0, image=image)
+PLAIN = np.full((60, 80, 3), 0.5, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("depth", "kind", "count", "image", "error"),
+    [
+        (0 * DEPTH, "uniform", 1, None, NoPointsError),
+        (DEPTH, "uniform", 4801, None, UsageError),
+        (DEPTH, "features", 3, PLAIN, NoPointsError),
+        (DEPTH, "features", 3, None, UsageError),
+        (DEPTH, "features", 3, PLAIN[:30], SizeError),
+        (DEPTH, "lines", 61, None, UsageError),
+    ],
+)
+def test_what_the_depth_map_cannot_give_is_refused(
+    depth: np.ndarray, kind: str, count: int, image: np.ndarray | None, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        sample_points(depth, SamplePattern(kind=kind, count=count), 0, image=image)

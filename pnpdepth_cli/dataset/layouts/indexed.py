@@ -71,10 +71,11 @@ def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
             for name in ("rgb.txt", "depth.txt")
         )
         pairs = _nearest_pairs(images, depths)
-        for timed, number, other in ((images, 0, "depth"), (depths, 1, "image")):
-            used = {pair[number] for pair in pairs}
-            why = f"has no {other} within {LONGEST_GAP_S} s that is not another's"
-            yield from (Unmatched(path=each[1], why=why) for each in timed if each not in used)
+        used = {timed for pair in pairs for timed in pair}
+        why = f"has no partner within {LONGEST_GAP_S} s that is not another's"
+        for timed in (*images, *depths):
+            if timed not in used:
+                yield Unmatched(path=timed[1], why=why)
     # The frames, with poses where motion capture has them.
     poses = root / "groundtruth.txt"
     trajectory = read_trajectory(poses) if poses.is_file() else None
@@ -102,10 +103,8 @@ def _timed_files(path: Path, count: int) -> list[list[Timed]]:
             row = []
         finite = all(math.isfinite(time_s) for time_s, _ in row)
         if len(row) != count or not finite or (count == 2 and sum(map(_is_depth, row)) != 1):
-            raise FileFormatError(
-                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path for each"
-                " image and depth"
-            )
+            fact = f"{one_line(line)[:60]!r} is not a time and a path for each image and depth"
+            raise FileFormatError(f"{path}, line {number}: {fact}")
         rows.append(row)
     return rows
 

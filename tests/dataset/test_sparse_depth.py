@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.dataset.colmap_points import read_colmap_points
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.read_options import ReadOptions
+from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
