@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.exports import export_results
-from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
+from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
