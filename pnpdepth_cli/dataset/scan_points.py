@@ -171,7 +171,8 @@ def choose_camera(
     }
     candidates = cameras if "image_rect" in topic else {"K and distortion": raw} | cameras
     choice = next(iter(candidates))
-    own, why = candidates[choice], topic or "the usual meaning of camera_info"
+    own = candidates[choice]
+    why = f"the topic {topic}" if topic else "the usual meaning of camera_info"
     # How well jumps of depth meet edges, in the mean of the frames.
     scores = list[dict[str, float]]()
     for rgb, xyz in frames if own.scanner and len(candidates) > 1 else ():
