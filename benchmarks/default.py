@@ -45,8 +45,8 @@ from benchmarks.frames import (
     without_occluded,
 )
 from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.fuse import LEAST_PART
-from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED

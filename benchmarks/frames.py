@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.frames.frame import Frame, Register, tensor_of
+from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
 from pnpdepth_cli.frames.method import Method, refine_fixed
-from pnpdepth_cli.frames.open_network import Member, OpenNetwork
-from pnpdepth_cli.frames.refined import Refined
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
@@ -163,7 +162,7 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
     """The refinement of a frame with all of its points."""
-    with OpenNetwork(Member(network=network, layer=layer, settings=settings)) as opened:
+    with OpenNetwork(network, layer, settings) as opened:
         return refine_fixed(opened, inputs.registered())
 
 

@@ -22,8 +22,8 @@ from pnpdepth_cli.errors import NoPointsError as NoPointsError
 from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
 from pnpdepth_cli.errors import SizeError as SizeError
 from pnpdepth_cli.errors import UsageError as UsageError
+from pnpdepth_cli.frames.frame import Refined as Refined
 from pnpdepth_cli.frames.frame import Registration
-from pnpdepth_cli.frames.refined import Refined as Refined
 from pnpdepth_cli.frames.refiner import Refiner as Refiner
 from pnpdepth_cli.frames.refiner import Unit, in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS

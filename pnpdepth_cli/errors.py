@@ -1,10 +1,15 @@
 """Every error a user can cause, as one tree; each class carries its exit code.
 
-A message names the object, the fact and the remedy, on one line.
+A message names the object, the fact and the remedy, on one line. So do the errors made of what a
+user's code raises, such as a network's forward.
 """
 
 from __future__ import annotations
 
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ClassVar
 
 
@@ -80,3 +85,49 @@ class FramesFailedError(PnpDepthError):
     """A batch finished, but some of its frames failed."""
 
     exit_code = 7
+
+
+@contextmanager
+def wrap_user_errors(what: str) -> Iterator[None]:
+    """Turns exceptions inside the block into a ModelError "`what` raises …".
+
+    Errors of this program and exhausted memory are raised as they are.
+    """
+    try:
+        yield
+    except PnpDepthError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise ModelError(f"{what} raises {describe(error)}") from error
+
+
+def describe(error: BaseException, file: Path | None = None) -> str:
+    """Returns the exception on one line, with the number of the line of `file` that raised it."""
+    text = " ".join(str(error).split())[:300]
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f.lineno for f in frames if file and Path(f.filename).resolve() == file.resolve()]
+    line = f" (line {lines[-1]})" if lines else ""
+    return f"{type(error).__name__}: {text}{line}" if text else f"{type(error).__name__}{line}"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether the exception is one of those by which torch and Python report exhausted memory."""
+    messages = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(message in str(error) for message in messages)
+    )
+
+
+@contextmanager
+def out_of_memory_is_a_device_error(device: object) -> Iterator[None]:
+    """Inside, running out of memory becomes a DeviceError."""
+    try:
+        yield
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        raise DeviceError(
+            f"device {str(device)!r} is out of memory; use a smaller image or another device"
+        ) from None

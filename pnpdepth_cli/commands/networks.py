@@ -13,8 +13,12 @@ from torch.utils.flop_counter import FlopCounterMode
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
-from pnpdepth_cli.errors import ModelError, UsageError
+from pnpdepth_cli.errors import (
+    ModelError,
+    UsageError,
+    out_of_memory_is_a_device_error,
+    wrap_user_errors,
+)
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -134,7 +138,7 @@ class MeasuredLayer:
 
     stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
     fraction of the network's floating-point operations behind the cut, which every update repeats.
-    Fields: rows and columns that one point influences, see `InfluentialField`.
+    Fields: rows and columns that one point influences, see `influential_field`.
     """
 
     name: str
@@ -192,7 +196,7 @@ def _measure(
             split.rear(z)  # the first pass learns the cut
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
-            field = influential_field(split, z, network.known_of)
+            in_z, in_output = influential_field(split, z, network.known_of)
     except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(
@@ -200,6 +204,6 @@ def _measure(
         shape=tuple(z.shape),
         stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
-        field_in_z=field.in_z,
-        field_in_output=field.in_output,
+        field_in_z=in_z,
+        field_in_output=in_output,
     )

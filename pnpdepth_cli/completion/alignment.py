@@ -57,19 +57,18 @@ class Alignment:
         The gradient is that of the unclamped depth, so that a loss still pulls back a pixel that
         is outside.
         """
-        line = self.scale * x + self.shift
-        near, far = self.bounds
-        if self.space == "inverse":
-            return _clamp(line, 1 / far, 1 / near).reciprocal()
-        if self.space == "log":
-            return _clamp(line, math.log(near), math.log(far)).exp()
-        return _clamp(line, near, far)
+        return from_space(_clamp(self.scale * x + self.shift, *self._limits), self.space)
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
-        line = self.scale * x.cpu() + self.shift
-        near, far = (float(to_space(torch.tensor(b), self.space)) for b in self.bounds)
-        return float(((line < min(near, far)) | (line > max(near, far))).double().mean())
+        line, (low, high) = self.scale * x.cpu() + self.shift, self._limits
+        return float(((line < low) | (line > high)).double().mean())
+
+    @property
+    def _limits(self) -> list[float]:
+        """The bounds of the line in its space, the lower one first."""
+        bounds = torch.tensor(self.bounds, dtype=torch.float64)
+        return sorted(to_space(bounds, self.space).tolist())
 
     @property
     def falling(self) -> bool:
@@ -156,7 +155,7 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
 
 def _fit(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
     y = to_space(d, space)
-    line = (1.0, 0.0) if kind == "none" else _LINES[kind](x, y, space)
+    line = _line(x, y, space, kind)
     if line is None or not all(map(math.isfinite, line)) or line[0] == 0:
         return None
     bounds = (float(d.min()) / BEYOND, float(d.max()) * BEYOND)
@@ -178,30 +177,23 @@ def _bic(fit: Alignment) -> float:
     return 2 * (fit.points * math.log(error) + parameters * math.log(max(2, fit.points)))
 
 
-def _median(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
-    if space == "log":
-        return 1.0, float((y - x).median())
+def _line(x: Tensor, y: Tensor, space: str, kind: str) -> tuple[float, float] | None:
+    """Scale and shift of y = scale·x + shift; None where the x do not determine them."""
+    if kind == "none":
+        return 1.0, 0.0
+    if kind == "affine":
+        if float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
+            return None
+        return _fit_reweighted(x, y, _least_median(x, y), shifted=True)
+    if space == "log":  # where a factor of depth is an addend
+        x, y = torch.ones_like(x), y - x
     used = x != 0
-    return (float((y[used] / x[used]).median()), 0.0) if bool(used.any()) else None
-
-
-def _scale(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
-    start = _median(x, y, space)
-    if start is None:
+    if not bool(used.any()):
         return None
-    if space == "log":
-        one = torch.ones_like(x)
-        return 1.0, _fit_reweighted(one, y - x, (start[1], 0.0), shifted=False)[0]
-    return _fit_reweighted(x, y, start, shifted=False)
-
-
-def _affine(x: Tensor, y: Tensor, space: str) -> tuple[float, float] | None:
-    if float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
-        return None
-    return _fit_reweighted(x, y, _least_median(x, y), shifted=True)
-
-
-_LINES = {"median": _median, "scale": _scale, "affine": _affine}
+    factor = float((y[used] / x[used]).median())
+    if kind == "scale":
+        factor, _ = _fit_reweighted(x, y, (factor, 0.0), shifted=False)
+    return (1.0, factor) if space == "log" else (factor, 0.0)
 
 
 def _least_median(x: Tensor, y: Tensor) -> tuple[float, float]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -51,20 +50,15 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     return torch.where(known, depth, 0.0).float().to(device)
 
 
-def _of_points(fill: Callable[[SparsePoints], Tensor]) -> Baseline:
-    """The baseline that takes no prediction."""
-    return lambda points, prediction: fill(points)
-
-
 def _aligned(kind: str, space: str = "depth") -> Baseline:
     """The baseline that aligns the prediction."""
     return lambda points, prediction: align_prediction(prediction, points, kind=kind, space=space)
 
 
 TABLE: dict[str, Baseline] = {
-    "nearest": _of_points(nearest),
-    "linear": _of_points(linear),
-    "linear-log": _of_points(partial(linear, space="log")),
+    "nearest": lambda points, _: nearest(points),
+    "linear": lambda points, _: linear(points),
+    "linear-log": lambda points, _: linear(points, space="log"),
     "median": _aligned("median"),
     "scale": _aligned("scale"),
     "affine": _aligned("affine"),

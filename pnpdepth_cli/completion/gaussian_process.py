@@ -1,6 +1,6 @@
 """A Gaussian process over the image that predicts the residual at the sparse points (kriging).
 
-The residual r in log depth is a random field observed at the points,
+The residual r = log measured depth − log predicted depth is a random field observed at the points,
 
     r(p) = β₀ + β₁·u(p) + f(p) + noise,   cov f(p), f(q) = exp(−|φ(p) − φ(q)|),
 
@@ -23,17 +23,18 @@ layers of blocks, half a block apart, are blended so that no seam is seen.
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.completion.interpolation import nearest_points
-from pnpdepth_cli.completion.residual_field import Kernel, ResidualField
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.completion.alignment import where_predicted
+from pnpdepth_cli.completion.interpolation import distinct, nearest_points
+from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.scan_pattern import scan_pattern
 
 CONSTANT, SLOPE = 100.0, 1.0
@@ -63,6 +64,114 @@ _NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
 _MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
 _CROWDED = 0.05  # except for this fraction of all points
 _MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+DEPTH = 2
+"""Position of the predicted log depth among the features."""
+_FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to standard deviations: a flat image has no edges
+_XYZ_OF_RGB = (
+    (0.4124564, 0.3575761, 0.1804375),
+    (0.2126729, 0.7151522, 0.0721750),
+    (0.0193339, 0.1191920, 0.9503041),
+)  # IEC 61966-2-1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualField:
+    """A residual that is known at N points of an image."""
+
+    features: Tensor  # (3 or 6, H, W), see `features_of`
+    points: SparsePoints  # the points at pixel coordinates of the image, on the CPU
+    at: Tensor  # (N, 3 or 6), features at the points
+    residual: Tensor  # (N,) float64, log measured − log predicted depth
+    # Covariance of a Gaussian process; `gaussian_process.fit` chooses it.
+    depth_length: float = 2.5  # length scale of the predicted log depth
+    colour_length: float = 8.0  # length scale of the colour
+    noise: float = 1e-3  # variance of the noise
+
+    def scaled(self, features: Tensor) -> Tensor:
+        """Returns features (..., 3 or 6) divided by their length scales."""
+        lengths = [1.0, 1.0, self.depth_length]
+        lengths += [self.colour_length] * (features.shape[-1] - 3)
+        return features / features.new_tensor(lengths)
+
+    def select(self, mask: Tensor) -> ResidualField:
+        """Returns the field with only the points where mask (N,) is true."""
+        points, at, residual = self.points.select(mask), self.at[mask], self.residual[mask]
+        return replace(self, points=points, at=at, residual=residual)
+
+
+def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> ResidualField:
+    """Returns the residual at the points that lie in the image and have a prediction.
+
+    Of several points at the same coordinates the nearest counts.
+
+    Args:
+        prediction: (H, W) metres; not positive or not finite is unknown.
+        rgb: (3, H, W) in 0…1, or None.
+
+    Raises:
+        NoPointsError: No point has a prediction.
+    """
+    prediction, points = prediction.detach().cpu(), points.tensors()
+    inside = in_frame(points.xy, points.size, closed=True)
+    known, points = where_predicted(prediction, points.select(inside))
+    points = distinct(points)
+    features = features_of(
+        torch.where(known, prediction, torch.nan).log(), None if rgb is None else rgb.cpu()
+    )
+    predicted = points.sample(torch.where(known, prediction, 1.0)).double()
+    return ResidualField(
+        features=features,
+        points=points,
+        at=_sample(features, points),
+        residual=points.depth.double().log() - predicted.log(),
+    )
+
+
+def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
+    """Returns (3 or 6, H, W) float32: x and y, predicted log depth, CIELAB colour.
+
+    x and y are in units of the longer side; depth and colour in standard deviations over the image.
+
+    Args:
+        log_depth: (H, W), NaN where unknown.
+        rgb: (3, H, W) in 0…1, or None.
+    """
+    height, width = log_depth.shape
+    y, x = (torch.arange(float(n)) / max(height, width) for n in (height, width))
+    known = log_depth.isfinite()
+    values = log_depth if bool(known.all()) else log_depth[known]  # picking them is slow
+    values = values.double().flatten()
+    mean = values.mean()
+    std = (values.dot(values) / len(values) - mean.square()).clamp_min(0).sqrt()
+    u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
+    maps = x.expand(height, width), y[:, None].expand(height, width), u.float()
+    return torch.stack(maps if rgb is None else (*maps, *_colour(rgb)))
+
+
+def _sample(features: Tensor, points: SparsePoints) -> Tensor:
+    """The features (N, 3 or 6) at the coordinates of the points."""
+    return torch.stack([points.sample(one) for one in features], dim=1)
+
+
+@functools.lru_cache(maxsize=2)
+def _colour(rgb: Tensor) -> Tensor:
+    """CIELAB (3, H, W), its mean 0 and its standard deviation over the image about 1.
+
+    Remembered for the last image, whose residuals are propagated several times, and for a grey one.
+    """
+    lab = cielab(rgb)
+    lab = lab - lab.mean(dim=(1, 2), keepdim=True)
+    return lab / (lab.square().sum(dim=0).mean().sqrt() + _FLAT_COLOUR)
+
+
+def cielab(rgb: Tensor) -> Tensor:
+    """Returns (3, H, W) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
+    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055).clamp_min(0) ** 2.4)
+    matrix = rgb.new_tensor(_XYZ_OF_RGB)
+    xyz = torch.einsum("ij,jhw->ihw", matrix / matrix.sum(dim=1, keepdim=True), linear)
+    root = xyz.clamp_min(1e-6).pow(1 / 3)
+    x, y, z = torch.where(xyz > 216 / 24389, root, xyz * (24389 / 27 / 116) + 16 / 116)
+    return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
 def fit(field: ResidualField) -> ResidualField:
@@ -75,15 +184,15 @@ def fit(field: ResidualField) -> ResidualField:
         return field
     near = neighbourhoods(field, _MAX_EXACT)
 
-    def error(kernel: Kernel) -> float:
-        errors, _ = leave_one_out(replace(field, kernel=kernel), near)
+    def error(candidate: ResidualField) -> float:
+        errors, _ = leave_one_out(candidate, near)
         return float(errors.abs().mean())
 
     colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
-    lengths = [Kernel(depth=d, colour=c) for d, c in product(LENGTHS_DEPTH, colours)]
-    best = min(lengths, key=error)
+    lengths = product(LENGTHS_DEPTH, colours)
+    best = min((replace(field, depth_length=d, colour_length=c) for d, c in lengths), key=error)
     noises = [replace(best, noise=noise) for noise in NOISES if noise != best.noise]
-    return replace(field, kernel=min([best, *noises], key=error))
+    return min([best, *noises], key=error)
 
 
 def predict(field: ResidualField) -> Tensor:
@@ -96,21 +205,18 @@ def predict(field: ResidualField) -> Tensor:
     if rows == columns == 1:
         return _predict_grid(field)
     coarse = (max(1, round(size[0] / rows)), max(1, round(size[1] / columns)))
-    features = F.interpolate(torch.stack(field.features)[None], coarse, mode="area")[0]
-    grid = replace(field, features=features.unbind(), points=field.points.resized(*coarse))
+    features = F.interpolate(field.features[None], coarse, mode="area")[0]
+    grid = replace(field, features=features, points=field.points.resized(*coarse))
     values = _predict_grid(grid)[None, None]
     return F.interpolate(values, size, mode="bilinear", align_corners=False)[0, 0]
 
 
-def predict_at(field: ResidualField, xy: Tensor, features: Tensor) -> Tensor:
-    """Returns the mean residual (M,) at single pixels.
-
-    Args:
-        xy: (M, 2) pixel coordinates.
-    """
+def predict_at(field: ResidualField, queries: SparsePoints) -> Tensor:
+    """Returns the mean residual (M,) at the coordinates of M points."""
+    features = _sample(field.features, queries)
     if _is_exact(field) or len(field.points) <= NEIGHBOURS:
         return _solve(field, _all_points(field), features[None])[0]
-    _, near = nearest_points(field.points, xy.double(), NEIGHBOURS)
+    _, near = nearest_points(field.points, queries.xy.double(), NEIGHBOURS)
     return _solve(field, near, features[:, None])[:, 0]
 
 
@@ -127,7 +233,7 @@ def leave_one_out(
     """
     _, _, system = _systems(field, near)
     weight = torch.ones_like(field.residual) if weight is None else weight
-    extra_noise = field.kernel.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
+    extra_noise = field.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
     system.diagonal(dim1=1, dim2=2).add_(extra_noise)
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
@@ -168,7 +274,7 @@ def _predict_grid(field: ResidualField) -> Tensor:
     """The same, predicted at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
-        queries = torch.stack(field.features, dim=-1).reshape(1, height * width, -1)
+        queries = field.features.flatten(1).T.contiguous()[None]
         return _solve(field, _all_points(field), queries).reshape(height, width)
     side = _block_side(field.points)
     layers = [_predict_blocks(field, side, shift) for shift in (0, side // 2)]
@@ -190,7 +296,7 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
         beta = torch.stack([CONSTANT * alpha[..., 0].sum(1), SLOPE * (u * alpha[..., 0]).sum(1)])
         for start in range(0, per_block, step):
             part = queries[some, start : start + step]
-            k = _covariance(field.kernel.scaled(part), at.float())
+            k = _covariance(field.scaled(part), at.float())
             mean = (k @ alpha.float())[..., 0] + beta.float()[0, :, None]
             result[some, start : start + step] = mean + beta.float()[1, :, None] * part[..., 2]
     return result
@@ -199,10 +305,10 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
 def _systems(field: ResidualField, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Scaled features, u, and the covariances of r, of points near (B, k)."""
     at = field.at[near].double()
-    scaled, u = field.kernel.scaled(at), at[..., 2]
+    scaled, u = field.scaled(at), at[..., 2]
     system = _covariance(scaled, scaled).double()
     system.baddbmm_(u[:, :, None], u[:, None, :], alpha=SLOPE).add_(CONSTANT)
-    system.diagonal(dim1=1, dim2=2).add_(field.kernel.noise)
+    system.diagonal(dim1=1, dim2=2).add_(field.noise)
     return scaled, u, system
 
 
@@ -236,7 +342,7 @@ def _predict_blocks(field: ResidualField, side: int, shift: int) -> tuple[Tensor
     height, width = field.points.size
     rows, columns = (math.ceil((n + shift) / side) for n in (height, width))
     padding = (shift, columns * side - shift - width, shift, rows * side - shift - height)
-    padded = F.pad(torch.stack(field.features)[None], padding, mode="replicate")[0]
+    padded = F.pad(field.features[None], padding, mode="replicate")[0]
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 from scipy.special import logsumexp
 
-from pnpdepth_cli.completion.residual_field import cielab
+from pnpdepth_cli.completion.gaussian_process import cielab
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
 
@@ -61,7 +61,7 @@ _LEAST_SPREAD = 0.4  # standard deviation of the log of that change; a noisy wal
 _LARGEST_EVIDENCE = 2.5  # standard deviations
 _LEAST_CONTRAST = 0.02  # of an image with edges
 _EDGE_SIGMA, _EDGE_REACH, _EDGE_BAND = 1.0, 8.0, 6.0  # pixels of the reduced image
-_WEIGHT = 0.1  # log likelihood per unit of correlation
+_WEIGHT = 0.1  # log likelihood per unit of correlation of edges and change of depth
 _INDEPENDENT = 37.0  # norm of the evidence from which pairs are no longer independent
 _NO_EVIDENCE, _EVIDENCE = 25, 0.85  # points that tell nothing, and what each e-fold of more tells
 
@@ -98,8 +98,7 @@ class Evidence:
 
     edges: Image  # (h, w) strength of the image's edges
     between: Floats  # (S, 2) x and y of samples between neighbouring points
-    weight: Floats  # (S,) how much depth changes there
-    factor: float  # log likelihood per unit of correlation
+    weight: Floats  # (S,) log likelihood per unit of edge strength, by how much depth changes there
     size: tuple[int, int]  # (H, W) of the image
     points: int  # number of points
     jumps: int  # number of pairs of neighbouring points across a jump of depth
@@ -109,8 +108,7 @@ class Evidence:
     def log_likelihood(self, zoom: float) -> Floats:
         """Returns (rows, columns), the log likelihood of each shift in pixels of the reduced image.
 
-        It is the sum over the samples of weight × edge strength. Edges outside the image have
-        strength 0.
+        Edges outside the image have strength 0.
         """
         reach = np.rint(_LARGEST_SHIFT * np.array(self.edges.shape)).astype(np.intp)
         centre = np.array(self.edges.shape[::-1]) / 2
@@ -124,7 +122,7 @@ class Evidence:
         # Their correlation with the edges at all shifts.
         top, left = (int(n) for n in 2 * reach)
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
-        return self.factor * cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
+        return cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
@@ -138,7 +136,6 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
         only, scan lines of a LiDAR, or were matched in the image, as SfM points are.
     """
     xy, depth = points.xy.double().numpy(), points.depth.double().numpy()
-    # Points that cannot tell.
     if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size):
         return None
     if len(xy) > _MOST_POINTS:
@@ -172,6 +169,7 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
         return None
     weight = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
     weight -= weight.mean()
+    weight *= _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight)))
     # Samples of each pair; jumps of depth, and how many of them lie between close points.
     step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
     ordered = np.sort(length)
@@ -180,7 +178,6 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
         edges=edges,
         between=(at[pairs][:, :1] * (1 - step) + at[pairs][:, 1:] * step).reshape(-1, 2),
         weight=np.repeat(weight / _STEPS, _STEPS),
-        factor=_WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight))),
         size=points.size,
         points=len(xy),
         jumps=int((change > _JUMP).sum()),

@@ -10,9 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.gaussian_process import leave_one_out, neighbourhoods
+from pnpdepth_cli.completion.gaussian_process import (
+    ResidualField,
+    leave_one_out,
+    neighbourhoods,
+    residual_field,
+)
 from pnpdepth_cli.completion.interpolation import nearest_points
-from pnpdepth_cli.completion.residual_field import ResidualField, residual_field
 from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.points import SparsePoints
 

@@ -28,9 +28,9 @@ from torch import Tensor
 
 from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion import gaussian_process
+from pnpdepth_cli.completion.gaussian_process import DEPTH, ResidualField, residual_field
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.completion.outliers import without_outliers
-from pnpdepth_cli.completion.residual_field import DEPTH, ResidualField, residual_field
 from pnpdepth_cli.points import SparsePoints
 
 # Of the lines; chosen on rendered frames, with predictions of three networks and a synthetic one.
@@ -134,18 +134,19 @@ def _lines_at(
 
 def _by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
     """The residual by lines over the predicted log depth."""
-    xy = None if queries is None else queries.xy
-    depth = field.features[DEPTH] if queries is None else field.features_at(queries)[:, DEPTH]
-    at, weights = field.at[:, DEPTH].double(), torch.ones_like(field.residual)
+    log_depth, at = field.features[DEPTH], field.at[:, DEPTH].double()
+    if queries is not None:
+        log_depth = queries.sample(log_depth)
+    xy, weights = None if queries is None else queries.xy, torch.ones_like(field.residual)
     shift, slope = local_lines(field.points, xy, field.residual, at, weights)
-    return (shift + slope * depth).float()
+    return (shift + slope * log_depth).float()
 
 
 def _by_gaussian_process(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
     field = gaussian_process.fit(field)
     if queries is None:
         return gaussian_process.predict(field)
-    return gaussian_process.predict_at(field, queries.xy, field.features_at(queries))
+    return gaussian_process.predict_at(field, queries)
 
 
 TABLE = {"gp": _by_gaussian_process, "local": _by_lines}

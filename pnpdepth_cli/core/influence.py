@@ -8,25 +8,20 @@ Both senses of the paper's term are measured: the patch of z that the gradient o
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.errors import wrap_user_errors
 
 _POSITIONS = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
 """Where points are placed, as fractions of height and width; inactive units may hide a part at
 one position."""
 
 
-class InfluentialField(NamedTuple):
-    """The sizes of both patches, (height, width)."""
-
-    in_z: tuple[int, int] | None
-    """Size of the patch of z, in elements; None if z has no two spatial axes."""
-    in_output: tuple[int, int]  # of the patch of the output, in pixels
+Patch = tuple[int, int]
+"""Height and width of a patch."""
 
 
 def influential_field(
@@ -34,10 +29,12 @@ def influential_field(
     z: Tensor,
     depth_of: Callable[[object], Tensor],
     enough: float | None = None,
-) -> InfluentialField:
-    """Returns the largest patches over a few points near the centre of the image.
+) -> tuple[Patch | None, Patch]:
+    """Returns the largest patch of z in elements, and of the output in pixels.
 
-    The sizes are lower bounds: connections through units that are zero for this image do not count.
+    They are those of a few points near the centre of the image. The sizes are lower bounds:
+    connections through units that are zero for this image do not count. The patch of z is None if
+    z has no two spatial axes.
 
     Args:
         z: z_0, as returned by `split.front`.
@@ -69,10 +66,10 @@ def influential_field(
         width = min(_largest(in_output))
         if enough is not None and (width >= enough or 0 < width < enough / 2):
             break
-    return InfluentialField(_largest(in_z) if in_z else None, _largest(in_output))
+    return _largest(in_z) if in_z else None, _largest(in_output)
 
 
-def _extent(mask: Tensor) -> tuple[int, int]:
+def _extent(mask: Tensor) -> Patch:
     """Height and width of the bounding box of the true elements of (…, h, w)."""
     flat = mask.reshape(-1, *mask.shape[-2:]).any(dim=0)
     rows, columns = flat.any(dim=1).nonzero(), flat.any(dim=0).nonzero()
@@ -81,5 +78,5 @@ def _extent(mask: Tensor) -> tuple[int, int]:
     return int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 
 
-def _largest(patches: list[tuple[int, int]]) -> tuple[int, int]:
+def _largest(patches: list[Patch]) -> Patch:
     return max(height for height, _ in patches), max(width for _, width in patches)

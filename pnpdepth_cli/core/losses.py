@@ -13,8 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.choices import LOSSES
-from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, wrap_user_errors
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

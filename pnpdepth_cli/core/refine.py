@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,15 +23,14 @@ from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blur, step_size
-from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import DivergedError, LayerError, ModelError
+from pnpdepth_cli.errors import DivergedError, LayerError, ModelError, wrap_user_errors
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 _LOSS_SCALE = 1024.0
 """Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
 
-DepthOf = Callable[[Any], Tensor]
+DepthOf = Callable[[object], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
 
 

@@ -135,7 +135,7 @@ def blur(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
     reach far, many points hardly beyond their own cells.
 
     Args:
-        gradient: (1, C, h, w) at z. Any other shape is returned unchanged.
+        gradient: (1, C, h, w) at z. Another shape is returned unchanged.
         points: The N sparse points of an image of H × W pixels.
         spacings: Standard deviation in units of √(HW/N) pixels; 0 returns the gradient unchanged.
     """

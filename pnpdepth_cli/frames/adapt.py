@@ -24,8 +24,7 @@ from torch.func import functional_call
 
 from pnpdepth_cli.completion.outliers import outliers
 from pnpdepth_cli.core.losses import MIN_DEPTH
-from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError
+from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError, wrap_user_errors
 from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.fuse import FEW_POINTS
 from pnpdepth_cli.frames.open_network import PreparedFrame, encoding_once, prepare
@@ -48,6 +47,9 @@ SIGNIFICANT = 0.05
 
 Weights = Mapping[str, Tensor]
 """Values of parameters in float32, by name."""
+
+Lesson = tuple[PreparedFrame, SparsePoints]
+"""A frame to learn from, and its points to hide and to ask for: those that are no outliers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,20 +109,20 @@ def learn(
             " points hidden from its input"
         )
     # Some frames are for validation.
-    lessons = [_Lesson.of(network, name, frame) for name, frame in frames]
+    lessons = [_lesson(network, name, frame) for name, frame in frames]
     every = max(2, min(5, len(lessons) // 3))
     validation = lessons[every - 1 :: every]
     training = [one for number, one in enumerate(lessons, 1) if number % every]
     # The loss before.
     theta = _weights_that_learn(network)
-    before = _losses_of(validation, theta, seed)
+    before = _losses_of(network, validation, theta, seed)
     # All updates, a few on each frame.
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(theta.values(), LR, eps=EPSILON)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     visited = _shuffle(len(training), generator)
     for first in range(0, STEPS, STEPS_A_VISIT):
-        with training[next(visited)].open_lesson(generator) as loss_of:
+        with _open_lesson(network, training[next(visited)], generator) as loss_of:
             for step in range(first, min(first + STEPS_A_VISIT, STEPS)):
                 optimiser.zero_grad()
                 with torch.enable_grad():
@@ -133,7 +135,8 @@ def learn(
                 schedule.step()
                 on_step()
     weights = {name: value.detach() for name, value in theta.items()}
-    return Learnt(weights=weights, before=before, after=_losses_of(validation, theta, seed))
+    after = _losses_of(network, validation, theta, seed)
+    return Learnt(weights=weights, before=before, after=after)
 
 
 @contextmanager
@@ -150,52 +153,46 @@ def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
             parameters[name].data = value
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Lesson:
-    """A frame to learn from."""
+def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
+    """Raises NoPointsError with fewer than two points."""
+    prepared = prepare(network, frame.registered())
+    points = prepared.points
+    if len(points) < 2:
+        raise NoPointsError(f"{name}: {len(points)} points; hiding some needs 2")
+    if len(points) >= FEW_POINTS:
+        outlying = outliers(torch.ones(points.size), points.tensors(), None)
+        points = points.select(~outlying.to(points.xy.device))
+    return prepared, points
 
-    frame: PreparedFrame
-    points: SparsePoints  # those to hide and to ask for: the frame's without outliers
 
-    @classmethod
-    def of(cls, network: Network, name: str, frame: Frame) -> _Lesson:
-        """Returns the lesson of a frame. Raises NoPointsError with fewer than two points."""
-        prepared = prepare(network, frame.registered())
-        points = prepared.points
-        if len(points) < 2:
-            raise NoPointsError(f"{name}: {len(points)} points; hiding some needs 2")
-        if len(points) >= FEW_POINTS:
-            outlying = outliers(torch.ones(points.size), points.tensors(), None)
-            points = points.select(~outlying.to(points.xy.device))
-        return cls(frame=prepared, points=points)
+@contextmanager
+def _open_lesson(
+    network: Network, lesson: Lesson, generator: torch.Generator
+) -> Iterator[Callable[[Weights], Tensor]]:
+    """Gives a function: the loss L(f_θ(x, D_s ∖ m), m) for θ, with another m at every call.
 
-    @contextmanager
-    def open_lesson(self, generator: torch.Generator) -> Iterator[Callable[[Weights], Tensor]]:
-        """Gives a function: the loss at hidden points for weights, others at every call.
+    The points are divided into two halves, and each half is hidden once before they are divided
+    anew: halves that complement each other make steps that agree more.
+    """
+    prepared, points = lesson
+    reader = AlignedDepth(network, prepared.points, network.definition.default_alignment)
+    halves = _halves(len(points), generator)
+    own = dict(network.module.named_parameters())
 
-        The points are divided into two halves, and each half is hidden once before they are
-        divided anew: halves that complement each other make steps that agree more.
-        """
-        network = self.frame.network
-        reader = AlignedDepth(network, self.frame.points, network.definition.default_alignment)
-        halves = _halves(len(self.points), generator)
-        with encoding_once(network, {}):
-            yield lambda weights: self._loss(weights, next(halves), reader)
-
-    def _loss(self, weights: Weights, hidden: Tensor, reader: AlignedDepth) -> Tensor:
-        """L(f_θ(x, D_s ∖ m), m), m the points of (N,) bool."""
-        module = self.frame.network.module
-        hidden = hidden.to(self.points.depth.device)
-        shown, asked = self.points.select(~hidden), self.points.select(hidden)
-        own = dict(module.named_parameters())
+    def loss_of(weights: Weights) -> Tensor:
+        hidden = next(halves).to(points.depth.device)
+        shown, asked = points.select(~hidden), points.select(hidden)
         values = {name: value.to(own[name].dtype) for name, value in weights.items()}
-        arguments = tuple(each.clone() for each in self.frame.arguments_for(shown))
+        arguments = tuple(each.clone() for each in prepared.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
-            output = functional_call(module, values, arguments)
+            output = functional_call(network.module, values, arguments)
         predicted = asked.sample(reader(output))
         known = predicted.isfinite()  # unknown where the network says so, such as in the sky
         log_error = predicted[known].clamp_min(MIN_DEPTH).log() - asked.depth[known].log()
         return log_error.abs().mean()
+
+    with encoding_once(network, {}):
+        yield loss_of
 
 
 def _weights_that_learn(network: Network) -> dict[str, Tensor]:
@@ -208,11 +205,14 @@ def _weights_that_learn(network: Network) -> dict[str, Tensor]:
     }
 
 
-def _losses_of(lessons: Sequence[_Lesson], theta: Weights, seed: int) -> NDArray[np.float64]:
+def _losses_of(
+    network: Network, lessons: Sequence[Lesson], theta: Weights, seed: int
+) -> NDArray[np.float64]:
     """The loss at hidden points of each frame; with a seed the same points are hidden."""
     losses = list[float]()
     for lesson in lessons:
-        with lesson.open_lesson(torch.Generator().manual_seed(seed)) as loss_of, torch.no_grad():
+        generator = torch.Generator().manual_seed(seed)
+        with _open_lesson(network, lesson, generator) as loss_of, torch.no_grad():
             losses.append(float(loss_of(theta)))
     return np.array(losses)
 

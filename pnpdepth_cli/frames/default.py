@@ -15,7 +15,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import far_points, outliers
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.frames.frame import Frame, is_dense
+from pnpdepth_cli.frames.frame import Frame, Prediction, Refined, Validation, is_dense, make_refined
 from pnpdepth_cli.frames.fuse import (
     FEW_POINTS,
     FOLDS,
@@ -24,6 +24,7 @@ from pnpdepth_cli.frames.fuse import (
     ValidatedFrame,
     add_blind_expert,
     fit_weights,
+    fusing_network,
     predict,
     predictions,
     scanner_shares,
@@ -31,7 +32,6 @@ from pnpdepth_cli.frames.fuse import (
     weighted_mean,
 )
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.refined import Prediction, Refined, Validation, make_refined
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 
@@ -50,7 +50,7 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
         each.next_image()
     # Points that contradict their neighbours are outliers. The network that weighs its points
     # judges, else the user's: a useless network does not decide which points are used.
-    judge = next((each for each in networks if each.member.weighs_points), networks[0])
+    judge = next((each for each in networks if each.weighs_points), networks[0])
     inliers, judged = without_outliers(judge, frame)
     # A fifth of the inliers are validation points, which every expert predicts from the others.
     split = split_frame(inliers, judged.before, seed)
@@ -59,24 +59,27 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     experts, warnings = add_blind_expert(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts, split)
-    fused = weighted_mean([(e.dense(), w) for e in experts if (w := weights[e.name]) > 0])
+    fused = weighted_mean([(e.dense(split), w) for e in experts if (w := weights[e.name]) > 0])
     # Points far from the depth of a network that weighs them are outliers, too.
-    if judge.member.weighs_points and not is_dense(inliers.points):
+    if judge.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.before, inliers.points))
     # The residual at the inliers is propagated to every pixel.
     depth = _propagate(fused, inliers, split)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts, split, weights)
-    depth = _with_shares(depth, {e.name: e.dense() for e in experts if e.of_scanner}, shares)
+    depth = _with_shares(depth, {e.name: e.dense(split) for e in experts if e.of_scanner}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
+    fusing, own = fusing_network(networks), experts[0].whole
+    alone = next((e for e in experts[1:] if fusing is not None and e.name == fusing.name), None)
+    assert own is not None
     return make_refined(
         frame,
-        _own(experts[0]),
+        own,
         depth,
         used=inliers.points,
-        notes=(*_notes(frame, inliers, split, experts, weights), *warnings),
-        stages={} if frame.gt is None else _stages(experts, inliers, split),
-        validation=_validation(experts, split, shares) if len(split.points) else None,
+        notes=(*_notes(frame, inliers, split, experts, alone, weights), *warnings),
+        stages={} if frame.gt is None else _stages(experts[0], alone, inliers, split),
+        validation=_validation(experts, alone, split, shares),
         weights=weights,
     )
 
@@ -93,7 +96,7 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> tuple[Frame, Predictio
     points = frame.points
     suspected = outliers(torch.ones(points.size), points, frame.rgb)
     # A network that weighs its points is given the outliers too, once they are known.
-    again = bool(suspected.any()) and judge.member.weighs_points
+    again = bool(suspected.any()) and judge.weighs_points
     consistent = frame.with_points(points.select(~suspected)) if bool(suspected.any()) else frame
     judged = predict(judge, consistent, updates=not again)
     outlying = outliers(judged.before, points, frame.rgb)
@@ -116,36 +119,33 @@ def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, 
     return weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
 
 
-def _own(expert: Expert) -> Prediction:
-    """What the network of an expert gives from all points."""
-    assert expert.whole is not None
-    return expert.whole
-
-
-def _alone(experts: Sequence[Expert]) -> Expert | None:
-    """The network that takes a prior, without one, where it is not the user's."""
-    return next((e for e in experts[1:] if e.user is None and e.network is not None), None)
-
-
-def _stages(experts: Sequence[Expert], frame: Frame, split: ValidatedFrame) -> dict[str, Tensor]:
+def _stages(
+    own: Expert, alone: Expert | None, frame: Frame, split: ValidatedFrame
+) -> dict[str, Tensor]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
-    own, alone = _own(experts[0]), _alone(experts)
-    propagated = own.after if experts[0].of_scanner else _propagate(own.after, frame, split)
-    stages = {BEFORE: own.before, UPDATED: own.after, PROPAGATED: propagated}
-    return (
-        stages if alone is None else stages | {ALONE: _propagate(_own(alone).after, frame, split)}
-    )
+    assert own.whole is not None
+    before, updated = own.whole.before, own.whole.after
+    propagated = updated if own.of_scanner else _propagate(updated, frame, split)
+    stages = {BEFORE: before, UPDATED: updated, PROPAGATED: propagated}
+    if alone is not None:
+        stages[ALONE] = _propagate(alone.dense(split), frame, split)
+    return stages
 
 
 def _validation(
-    experts: Sequence[Expert], split: ValidatedFrame, shares: Mapping[str, float]
-) -> Validation:
-    """The stages and the result at the validation points.
+    experts: Sequence[Expert],
+    alone: Expert | None,
+    split: ValidatedFrame,
+    shares: Mapping[str, float],
+) -> Validation | None:
+    """The stages and the result at the validation points; None without any.
 
     Each fifth of these is predicted by weights that were fitted to the others.
     """
-    user, alone, part = experts[0], _alone(experts), torch.arange(len(split.points)) % FOLDS
-    result = torch.empty(len(split.points))
+    own, points = experts[0], split.points
+    if not len(points):
+        return None
+    part, result = torch.arange(len(points)) % FOLDS, torch.empty(len(points))
     for fold in range(FOLDS):
         weights = fit_weights(experts, split, part != fold)
         fused = weighted_mean([(each.at, weights[each.name]) for each in experts])
@@ -153,23 +153,21 @@ def _validation(
     given = split.kept.points
     if split.kept.outliers is not None:
         given = given.joined(split.kept.outliers)
-    assert user.network is not None
-    assert user.kept is not None
-    updated = {each.name: each.updated(split) for each in experts}
+    assert own.kept is not None
     predicted = {
-        BEFORE: split.points.sample(user.kept.before),
-        PROPAGATED: updated[user.name] if user.of_scanner else user.at,
+        BEFORE: points.sample(own.kept.before),
+        PROPAGATED: own.updated if own.of_scanner else own.at,
     }
-    if not user.network.member.takes_points:  # else z was not updated here
-        predicted[UPDATED] = updated[user.name]
+    if own.user is not None and not own.user.takes_points:  # else z was not updated here
+        predicted[UPDATED] = own.updated
     if alone is not None:
         predicted[ALONE] = alone.at
-    predicted[AFTER] = _with_shares(result, updated, shares)
-    predicted[LINEAR] = linear(given, split.points.xy)
+    predicted[AFTER] = _with_shares(result, {each.name: each.updated for each in experts}, shares)
+    predicted[LINEAR] = linear(given, points.xy)
     return Validation(
-        points=split.points,
+        points=points,
         kept=given,
-        network=user.kept.before,
+        network=own.kept.before,
         weights=split.weights,
         predicted=predicted,
     )
@@ -180,10 +178,11 @@ def _notes(
     inliers: Frame,
     split: ValidatedFrame,
     experts: Sequence[Expert],
+    alone: Expert | None,
     weights: Mapping[str, float],
 ) -> tuple[str, ...]:
     """Which points were left out, and which of the user's networks have no part in the result."""
-    notes, alone = list[str](), _alone(experts)
+    notes = list[str]()
     if left_out := len(frame.points) - len(inliers.points):
         notes.append(
             f"outliers: {left_out:,} of {len(frame.points):,} points left out, inconsistent with"
@@ -191,7 +190,7 @@ def _notes(
         )
     for own in experts:
         of_user = sum(weights[each.name] for each in experts if each.user is own.user)
-        if own.user is None or own.network is not own.user or of_user >= LEAST_PART:
+        if own.user is None or own.name != own.user.name or of_user >= LEAST_PART:
             continue
         why = "its depth does not help to predict the points from each other"
         if len(split.points) and alone is not None:

@@ -11,7 +11,7 @@ All predict twice: from all points, and the validation points from the others.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +22,8 @@ from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import propagate_at
-from pnpdepth_cli.frames.frame import Frame, is_dense
+from pnpdepth_cli.frames.frame import Frame, Prediction, ValidationPoints, is_dense
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.refined import Prediction, ValidationPoints
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.stages import LINEAR
 
@@ -112,9 +111,8 @@ def split_frame(frame: Frame, judged: Tensor, seed: int) -> ValidatedFrame:
     if len(points) >= MIN_POINTS:
         chosen = spatial_folds(points, FOLDS, seed=seed) == 0
     if not bool(chosen.any()) or bool(chosen.all()):
-        return ValidatedFrame(
-            whole=frame, kept=frame, points=points.select(slice(0)), weights=torch.empty(0)
-        )
+        none = points.select(slice(0))
+        return ValidatedFrame(whole=frame, kept=frame, points=none, weights=none.depth)
     # Of many validation points some are drawn; all of them are kept from the experts.
     (numbers,) = chosen.nonzero(as_tuple=True)
     drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
@@ -135,17 +133,15 @@ class Expert:
     name: str
     weight: float = 0.0  # prior weight; with 0 it has no part
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
-    dense: Callable[[], Tensor]
-    """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
-    whole: Prediction | None = None  # a network's, from all points
-    kept: Prediction | None = None  # a network's, from the others; the same without validation
-    network: OpenNetwork | None = None  # that predicts. None: linear interpolation
+    updated: Tensor  # (M,) the same, the residual not propagated
+    whole: Prediction | None = None  # from all points. None of linear interpolation
+    kept: Prediction | None = None  # from the others; the same as `whole` without validation
     user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
-    def updated(self, split: ValidatedFrame) -> Tensor:
-        """Returns `at` before the residual is propagated."""
-        return self.at if self.kept is None else split.points.sample(self.kept.after)
+    def dense(self, split: ValidatedFrame) -> Tensor:
+        """Returns (H, W) metres, 0 = unknown: from all points, the residual not propagated."""
+        return linear(split.whole.points) if self.whole is None else self.whole.after
 
 
 def predictions(
@@ -164,37 +160,32 @@ def predictions(
         PnpDepthError: A network gives no depth.
     """
     # The user's networks predict.
-    fusing = _fusing(networks)
-    own = [
-        _expert(each, split, each.member.name, known=known.get(each), user=each)
-        for each in networks
-        if each is not fusing
-    ]
+    fusing = fusing_network(networks)
+    users = [each for each in networks if each is not fusing]
+    own = [_expert(each, split, each.name, known=known.get(each), user=each) for each in users]
     # Without a network that takes a prior, they are all.
     if fusing is None:
         return [replace(expert, weight=1 / len(own)) for expert in own]
     # That network predicts without a prior.
-    name = fusing.member.name
-    alone = _expert(fusing, split, name, known=known.get(fusing))
+    alone = _expert(fusing, split, fusing.name, known=known.get(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
-    experts, with_prior = list[Expert](), list[Expert]()
-    for expert in own:
-        share = trust(expert, split, alone) / len(own)
-        experts.append(replace(expert, weight=0.0 if expert.of_scanner else OWN * share))
+    with_prior = list[Expert]()
+    for number, (user, expert) in enumerate(zip(users, own, strict=True)):
+        share = trust(user, expert, split, alone) / len(own)
+        own[number] = replace(expert, weight=0.0 if expert.of_scanner else OWN * share)
         if share > 0:
-            both = f"{name} with {expert.name}"
-            informed = _expert(fusing, split, both, prior=expert, user=expert.user, updates=False)
-            with_prior.append(replace(informed, weight=WITH_PRIOR * share))
+            name = f"{fusing.name} with {expert.name}"
+            both = _expert(fusing, split, name, prior=expert, user=user, updates=False)
+            with_prior.append(replace(both, weight=WITH_PRIOR * share))
     # The rest of the prior weights is that of the network without a prior.
-    rest = 1 - sum(expert.weight for expert in (*experts, *with_prior))
+    rest = 1 - sum(expert.weight for expert in (*own, *with_prior))
     # Linear interpolation predicts; its dense depth, which takes long, only where it has a part.
-    at = linear(split.kept.points, split.points.xy) if len(split.points) else torch.empty(0)
-    dense = functools.partial(linear, split.whole.points)
-    interpolation = Expert(name=LINEAR, weight=WITHOUT_IMAGE, at=at, dense=dense)
-    return [*experts, *with_prior, replace(alone, weight=rest), interpolation]
+    at = linear(split.kept.points, split.points.xy) if len(split.points) else split.points.depth
+    interpolation = Expert(name=LINEAR, weight=WITHOUT_IMAGE, at=at, updated=at)
+    return [*own, *with_prior, replace(alone, weight=rest), interpolation]
 
 
-def trust(expert: Expert, split: ValidatedFrame, alone: Expert) -> float:
+def trust(network: OpenNetwork, expert: Expert, split: ValidatedFrame, alone: Expert) -> float:
     """Returns 0…1, the part of its prior weights that a network gets, by what it explains.
 
     The aligned depth of a network that takes the image alone explains a fraction of the variance of
@@ -210,12 +201,12 @@ def trust(expert: Expert, split: ValidatedFrame, alone: Expert) -> float:
         split: The frame and its validation points.
         alone: The network that takes a prior, without one.
     """
-    assert expert.whole is not None
-    if expert.network is not None and expert.network.member.takes_points:
+    if network.takes_points:
         if not len(split.points):
             return 0.0
-        ratio = split.error(expert.updated(split)) / max(split.error(alone.at), 1e-9)
+        ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
         return min(1.0, max(0.0, 2.0 - ratio))
+    assert expert.whole is not None
     points = split.whole.points
     at = points.sample(expert.whole.before).double()
     x, y = _log(at[at > 0]), _log(points.depth[at > 0].double())
@@ -236,11 +227,12 @@ def add_blind_expert(
 
     The second value is a warning where the image does not lower the error at validation points.
     """
-    fusing, rgb, count = _fusing(networks), split.whole.rgb, len(split.points)
+    fusing, rgb, count = fusing_network(networks), split.whole.rgb, len(split.points)
     if fusing is None or rgb is None or split.whole.one_view or count < ENOUGH_FOR_DOUBT:
         return experts, ()
-    at, name = {each.name: each.at for each in experts}, fusing.member.name
-    of_linear = split.gain(at[name], at[LINEAR])
+    by_name = {each.name: each.at for each in experts}
+    at, interpolated = by_name[fusing.name], by_name[LINEAR]
+    of_linear = split.gain(at, interpolated)
     if of_linear >= DOUBT:
         return experts, ()
     # The image is in doubt: a grey one takes its place.
@@ -248,15 +240,15 @@ def add_blind_expert(
         each.next_image()
     grey = torch.full_like(rgb, 0.5)
     blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
-    expert = _expert(fusing, blind, f"{name} without the image", updates=False)
+    expert = _expert(fusing, blind, f"{fusing.name} without the image", updates=False)
     experts = [*experts, replace(expert, weight=WITHOUT_IMAGE)]
     # It helps nothing if the grey one does as well.
-    if (of_linear + split.gain(at[name], expert.at)) / 2 >= NO_GAIN:
+    if (of_linear + split.gain(at, expert.at)) / 2 >= NO_GAIN:
         return experts, ()
-    without = min(split.error(at[LINEAR]), split.error(expert.at))
+    without = min(split.error(interpolated), split.error(expert.at))
     warning = (
         f"warning: the image does not lower the error: at {count:,} validation points it is"
-        f" {split.error(at[name]):.4f} with the image and {without:.4f} without it; check"
+        f" {split.error(at):.4f} with the image and {without:.4f} without it; check"
         " the registration"
     )
     return experts, (warning,)
@@ -319,7 +311,7 @@ def scanner_shares(
         return {}
     limit = split.error(weighted_mean([(each.at, weights[each.name]) for each in experts]))
     points = split.whole.points
-    error = {e.name: (points.sample(e.dense()) - points.depth).abs().mean() for e in own}
+    error = {e.name: (points.sample(e.dense(split)) - points.depth).abs().mean() for e in own}
     fit = [name for name in error if float(error[name]) <= limit]
     return {name: OWN_SCANNER / len(fit) for name in fit}
 
@@ -352,7 +344,7 @@ def predict(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Pred
             a network that takes them gain 1 % and take as long as everything else.
     """
     gains = len(frame.points) >= FEW_POINTS and not is_dense(frame.points)
-    return network.refine(frame, updates=updates and (gains or not network.member.takes_points))
+    return network.refine(frame, updates=updates and (gains or not network.takes_points))
 
 
 def _expert(
@@ -369,35 +361,33 @@ def _expert(
 
     `known` is its prediction from all points, if there is one. `prior` is whose depth it is given.
     """
-    whole, kept, takes_points = split.whole, split.kept, network.member.takes_points
+    whole, kept, takes_points = split.whole, split.kept, network.takes_points
     # A prior is given with all points, and made from the others where the others are used.
-    if prior is not None:
-        assert prior.whole is not None
-        assert prior.kept is not None
+    if prior is not None and prior.whole is not None and prior.kept is not None:
         whole = replace(whole, prior=prior.whole.before)
         kept = replace(kept, prior=prior.kept.before)
     # The network predicts from all points, and the validation points from the others.
     own = again = known or predict(network, whole, updates=updates)
-    at = torch.empty(0)
+    at = updated = split.points.depth
     if len(split.points):
         again = predict(network, kept, updates=not takes_points)
         xy, kind = split.points.xy, split.propagation
         at = propagate_at(again.after, kept.points, kept.rgb, xy, kind=kind)
+        updated = split.points.sample(again.after)
     return Expert(
         name=name,
         at=at,
-        dense=lambda: own.after,
+        updated=updated,
         whole=own,
         kept=again,
-        network=network,
         user=user,
         of_scanner=user is network and takes_points and split.has_scan_lines,
     )
 
 
-def _fusing(networks: Sequence[OpenNetwork]) -> OpenNetwork | None:
-    """The network that takes another one's depth as a prior. None without one."""
-    return next((each for each in networks if each.member.takes_prior), None)
+def fusing_network(networks: Sequence[OpenNetwork]) -> OpenNetwork | None:
+    """Returns the network that takes another one's depth as a prior; None without one."""
+    return next((each for each in networks if each.takes_prior), None)
 
 
 def _log(depth: Tensor) -> Tensor:

@@ -12,20 +12,20 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.errors import PnpDepthError, UsageError
 from pnpdepth_cli.frames.default import refine_default
-from pnpdepth_cli.frames.frame import Frame, Register
-from pnpdepth_cli.frames.fuse import ValidatedFrame, split_frame
-from pnpdepth_cli.frames.open_network import Member, OpenNetwork
-from pnpdepth_cli.frames.refined import Refined, Validation, make_refined
+from pnpdepth_cli.frames.frame import Frame, Refined, Register, Validation, make_refined
+from pnpdepth_cli.frames.fuse import split_frame
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.settings import ClosedSettings, Settings
+from pnpdepth_cli.settings import Settings
 from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 COMPANION = "compact"
@@ -81,7 +81,6 @@ class Method:
         self.registrations: dict[tuple[int, int], Register] = {}
         """How images of a size are moved to their points, where several frames decided it."""
         self._stack = ExitStack()
-        self._open: list[OpenNetwork] = []
         check_combination(asked, len(networks))
         # What the definitions leave open is decided.
         first = first.registered()
@@ -103,26 +102,17 @@ class Method:
         )
 
     def __enter__(self) -> Method:
+        for member in self.members:
+            self._stack.enter_context(member)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._open = []
         self._stack.close()
 
     @property
-    def own(self) -> Member:
+    def own(self) -> OpenNetwork:
         """The user's network."""
         return self.members[0]
-
-    @property
-    def network(self) -> Network:
-        """The user's network."""
-        return self.own.network
-
-    @property
-    def settings(self) -> ClosedSettings:
-        """The settings of the user's network."""
-        return self.own.settings
 
     def refine(self, frame: Frame) -> Refined:
         """Returns one frame refined, the same whatever was refined before.
@@ -130,17 +120,15 @@ class Method:
         Raises:
             PnpDepthError: The frame cannot be refined.
         """
-        if not self._open:
-            self._open = [self._stack.enter_context(OpenNetwork(m)) for m in self.members]
         seed = self.asked.seed
         torch.manual_seed(seed)
         if frame.register == "auto" and frame.size in self.registrations:
             frame = replace(frame, register=self.registrations[frame.size])
         frame = frame.registered()
         if self.is_default:
-            refined = refine_default(self._open, frame, seed=seed)
+            refined = refine_default(self.members, frame, seed=seed)
         else:
-            refined = refine_fixed(self._open[0], frame, seed=seed, validated=self._validated)
+            refined = refine_fixed(self.own, frame, seed=seed, validated=self._validated)
         if not self._uncertainty:
             return refined
         source = frame.sources.get("sparse")  # only a COLMAP model names an image
@@ -178,18 +166,18 @@ def refine_fixed(
     network.next_image()
     network.cut()
     own = network.refine(frame)
-    kind = network.member.settings.propagate
+    kind = network.settings.propagate
     depth = propagate(own.after, frame.points, frame.rgb, kind=kind)
-    split = split_frame(frame, depth, seed) if validated else None
-    validation = None
-    if split is not None and len(split.points):
-        validation = _validation(network, split, kind)
+    validation = _validation(network, frame, depth, seed) if validated else None
     return make_refined(frame, own, depth, used=frame.points, validation=validation)
 
 
-def _validation(network: OpenNetwork, split: ValidatedFrame, kind: str) -> Validation | None:
-    """Depth at validation points, refined without them. None where the method fails."""
+def _validation(network: OpenNetwork, frame: Frame, depth: Tensor, seed: int) -> Validation | None:
+    """Depth at validation points, refined without them. None without any, or where it fails."""
+    split, kind = split_frame(frame, depth, seed), network.settings.propagate
     points, kept = split.points, split.kept
+    if not len(points):
+        return None
     try:
         again = network.refine(kept)
     except PnpDepthError:

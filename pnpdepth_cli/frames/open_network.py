@@ -2,13 +2,13 @@
 
 For one image and several sets of points, the front of a network that takes the image alone runs
 once, and so does the image encoder that a definition names. `prepare` makes a frame the network's
-input; `Member` is a network as the method uses it.
+input.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,10 +18,13 @@ from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Interception, Run
-from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
-from pnpdepth_cli.errors import DivergedError, NoPointsError
-from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.refined import Prediction
+from pnpdepth_cli.errors import (
+    DivergedError,
+    NoPointsError,
+    out_of_memory_is_a_device_error,
+    wrap_user_errors,
+)
+from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network
@@ -29,55 +32,16 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Member:
-    """A network of the method, with nothing left open."""
-
-    network: Network
-    layer: str  # layer to cut at
-    settings: ClosedSettings  # how its output is aligned and z is updated
-    coarse: bool = False
-    """Whether z is updated by a smaller depth, which is faster, if the definition gives one."""
-
-    @property
-    def name(self) -> str:
-        """The network's name."""
-        return self.network.definition.name
-
-    @property
-    def takes_points(self) -> bool:
-        """Whether sparse depth is an input."""
-        return "sparse" in self.network.definition.input_kind
-
-    @property
-    def takes_prior(self) -> bool:
-        """Whether another network's depth is an input."""
-        return self.network.definition.takes_prior
-
-    @property
-    def weighs_points(self) -> bool:
-        """Whether it finds out itself which points are wrong."""
-        return self.network.definition.weighs_points
-
-
 @dataclass(frozen=True, kw_only=True)
 class PreparedFrame:
     """A frame as the network takes it."""
 
-    network: Network
     map: FrameMap  # from pixels of the image to those of the network
-    image: Tensor | None  # None if the network takes none
     arguments: tuple[Tensor, ...]
     points: SparsePoints
     """The points that the network sees, in its pixels and on its device, without outliers."""
-    prior: Tensor | None = None
-    """(1, 1, h, w) metres, 0 = unknown: the dense prior in the network's pixels. None without."""
-    intrinsics: Tensor | None = None
-    """(1, 3, 3): the camera matrix in the network's pixels. None where it is unknown."""
-
-    def arguments_for(self, points: SparsePoints) -> tuple[Tensor, ...]:
-        """Returns the arguments of the network for some of the points; the image is the same."""
-        return self.network.arguments_of(self.image, points, self.prior, self.intrinsics)
+    arguments_for: Callable[[SparsePoints], tuple[Tensor, ...]]
+    """Gives the arguments for some of the points; all else is the same."""
 
     def to_image(self, depth: Tensor) -> Tensor:
         """Returns depth (1, 1, h, w) of the network's pixels as (H, W) of the image.
@@ -89,14 +53,27 @@ class PreparedFrame:
 
 
 class OpenNetwork:
-    """A network that stays open from frame to frame, as a context manager.
+    """A network of the method, with nothing left open, as a context manager.
 
-    It is cut when z is first updated.
+    It is cut when z is first updated, and stays open from frame to frame.
+
+    Args:
+        layer: Layer to cut at.
+        settings: How its output is aligned and z is updated.
+        coarse: Whether z is updated by a smaller depth, which is faster, if the definition gives
+            one.
     """
 
-    def __init__(self, member: Member) -> None:
-        self.member = member
-        self._of_image_only = member.network.definition.input_kind == "rgb"
+    def __init__(
+        self, network: Network, layer: str, settings: ClosedSettings, *, coarse: bool = False
+    ) -> None:
+        definition = network.definition
+        self.network, self.layer, self.settings = network, layer, settings
+        self.name, self.weighs_points = definition.name, definition.weighs_points
+        self.takes_points = "sparse" in definition.input_kind
+        self.takes_prior = definition.takes_prior
+        self._coarse = definition.coarse if coarse else None
+        self._of_image_only = definition.input_kind == "rgb"
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
@@ -104,7 +81,7 @@ class OpenNetwork:
         self._encoded: dict[str, object] = {}
 
     def __enter__(self) -> OpenNetwork:
-        self._open.enter_context(encoding_once(self.member.network, self._encoded))
+        self._open.enter_context(encoding_once(self.network, self._encoded))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -120,8 +97,7 @@ class OpenNetwork:
     def cut(self) -> Split:
         """Returns the network cut at the layer, open. Raises LayerError if it has no such layer."""
         if self._split is None:
-            member = self.member
-            self._split = self._open.enter_context(member.network.cut_at(member.layer))
+            self._split = self._open.enter_context(self.network.cut_at(self.layer))
         return self._split
 
     def refine(self, frame: Frame, *, updates: bool = True) -> Prediction:
@@ -133,14 +109,14 @@ class OpenNetwork:
         Raises:
             PnpDepthError: The refinement fails.
         """
-        network, settings, diverged = self.member.network, self.member.settings, None
+        network, settings, diverged = self.network, self.settings, None
         with out_of_memory_is_a_device_error(network.device):
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
                 raise NoPointsError(
                     f"none of the {len(frame.points)} sparse points lies inside the part of the"
-                    f" image that network {self.member.name!r} sees (rows and columns"
+                    f" image that network {self.name!r} sees (rows and columns"
                     f" {prepared.map.crop})"
                 )
             reader = AlignedDepth(network, prepared.points, settings.align)
@@ -151,7 +127,8 @@ class OpenNetwork:
                 else:
                     # z is updated; the first and the last depth have full size.
                     z0 = self._front(prepared)
-                    with self._coarse() as at_full_size:
+                    coarse = None if self._coarse is None else self._coarse(network.module)
+                    with coarse or nullcontext([]) as at_full_size:
                         result = refine(
                             self.cut(), prepared.arguments, prepared.points, settings,
                             depth_of=reader, z0=z0,
@@ -176,35 +153,28 @@ class OpenNetwork:
 
     def _front(self, prepared: PreparedFrame) -> Tensor:
         """z_0. It is the same for all points if the network takes the image alone."""
-        z0, split = self._z0, self.cut()
+        z0 = self._z0
         if z0 is None:
             with torch.no_grad():
-                z0 = split.front(*prepared.arguments)
+                z0 = self.cut().front(*prepared.arguments)
         self._z0 = z0 if self._of_image_only else None
         return z0
-
-    def _coarse(self) -> AbstractContextManager[list[object]]:
-        """Inside, the network gives a smaller depth for the updates, if its definition has one."""
-        network = self.member.network
-        coarse = network.definition.coarse if self.member.coarse else None
-        return nullcontext([]) if coarse is None else coarse(network.module)
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
         """The depth without updates: one pass of the whole network, which need not be cut."""
         output = self._output
-        if output is None and self._z0 is not None:
-            with torch.no_grad():
-                output = self.cut().rear(self._z0)
-        elif output is None:
+        if output is None:
             with torch.no_grad(), wrap_user_errors("the network's forward"):
-                output = self.member.network.module(*prepared.arguments)
+                if self._z0 is None:
+                    output = self.network.module(*prepared.arguments)
+                else:
+                    output = self.cut().rear(self._z0)
         if self._of_image_only:
             self._output = output
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
         known = at_points.isfinite()
-        loss_of = checked_loss(self.member.settings.loss)
-        loss = loss_of(at_points[known], prepared.points.depth[known])
+        loss = checked_loss(self.settings.loss)(at_points[known], prepared.points.depth[known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
 
 
@@ -216,24 +186,23 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
         ModelError: The definition does not make arguments of it.
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
-    points = to_network.points_to_network(frame.points)
-    given = points
-    if frame.outliers is not None and network.definition.weighs_points:
-        given = points.joined(to_network.points_to_network(frame.outliers))
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
-    prior = None
+    prior, camera = None, frame.camera
     if frame.prior is not None and network.definition.takes_prior:
         prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
-    camera = frame.camera
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
+
+    def arguments_for(points: SparsePoints) -> tuple[Tensor, ...]:
+        return network.arguments_of(image, points, prior, intrinsics)
+
+    points = given = to_network.points_to_network(frame.points)
+    if frame.outliers is not None and network.definition.weighs_points:
+        given = points.joined(to_network.points_to_network(frame.outliers))
     return PreparedFrame(
-        network=network,
         map=to_network,
-        image=image,
-        arguments=network.arguments_of(image, given, prior, intrinsics),
+        arguments=arguments_for(given),
         points=points.tensors(network.device),
-        prior=prior,
-        intrinsics=intrinsics,
+        arguments_for=arguments_for,
     )
 
 

@@ -15,13 +15,13 @@ from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeEr
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
 from pnpdepth_cli.frames.frame import (
     Frame,
+    Refined,
     Register,
     Registration,
     registration_to_make,
     tensor_of,
 )
 from pnpdepth_cli.frames.method import Method, check_combination
-from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import resolve_definition
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -127,7 +127,7 @@ class Refiner:
         with self._lock:
             method = self._method_for(frame)
             refined = method.refine(frame)
-        refined = replace(refined, notes=(*method.network.notes, *frame.notes, *refined.notes))
+        refined = replace(refined, notes=(*method.own.network.notes, *frame.notes, *refined.notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined

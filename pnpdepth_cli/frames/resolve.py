@@ -9,10 +9,14 @@ import torch
 
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
-from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error
-from pnpdepth_cli.errors import ModelError, NoPointsError, UsageError
+from pnpdepth_cli.errors import (
+    ModelError,
+    NoPointsError,
+    UsageError,
+    out_of_memory_is_a_device_error,
+)
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_network import Member, prepare
+from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
 from pnpdepth_cli.models.cut_layers import default_layer
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
@@ -135,24 +139,26 @@ def resolve_settings(
     return settings.over(replace(defaults, align=alignment)).closed()
 
 
-def resolve_member(network: Network, frame: Frame, asked: Settings, *, is_default: bool) -> Member:
+def resolve_member(
+    network: Network, frame: Frame, asked: Settings, *, is_default: bool
+) -> OpenNetwork:
     """Returns a network, where it is cut, and its settings, with nothing left open.
 
     In the default method, a network whose output is metric is aligned too, where the points say
     that it should be. Of networks that take the points, only those with a prior are updated.
     """
-    definition, layer = network.definition, asked.layer
+    layer = asked.layer
     if layer is None and not asked.is_paper:
         layer = default_layer(network, frame.size, len(frame.points))
-    layer = resolve_layer(definition, layer)
-    settings = resolve_settings(definition, asked, metric=frame.unit == METRES)
+    layer = resolve_layer(network.definition, layer)
+    settings = resolve_settings(network.definition, asked, metric=frame.unit == METRES)
+    member = OpenNetwork(network, layer, settings, coarse=is_default)
     if is_default:
-        settings = replace(settings, iterations=min(settings.iterations, UPDATES))
-    member = Member(network=network, layer=layer, settings=settings, coarse=is_default)
-    if is_default and member.takes_points and not member.takes_prior:
-        return replace(member, settings=replace(settings, iterations=0))
-    if is_default and not member.takes_points and settings.align == "none":
-        return replace(member, settings=replace(settings, align="auto"))
+        updated = member.takes_prior or not member.takes_points
+        iterations = min(settings.iterations, UPDATES) if updated else 0
+        aligned = settings.align != "none" or member.takes_points
+        align = settings.align if aligned else "auto"
+        member.settings = replace(settings, iterations=iterations, align=align)
     return member
 
 

@@ -24,8 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points, pixels_of
-from pnpdepth_cli.frames.frame import is_dense
-from pnpdepth_cli.frames.refined import Refined, Validation
+from pnpdepth_cli.frames.frame import Refined, Validation, is_dense
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.stages import AFTER

@@ -19,8 +19,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.models.frame_map import FrameMap
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def best_layer(
         # A layer that the network cannot be cut at is left out.
         with suppress(ModelError), Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)
-            widths[name] = min(influential_field(split, z, network.known_of, enough).in_output)
+            widths[name] = min(influential_field(split, z, network.known_of, enough)[1])
             if widths[name] >= enough:
                 return name
     return max(widths, key=widths.__getitem__, default=None)

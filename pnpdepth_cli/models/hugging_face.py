@@ -21,8 +21,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.core.user_code import describe
-from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.errors import CheckpointError, ModelError, describe
 from pnpdepth_cli.models.definition import (
     UNTUNED_DEFAULTS,
     Fixed,

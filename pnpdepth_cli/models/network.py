@@ -13,8 +13,14 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
-from pnpdepth_cli.core.user_code import out_of_memory_is_a_device_error, wrap_user_errors
-from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError, UsageError
+from pnpdepth_cli.errors import (
+    CheckpointError,
+    DeviceError,
+    ModelError,
+    UsageError,
+    out_of_memory_is_a_device_error,
+    wrap_user_errors,
+)
 from pnpdepth_cli.models.cut_layers import suggest_layers
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame

@@ -23,8 +23,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.core.user_code import describe
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, describe
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
 

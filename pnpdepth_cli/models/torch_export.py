@@ -20,8 +20,7 @@ from torch import Tensor, fx
 from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.core.user_code import describe
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, describe
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
 from pnpdepth_cli.models.file_graph import FileGraph, Operation
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import LOSSES, UPDATES
-from pnpdepth_cli.core.split.cut_point import LayerName
+from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.tensors import map_tensors, tensors_in
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -33,10 +32,9 @@ def naive_refine(
     x: Tensor,
     points: SparsePoints,
     settings: ClosedSettings,
-    depth_of: Callable[[Any], Tensor],
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
-    name = LayerName.parse(layer)
+    cut = CutPoint.find(network, layer)
     loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
     z: Tensor | None = None
 
@@ -48,18 +46,18 @@ def naive_refine(
             nonlocal z, calls
             calls += 1
             recomputed = torch._C._current_graph_task_id() != -1
-            if calls != (name.call or 1) and not (recomputed and name.call is None):
+            if calls != (cut.call or 1) and not (recomputed and cut.call is None):
                 return None
             paths = [path for path, t in tensors_in(output) if t.is_floating_point()]
-            path = name.key or paths[0]
+            path = cut.key or paths[0]
             if z is None:
                 z = next(t for p, t in tensors_in(output) if p == path).detach().clone()
             return map_tensors(output, lambda p, t: z.clone() if p == path else t)
 
         whole = frozen_copy(network)
-        cut = dict(whole.named_modules(remove_duplicate=False))[name.module]
-        cut.register_forward_hook(replace, prepend=True)
-        return depth_of(whole(x.clone()))
+        layers = dict(whole.named_modules(remove_duplicate=False))
+        layers[cut.name].register_forward_hook(replace, prepend=True)
+        return whole(x.clone())
 
     with torch.no_grad():
         depth_with_z()

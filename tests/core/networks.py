@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -29,9 +28,6 @@ class Net(nn.Module):
 
 def conv(channels: int, out: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(channels, out, kernel, stride, padding=kernel // 2)
-
-
-# ------------------------------------------------------------------ ordinary architectures
 
 
 class UNet(nn.Module):
@@ -65,64 +61,6 @@ class UNet(nn.Module):
             skip = skip + 0.5 if skip.requires_grad else skip.add_(0.5)
             x = up(torch.cat([F.interpolate(F.relu(x), scale_factor=2.0), skip], 1))
         return x.abs() + 1
-
-
-@dataclass
-class Encoded(OrderedDict):
-    """Keys and attributes at once, as Hugging Face's outputs."""
-
-    last: Any = None
-    hidden: Any = None
-
-    def __post_init__(self) -> None:
-        for name in ("last", "hidden"):
-            super().__setitem__(name, getattr(self, name))
-
-    def __setitem__(self, key: str, value: Any) -> None:
-        super().__setitem__(key, value)
-        super().__setattr__(key, value)
-
-
-def vit() -> nn.Module:
-    """A transformer with dataclass and dict outputs and keyword arguments."""
-
-    def attend(block: Any, x: Tensor, *, scale: float = 1.0) -> tuple[Tensor, None]:
-        y = block.norm1(x)
-        x = x + scale * block.attention(y, y, y, need_weights=False)[0]
-        return x + scale * block.mlp(block.norm2(x)), None
-
-    def encode(encoder: Any, x: Tensor, output_hidden: bool = False) -> Encoded:
-        x = encoder.drop(encoder.patches(x).flatten(2).transpose(1, 2) + encoder.position)
-        hidden = [x]
-        for block in encoder.blocks:
-            x, _ = block(x, scale=0.5)
-            hidden.append(x)
-        return Encoded(last=encoder.norm(x), hidden=tuple(hidden) if output_hidden else None)
-
-    def depth(net: Any, x: Tensor) -> dict[str, Tensor]:
-        encoded = net.encoder(x, output_hidden=True)
-        tokens = net.project(torch.cat([encoded.last, encoded["hidden"][1]], -1))
-        grid = tokens.transpose(1, 2).unflatten(2, (4, 4))
-        disparity = net.head(F.interpolate(grid, scale_factor=4.0, mode="bilinear"))
-        return {"disparity": disparity.abs() + 0.5}
-
-    blocks = (
-        Net(
-            attend,
-            norm1=nn.LayerNorm(8),
-            norm2=nn.LayerNorm(8),
-            attention=nn.MultiheadAttention(8, 2, batch_first=True),
-            mlp=nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 8)),
-        )
-        for _ in range(3)
-    )
-    parts = {"patches": nn.Conv2d(3, 8, 4, 4), "drop": nn.Dropout(0.1), "norm": nn.LayerNorm(8)}
-    encoder = Net(encode, blocks=nn.ModuleList(blocks), **parts)
-    encoder.position = nn.Parameter(torch.randn(1, 16, 8) * 0.1)
-    return Net(depth, encoder=encoder, project=nn.Linear(16, 8), head=conv(8, 1))
-
-
-# ------------------------------------------------------------------ one difficulty each
 
 
 def in_place() -> nn.Module:
@@ -321,29 +259,18 @@ class Updating(nn.Module):
         return self.head(self.cut(y * self.passes) + self.average).abs() + 1
 
 
-class Methods(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b = conv(4, 4), conv(4, 4)
-
-    def features(self, x: Tensor) -> Tensor:
-        return self.b(self.a(x))
-
-    def forward(self, *, x: Tensor) -> Tensor:
-        return self.a(x) * 2
-
-
 def direct() -> nn.Module:
-    """Calls forward() itself, methods of submodules, and parametrizations."""
+    """Calls forward() itself, a method of a submodule, and parametrizations."""
 
     def run(net: Any, x: Tensor) -> Tensor:
         x = net.spectral.forward(net.enter.forward(x))
-        x = net.methods.features(x) + net.methods(x=x)
+        x = net.part.run(net.part, x) + net.part(x=x)
         return net.head(x).abs() + 1
 
     enter = nn.utils.parametrizations.weight_norm(conv(3, 4))
     spectral = nn.utils.parametrizations.spectral_norm(conv(4, 4))
-    return Net(run, enter=enter, spectral=spectral, methods=Methods(), head=conv(4, 1))
+    part = Net(lambda part, x: part.b(part.a(x)), a=conv(4, 4), b=conv(4, 4))
+    return Net(run, enter=enter, spectral=spectral, part=part, head=conv(4, 1))
 
 
 def scripted() -> nn.Module:
@@ -432,7 +359,6 @@ def catches() -> nn.Module:
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "unet": UNet,
-    "vit": vit,
     "in place": in_place,
     "midas": midas,
     "branching": branching,
@@ -463,8 +389,3 @@ def build(name: str) -> nn.Module:
 
 def image(height: int = 16, width: int = 16) -> Tensor:
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(1))
-
-
-def depth_of(output: Any) -> Tensor:
-    """Depth (1, 1, h, w) of what any of the networks here returns."""
-    return output["disparity"].reciprocal() if isinstance(output, dict) else output

@@ -6,39 +6,41 @@ import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.core.influence import InfluentialField, influential_field
+from pnpdepth_cli.core.influence import Patch, influential_field
 from pnpdepth_cli.core.split import Split
-from tests.core.networks import Net, build, conv, depth_of, image
+from tests.core.networks import Net, conv, image
 
 
-def field(network: nn.Module, layer: str, size: int = 32) -> InfluentialField:
+def field(network: nn.Module, layer: str, size: int = 32) -> tuple[Patch | None, Patch]:
     with Split(network, layer) as split:
         z = split.front(image(size, size))
-        return influential_field(split, z, depth_of)
+        return influential_field(split, z, lambda output: output)
 
 
 def test_two_3x3_convolutions_reach_5x5_of_z_and_9x9_of_the_output() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4), conv(4, 1))
-    assert field(network, "0") == InfluentialField((5, 5), (9, 9))
+    assert field(network, "0") == ((5, 5), (9, 9))
 
 
 def test_a_stride_behind_the_cut_widens_the_patch_of_z() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(conv(3, 4), conv(4, 4, stride=2), conv(4, 1))
     # 3×3 of the strided map read 7×7 of z; those move (7 + 2) / 2 + 1 = 5 cells, widened to 7
-    assert field(network, "0") == InfluentialField((7, 7), (7, 7))
+    assert field(network, "0") == ((7, 7), (7, 7))
 
 
-def test_attention_reaches_everywhere_and_tokens_have_no_patch() -> None:
-    assert field(build("vit"), "encoder.blocks.0[0]", 16) == InfluentialField(None, (16, 16))
+def test_tokens_that_are_mixed_reach_everywhere_and_have_no_patch() -> None:
+    tokens = [conv(3, 8, 3, stride=4), nn.Flatten(2), nn.Linear(16, 16)]
+    network = nn.Sequential(*tokens, nn.Unflatten(2, (4, 4)), conv(8, 1))
+    assert field(network, "1", 16) == (None, (4, 4))
 
 
 def test_a_cut_that_does_not_reach_the_output_has_no_field() -> None:
     network = Net(
         lambda net, x: (net.cut(x), net.head(x))[1], cut=conv(3, 4), head=nn.Sequential(conv(3, 1))
     )
-    assert field(network, "cut") == InfluentialField((0, 0), (0, 0))
+    assert field(network, "cut") == ((0, 0), (0, 0))
 
 
 @pytest.mark.parametrize(("enough", "tried"), [(None, 3), (1, 1), (2, 3), (3, 1)])
@@ -48,11 +50,11 @@ def test_points_are_tried_until_the_narrower_side_is_enough_or_far_from_it(
     network = nn.Sequential(conv(3, 4), nn.Conv2d(4, 1, (3, 1), padding=(1, 0)))
     calls = list[object]()
 
-    def counted(output: object) -> torch.Tensor:
+    def counted(output: torch.Tensor) -> torch.Tensor:
         calls.append(output)
-        return depth_of(output)
+        return output
 
     with Split(network, "0") as split:
         found = influential_field(split, split.front(image(32, 32)), counted, enough)
-    assert found == InfluentialField((3, 1), (5, 1))
+    assert found == ((3, 1), (5, 1))
     assert len(calls) == 1 + tried

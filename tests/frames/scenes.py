@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.open_network import Member, OpenNetwork
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
@@ -61,7 +61,7 @@ class Nearest(nn.Module):
 
 def member(
     build: type[nn.Module], *, settings: ClosedSettings | None = None, **of_definition: Any
-) -> Member:
+) -> OpenNetwork:
     """The network as a member of the default method, by default without updates and alignment."""
     kind = "rgb" if issubclass(build, Brightness) else "rgb+sparse"
     definition = ModelDefinition(
@@ -75,11 +75,11 @@ def member(
         definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None
     )
     settings = settings or ClosedSettings(iterations=0, align="none")
-    return Member(network=network, layer="layer", settings=settings)
+    return OpenNetwork(network, "layer", settings)
 
 
 @contextmanager
-def opened(*members: Member) -> Iterator[list[OpenNetwork]]:
+def opened(*members: OpenNetwork) -> Iterator[list[OpenNetwork]]:
     """The networks, open."""
     with ExitStack() as stack:
-        yield [stack.enter_context(OpenNetwork(member)) for member in members]
+        yield [stack.enter_context(member) for member in members]

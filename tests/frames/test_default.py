@@ -15,7 +15,7 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import Frame, Prediction, Refined
 from pnpdepth_cli.frames.fuse import (
     FOLDS,
     MIN_POINTS,
@@ -27,8 +27,7 @@ from pnpdepth_cli.frames.fuse import (
     trust,
     weighted_mean,
 )
-from pnpdepth_cli.frames.open_network import Member, OpenNetwork
-from pnpdepth_cli.frames.refined import Prediction, Refined
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.resolve import resolve_member
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
@@ -56,15 +55,15 @@ class Noise(Brightness):
         return self.layer(1 + random)
 
 
-def refined(frame: Frame, *members: Member, seed: int = 0) -> Refined:
+def refined(frame: Frame, *members: OpenNetwork, seed: int = 0) -> Refined:
     """The frame by the default method with these networks."""
     with opened(*members) as networks:
         return refine_default(networks, frame, seed=seed)
 
 
-def predicted_by(own: Member, frame: Frame) -> Prediction:
+def predicted_by(own: OpenNetwork, frame: Frame) -> Prediction:
     """What the network alone gives for the frame."""
-    with OpenNetwork(own) as network:
+    with own as network:
         return network.refine(frame)
 
 
@@ -73,10 +72,10 @@ def with_gt(frame: Frame) -> Frame:
     return replace(frame, gt=depth_of_scene().numpy())
 
 
-def compact() -> Member:
+def compact() -> OpenNetwork:
     """`compact` without updates of z."""
     network = load_network("compact", None)
-    return Member(network=network, layer="decoder.s8", settings=ClosedSettings(iterations=0))
+    return OpenNetwork(network, "decoder.s8", ClosedSettings(iterations=0))
 
 
 def scan_frame() -> Frame:
@@ -90,7 +89,7 @@ def scan_frame() -> Frame:
 
 def expert(name: str, at: Tensor, weight: float = 1.0) -> Expert:
     """An expert with these predictions at the validation points."""
-    return Expert(name=name, weight=weight, at=at, dense=depth_of_scene)
+    return Expert(name=name, weight=weight, at=at, updated=at)
 
 
 def split_of(depth: Tensor) -> ValidatedFrame:
@@ -178,7 +177,8 @@ def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise:
         total += (y[left_out] - y[rest].mean()) ** 2
     rises = np.polyfit(x, y, 1)[0] > 0 and known >= MIN_POINTS
     expected = np.clip((1 - press / total - 0.25) / 0.5, 0, 1) if rises else 0
-    assert trust(one, split, expert("compact", torch.ones(60))) == pytest.approx(expected, abs=1e-6)
+    alone = expert("compact", torch.ones(60))
+    assert trust(member(Brightness), one, split, alone) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
@@ -194,18 +194,9 @@ def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
 
 def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation_points() -> None:
     depth = torch.full((50,), 2.0)
-    frame, split = frame_in_memory(60), split_of(depth)
-    alone, own = expert("compact", depth + 0.1), member(Nearest)
+    split, alone = split_of(depth), expert("compact", depth + 0.1)
     found = [
-        trust(
-            replace(
-                expert("own", depth + off),
-                whole=predicted_by(own, frame),
-                network=OpenNetwork(own),
-            ),
-            split,
-            alone,
-        )
+        trust(member(Nearest), expert("own", depth + off), split, alone)
         for off in (0.05, 0.1, 0.15, 0.2, 0.4)
     ]
     assert found == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-4)
@@ -368,9 +359,7 @@ def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> No
     with opened(member(Brightness, settings=UPDATES), compact()) as networks:
         first, _, again = (refine_default(networks, frames[n]) for n in (0, 1, 0))
     assert np.array_equal(first.after, again.after)
-    assert np.array_equal(
-        first.after, refined(frames[0], *(each.member for each in networks)).after
-    )
+    assert np.array_equal(first.after, refined(frames[0], *networks).after)
 
 
 def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
@@ -396,8 +385,7 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     handle = first.register_forward_hook(lambda *_: runs.append(1))
     frame, settings = frame_in_memory(60), ClosedSettings(iterations=1, lr="5%")
     fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
-    own = Member(network=network, layer="decoder.s8", settings=settings, coarse=True)
-    with OpenNetwork(own) as one:
+    with OpenNetwork(network, "decoder.s8", settings, coarse=True) as one:
         one.refine(frame)
         count = len(runs)
         shared = one.refine(fewer)
@@ -420,7 +408,7 @@ def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
 
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     frame, bad = spoiled(frame_in_memory(60))
-    with OpenNetwork(member(Brightness)) as judge:
+    with member(Brightness) as judge:
         inliers, _ = without_outliers(judge, frame)
         clean, _ = without_outliers(judge, frame_in_memory(60))
     assert inliers.outliers is not None
@@ -439,7 +427,7 @@ def test_the_loss_without_updates_is_that_of_the_points_where_the_depth_is_finit
     monkeypatch.setattr(build, "forward", lambda *_: sky[None, None])
     rows = frame.points.xy[:, 1].numpy()
     settings = ClosedSettings(iterations=0, align="none", loss="l2")
-    with OpenNetwork(member(build, settings=settings)) as network:
+    with member(build, settings=settings) as network:
         found = network.refine(frame)
     expected = np.square(0.5 * frame.points.depth.numpy()[rows >= 30]).mean()
     assert found.losses == (pytest.approx(expected),)

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import refine_fixed
 from pnpdepth_cli.frames.open_network import prepare
-from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints

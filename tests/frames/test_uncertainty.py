@@ -13,7 +13,7 @@ from scipy.interpolate import griddata
 from scipy.ndimage import maximum_filter, minimum_filter
 
 import pnpdepth_cli as pnp
-from pnpdepth_cli.frames.refined import Refined, Validation
+from pnpdepth_cli.frames.frame import Refined, Validation
 from pnpdepth_cli.frames.uncertainty import calibration, valid_depth, with_uncertainty
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints

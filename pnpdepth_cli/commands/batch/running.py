@@ -40,9 +40,8 @@ from pnpdepth_cli.errors import (
     StorageError,
     UsageError,
 )
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.io.file_bytes import Fingerprint, fingerprint, one_line
 
 DECIDING = 16

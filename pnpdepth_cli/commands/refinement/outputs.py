@@ -17,8 +17,7 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.refined import Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
 from pnpdepth_cli.io.file_bytes import write_json

@@ -36,9 +36,8 @@ from pnpdepth_cli.dataset.frame_record import (
 )
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames.frame import DepthMap, Frame
+from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
 from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.frames.refined import Refined
 from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
@@ -150,7 +149,7 @@ def write_refined(
                 for kind, path in outputs.items()
             },
             seconds=watch.seconds,
-            peak_memory_mb=peak_memory_mb(method.network.device),
+            peak_memory_mb=peak_memory_mb(method.own.network.device),
         )
         if "record" in outputs:
             record.write(outputs["record"])
@@ -162,7 +161,8 @@ def _record_of(
 ) -> FrameRecord:
     """The record of a refined frame, without its outputs and times."""
     # What the frame is called, and what the networks say.
-    network, weights, files = method.network, method.network.checkpoint, request.files
+    network, files = method.own.network, request.files
+    weights = network.checkpoint
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
     own_used = len(frame.own) - len(refined.held_out)
@@ -191,10 +191,10 @@ def _record_of(
         settings={
             "method": method.asked.method,
             "layer": method.own.layer,
-            **asdict(method.settings),
+            **asdict(method.own.settings),
             "seed": method.asked.seed,
             "step": refined.step,
-            "propagate": "gp" if method.is_default else method.settings.propagate,
+            "propagate": "gp" if method.is_default else method.own.settings.propagate,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
             "holdout": request.holdout,

@@ -18,19 +18,16 @@ reached Python, where the network could branch on it. Then further frames are on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.recorder import Recorder
-from pnpdepth_cli.core.split.replay import Interception, Replay
+from pnpdepth_cli.core.split.replay import Interception, Recorder, Replay
 from pnpdepth_cli.core.split.tensors import NetworkState
 from pnpdepth_cli.core.split.watch import Watch
-from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import PnpDepthError
+from pnpdepth_cli.errors import PnpDepthError, wrap_user_errors
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -103,12 +100,16 @@ class Split:
 
         In float32 if the layer gives a shorter type, in which small steps would be rounded away.
         """
-        if self._replay is not None and self._replay.recording.holds_for(arguments):
-            self._replay_front(self._replay, arguments)
+        replay = self._replay
+        if replay is not None and replay.recording.holds_for(arguments):
+            replay.next_frame(arguments)
+            if not self._run_front(replay):
+                ran = set(replay.recording.calls)
+                raise self._cut.never_ran(ran, replay.calls[self._cut.module])
         else:
-            self._replay = None  # frees the tensors of the last frame
-            self._replay = self._record_front(arguments)
-        z0 = self._replay.z0
+            self._replay = replay = None  # frees the tensors of the last frame
+            self._replay = replay = self._record_front(arguments)
+        z0 = replay.z0
         assert z0 is not None
         # A copy, because the network may go on to change the memory of z_0.
         return z0.to(torch.float32 if z0.dtype in _LOW_PRECISION else z0.dtype, copy=True)
@@ -121,13 +122,7 @@ class Split:
         replay.z = z
         return self._run(replay) if replay.recording.complete else self._record_rear(replay)
 
-    def _replay_front(self, replay: Replay, arguments: Sequence[object]) -> None:
-        replay.next_frame(arguments)
-        if not self._run_front(replay):
-            ran = {call.module for call in replay.recording.calls}
-            raise self._cut.never_ran(ran, replay.calls[self._cut.module])
-
-    def _record_front(self, arguments: Sequence[object]) -> Replay:
+    def _record_front(self, arguments: tuple[object, ...]) -> Replay:
         while True:
             replay = Replay(self._cut, arguments)
             watch = Watch(
@@ -139,7 +134,7 @@ class Split:
                 raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
             if len(self._uncacheable) > uncacheable:
                 continue  # once more, to cache what lies inside those
-            recorder.finish_front(promised_static=self._promised_static)
+            recorder.finish(complete=False)
             return replay
 
     def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> bool:
@@ -151,35 +146,32 @@ class Split:
                 raise
         return replay.has_front
 
-    def _record_rear(self, replay: Replay) -> Any:
+    def _record_rear(self, replay: Replay) -> object:
         saved = [output for output in replay.outputs if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, escapes=not self._promised_static)
         recorder = Recorder(self._cut, watch, replay, self._uncacheable)
-        try:
-            output = self._run(replay, recorder)
-            recorder.finish_rear(promised_static=self._promised_static)
-        except BaseException:
-            recorder.abandon()
-            raise
+        output = self._run(replay, recorder)
+        recorder.finish_rear()
         return output
 
-    def _run(self, replay: Replay, recorder: Recorder | None = None) -> Any:
+    def _run(self, replay: Replay, recorder: Recorder | None = None) -> object:
         """One pass of the network, learning if there is a recorder."""
         assert self._interception is not None
         self._state.restore()
         replay.calls.clear()
         replay.recorder = recorder
-        arguments = replay.arguments
+        arguments = replay.arguments.fresh()
+        assert isinstance(arguments, tuple)
         try:
             with (
                 self._interception.handled_by(replay.handle, replay.handle_outside),
                 wrap_user_errors("the network's forward"),
             ):
                 if recorder is None:
-                    return self._network(*arguments.fresh())
-                with recorder.watch, recorder.watch.seeing_escapes():
-                    return self._network(*arguments.fresh())
+                    return self._network(*arguments)
+                with recorder.watch, recorder.watch.seeing_escapes_of(self._network):
+                    return self._network(*arguments)
         finally:
             replay.recorder = None
 

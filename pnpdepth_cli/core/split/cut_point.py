@@ -13,30 +13,8 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import LayerError
 
-
-@dataclass(frozen=True)
-class LayerName:
-    """A layer: `module`, `module#2` for its second call, `module[key]` for one of its outputs."""
-
-    module: str
-    call: int | None = None  # number of the call, from 1; None if there is one call
-    key: tuple[str, ...] | None = None
-    """Path of the output in nested containers; None if there is one."""
-
-    @classmethod
-    def parse(cls, text: str) -> LayerName:
-        """Returns the parts of a name. Raises LayerError if it is not of this form."""
-        match = re.fullmatch(
-            r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)", text
-        )
-        if match is None or match["call"] == "0":
-            raise LayerError(f"layer {text!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
-        keys = tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"]))
-        return cls(match["module"], int(match["call"]) if match["call"] else None, keys or None)
-
-    def of_output(self, path: tuple[str, ...]) -> str:
-        """Returns the name of the output of this module at a path."""
-        return self.module + "".join(f"[{key}]" for key in path)
+_NAME = re.compile(r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)")
+"""`module`, `module#2` for its second call, `module[key]` for one of its outputs."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +22,9 @@ class CutPoint:
     """The layer to cut at, and the submodules around it."""
 
     layer: str  # the layer as the user named it
-    name: LayerName
+    name: str  # the submodule's
+    call: int | None  # number of the submodule's call, from 1; None if there is one
+    key: tuple[str, ...]  # path of z in nested containers; empty if there is one output
     module: nn.Module
     modules: Mapping[str, nn.Module]
     """All submodules by name; one with several names comes several times."""
@@ -55,20 +35,25 @@ class CutPoint:
     @classmethod
     def find(cls, network: nn.Module, layer: str) -> CutPoint:
         """Returns the cut point of that name. Raises LayerError if there is no such submodule."""
-        name = LayerName.parse(layer)
+        match = _NAME.fullmatch(layer)
+        if match is None or match["call"] == "0":
+            raise LayerError(f"layer {layer!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
+        name = match["module"]
         modules = dict(network.named_modules(remove_duplicate=False))
-        if name.module not in modules or not name.module:
-            near = difflib.get_close_matches(name.module, filter(None, modules), n=3, cutoff=0.5)
+        if name not in modules or not name:
+            near = difflib.get_close_matches(name, filter(None, modules), n=3, cutoff=0.5)
             hint = f"did you mean {', '.join(near)}?"
             if not near:
                 hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
-            raise LayerError(f"layer {name.module!r} is not in this network; {hint}")
+            raise LayerError(f"layer {name!r} is not in this network; {hint}")
         return cls(
             layer=layer,
             name=name,
-            module=modules[name.module],
+            call=int(match["call"]) if match["call"] else None,
+            key=tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"])),
+            module=modules[name],
             modules=modules,
-            containers=_containers(modules[name.module], modules),
+            containers=_containers(modules[name], modules),
             around_hooks=_around_hooks(modules),
         )
 
@@ -83,12 +68,12 @@ class CutPoint:
             for path, tensor in tensors_in(output)
             if tensor.is_floating_point() and tensor.layout == torch.strided
         ]
-        key = self.name.key
-        chosen = [(path, tensor) for path, tensor in candidates if key in (None, path)]
+        chosen = [(path, tensor) for path, tensor in candidates if self.key in ((), path)]
         if len(chosen) == 1:
             return chosen[0][0], chosen[0][1].detach()
-        names = ", ".join(self.name.of_output(path) for path, _ in candidates)
-        if key is not None:
+        keys = ["".join(f"[{key}]" for key in path) for path, _ in candidates]
+        names = ", ".join(self.name + key for key in keys)
+        if self.key:
             problem = f"has no such output; it has {names}"
         elif candidates:
             problem = f"returns several tensors; say which: {names}"
@@ -104,7 +89,7 @@ class CutPoint:
         inside = [
             name
             for name, module in self.modules.items()
-            if name.startswith(self.name.module + ".") and module in ran
+            if name.startswith(f"{self.name}.") and module in ran
         ]
         hint = f"cut at a part of it: {', '.join(inside[:4])}" if inside else "choose another layer"
         return LayerError(f"layer {self.layer!r} never runs in this network's forward; {hint}")

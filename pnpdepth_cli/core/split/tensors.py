@@ -6,7 +6,6 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,28 +23,28 @@ def tensors_in(
 
 
 def map_tensors(
-    structure: Any,
+    structure: object,
     change: Callable[[tuple[str, ...], Tensor], Tensor],
     path: tuple[str, ...] = (),
-) -> Any:
+) -> object:
     """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
     if isinstance(structure, Tensor):
         return change(path, structure)
     children = [map_tensors(child, change, (*path, key)) for key, child in _children(structure)]
     if isinstance(structure, tuple):
-        named = hasattr(structure, "_fields")
-        return type(structure)(*children) if named else type(structure)(children)
+        make: Callable[..., object] = type(structure)
+        return make(*children) if hasattr(structure, "_fields") else make(children)
     if not _is_container(structure):
         return structure
-    result: Any = copy.copy(structure)
-    if isinstance(structure, list):
+    result = copy.copy(structure)
+    if isinstance(result, list):
         result[:] = children
-    elif isinstance(structure, MutableMapping):
-        for key, child in zip(structure, children, strict=True):
+    elif isinstance(result, MutableMapping):
+        for key, child in zip(result, children, strict=True):
             result[key] = child
     else:
-        for field, child in zip(dataclasses.fields(structure), children, strict=True):
-            object.__setattr__(result, field.name, child)  # the dataclass may be frozen
+        for (name, _), child in zip(_children(structure), children, strict=True):
+            object.__setattr__(result, name, child)  # the dataclass may be frozen
     return result
 
 
@@ -58,12 +57,12 @@ def is_transparent(structure: object) -> bool:
     )
 
 
-def _children(structure: Any) -> Iterator[tuple[str, object]]:
+def _children(structure: object) -> Iterator[tuple[str, object]]:
     if isinstance(structure, list | tuple):
         yield from ((str(index), child) for index, child in enumerate(structure))
     elif isinstance(structure, MutableMapping):
         yield from ((str(key), child) for key, child in structure.items())
-    elif _is_container(structure):
+    elif dataclasses.is_dataclass(structure) and not isinstance(structure, type):
         yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
 
 
@@ -77,7 +76,7 @@ def _is_container(structure: object) -> bool:
 class SavedTensors:
     """Tensors in nested containers, as they were when saved."""
 
-    value: Any = None
+    value: object = None
     copied: bool = False
     """Whether the network changes them in place, so that `fresh` returns clones."""
 
@@ -86,7 +85,7 @@ class SavedTensors:
         """Returns the tensors of an output in new containers, clones if they are `copied`."""
         return cls(map_tensors(output, lambda _, t: t.clone() if copied else t), copied)
 
-    def fresh(self) -> Any:
+    def fresh(self) -> object:
         """Returns the tensors in new containers; whatever is done to them leaves `value` as is."""
         return map_tensors(
             self.value, lambda _, t: t.clone() if self.copied or t.is_inference() else t
@@ -111,8 +110,8 @@ class NetworkState:
                 [b for m in modules for b in m._buffers.values()],
             )
         )
-        self.tensors = [SavedTensors(t) for t in (*parameters, *buffers)]
-        self._originals = [saved.value for saved in self.tensors]
+        self._originals = [*parameters, *buffers]
+        self.tensors = [SavedTensors(tensor) for tensor in self._originals]
         self._learning = [(p, p.requires_grad) for p in parameters]
         self._buffers = [(m, dict(m._buffers)) for m in plain if m._buffers]
         self._modes = [(m, m.training) for m in modules if hasattr(m, "training")]
@@ -128,7 +127,7 @@ class NetworkState:
             module._buffers.update(buffers)
         with torch.no_grad():
             for original, saved in zip(self._originals, self.tensors, strict=True):
-                if saved.copied:
+                if saved.copied and isinstance(saved.value, Tensor):
                     original.copy_(saved.value)
 
     def close(self) -> None:

@@ -9,13 +9,12 @@ other kernels, and so other bits, than in later passes.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn, overrides
+from torch._ops import OpOverload
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -32,13 +31,8 @@ _FUSED = (
 """Torch's own forwards that use a fused kernel only where no torch function mode is active."""
 
 
-@dataclass(frozen=True)
-class Moment:
-    """A time in a watched pass: the operations, results that depend on z, and writes before it."""
-
-    operations: int
-    touches: int
-    writes: int
+Moment = tuple[int, int, int]
+"""A time in a watched pass: the operations, results that depend on z, and writes before it."""
 
 
 class Watch(TorchDispatchMode):
@@ -64,7 +58,7 @@ class Watch(TorchDispatchMode):
 
         Args:
             saved: Tensors to protect from in-place operations.
-            escapes: Whether values that reach Python are noted, which takes time.
+            escapes: Whether values that reach Python are noted.
         """
         super().__init__()  # type: ignore[no-untyped-call]
         self.data_dependent = self.escaped = self.torn = False
@@ -80,14 +74,10 @@ class Watch(TorchDispatchMode):
         for tensors in saved:
             self.protect(tensors)
 
-    def touch(self, tensor: Tensor) -> None:
-        """Marks a tensor as depending on z."""
-        self._touches += 1
-        self._marked.add(_storage(tensor))
-
     def injected(self, z: Tensor, original: Tensor | None) -> None:
         """Notes that the network goes on with z, in place of `original` if that exists."""
-        self.touch(z)
+        self._touches += 1
+        self._marked.add(_storage(z))
         if original is not None:
             self._twins = (original, z)
 
@@ -101,7 +91,7 @@ class Watch(TorchDispatchMode):
 
     def now(self) -> Moment:
         """Returns this moment, for `can_stand_for`."""
-        return Moment(self._operations, self._touches, len(self._writes))
+        return self._operations, self._touches, len(self._writes)
 
     def can_stand_for(self, since: Moment, inputs: object, output: object) -> bool:
         """Whether returning `output` does all that the call did which began at `since`.
@@ -109,36 +99,24 @@ class Watch(TorchDispatchMode):
         So it did not depend on z, changed nothing older than itself in place, and its output
         consists of tensors that it created, no two of them in the same memory.
         """
+        operations, touches, writes = since
         marked_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
         if self._marked and (marked_input or not is_transparent(inputs)):
             self._touches += 1  # a native extension may read its arguments unnoticed
         created_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
-        created_inside = [s for s in created_inside if self._created.get(s, 0) > since.operations]
-        if self._touches > since.touches:
+        created_inside = [s for s in created_inside if self._created.get(s, 0) > operations]
+        if self._touches > touches:
             self._marked.update(created_inside)
             return False
         return (
             is_transparent(output)
             and len(set(created_inside)) == sum(1 for _ in tensors_in(output))
-            and all(created > since.operations for created in self._writes[since.writes :])
+            and all(created > operations for created in self._writes[writes:])
         )
 
     @contextmanager
-    def seeing_escapes(self) -> Iterator[None]:
-        """Watches the methods that give values to Python, too."""
-        if not self._notes_escapes:
-            yield
-            return
-        self._sees_escapes = True
-        try:
-            with self._function_mode:
-                yield
-        finally:
-            self._sees_escapes = False
-
-    @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
-        """The same while this submodule runs, unless it is one of torch's fused layers."""
+        """Watches the methods that give values to Python, too, but not in torch's fused layers."""
         if not self._notes_escapes:
             yield
             return
@@ -148,7 +126,7 @@ class Watch(TorchDispatchMode):
             if self._sees_escapes and not outer:
                 with self._function_mode:
                     yield
-            elif outer and not self._sees_escapes and self._mode_is_innermost():
+            elif outer and not self._sees_escapes and _innermost_mode() is self._function_mode:
                 with overrides._pop_mode_temporarily():
                     yield
             else:
@@ -156,26 +134,27 @@ class Watch(TorchDispatchMode):
         finally:
             self._sees_escapes = outer
 
-    def _mode_is_innermost(self) -> bool:
-        innermost: object = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
-        return innermost is self._function_mode
-
     def note_escape(self, tensor: Tensor) -> None:
         """Notes that values of the tensor reach Python."""
         self.escaped = True
         self.data_dependent |= self._is_marked(tensor)
 
     def __torch_dispatch__(
-        self, func: Any, types: object, args: Sequence[Any] = (), kwargs: Any = None
+        self,
+        func: OpOverload,
+        types: object,
+        args: Sequence[object] = (),
+        kwargs: Mapping[str, object] | None = None,
     ) -> object:
         kwargs = kwargs or {}
-        facts = _facts(func)
+        writes, escapes = _facts(func)
+        escapes = escapes and self._notes_escapes
         self._operations += 1
         inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
         written = [
             tensor
-            for index, name in facts.writes
+            for index, name in writes
             for tensor in _tensors(args[index] if index < len(args) else kwargs.get(name))
         ]
         for tensor in written:
@@ -190,8 +169,8 @@ class Watch(TorchDispatchMode):
         if marked:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
-            self.data_dependent |= facts.escapes
-        self.escaped |= facts.escapes
+            self.data_dependent |= escapes
+        self.escaped |= escapes
         return result
 
     def _before_write(self, tensor: Tensor) -> None:
@@ -217,11 +196,19 @@ class _EscapeMode(TorchFunctionMode):
         self._watch = watch
 
     def __torch_function__(
-        self, func: Any, types: object, args: Sequence[Any] = (), kwargs: Any = None
+        self,
+        func: Callable[..., object],
+        types: object,
+        args: Sequence[object] = (),
+        kwargs: Mapping[str, object] | None = None,
     ) -> object:
-        if func in _ESCAPES:
+        if func in _ESCAPES and isinstance(args[0], Tensor):
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
+
+
+def _innermost_mode() -> object:
+    return overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
 
 
 _NO_STORAGE = 0
@@ -235,26 +222,16 @@ def _storage(tensor: Tensor) -> int:
         return _NO_STORAGE
 
 
-@dataclass(frozen=True)
-class _Facts:
-    """What an operation may do, by its schema and tags."""
-
-    writes: tuple[tuple[int, str], ...]  # index and name of the arguments that it changes in place
-    escapes: bool  # whether it gives values, or shapes that depend on values, to Python
-
-
 @functools.cache
-def _facts(func: Any) -> _Facts:
-    schema = func._schema
-    return _Facts(
-        writes=tuple(
-            (index, argument.name)
-            for index, argument in enumerate(schema.arguments)
-            if argument.alias_info is not None and argument.alias_info.is_write
-        ),
-        escapes=torch.Tag.data_dependent_output in func.tags
-        or torch.Tag.dynamic_output_shape in func.tags,
-    )
+def _facts(func: OpOverload) -> tuple[list[tuple[int, str]], bool]:
+    """Index and name of the arguments that an operation changes in place; whether values escape.
+
+    They do where it gives them, or shapes that depend on them, to Python.
+    """
+    arguments = enumerate(func._schema.arguments)
+    writes = [(i, a.name) for i, a in arguments if a.alias_info and a.alias_info.is_write]
+    tags = torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape
+    return writes, any(tag in func.tags for tag in tags)
 
 
 def _tensors(value: object) -> list[Tensor]:

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import budget, check_claim
-from pnpdepth_cli.core.user_code import describe, wrap_user_errors
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 from pnpdepth_cli.models.definition import (
     ASSUMED_MULTIPLE,
     ModelDefinition,

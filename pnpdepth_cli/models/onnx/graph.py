@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.fx.node import Argument
 
-from pnpdepth_cli.core.user_code import wrap_user_errors
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import ModelError, wrap_user_errors
 from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit, Unsupported
 from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
 from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.core.user_code import wrap_user_errors
+from pnpdepth_cli.errors import wrap_user_errors
 from pnpdepth_cli.models.file_graph import Unsupported
 from pnpdepth_cli.models.onnx.operators import (
     Inputs,

@@ -18,8 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.core.user_code import describe
-from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.errors import CheckpointError, ModelError, describe
 from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file

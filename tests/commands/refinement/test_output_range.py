@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.commands.refinement.outputs import output_scale, within_range
-from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.refined import Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.points import SparsePoints
 from tests.commands.frames import frame_on_disk, run

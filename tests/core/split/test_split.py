@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.cut_point import LayerName
 from pnpdepth_cli.errors import LayerError, ModelError
 from tests.completion.naive import plain
 from tests.core.networks import (
@@ -24,13 +23,11 @@ from tests.core.networks import (
     Updating,
     build,
     conv,
-    depth_of,
     image,
 )
 
 NO_CUT = {
     "unet": {"encoder.stages", "ups"},
-    "vit": {"encoder.blocks", *(f"encoder.blocks.{i}.attention.out_proj" for i in range(3))},
     "in place": {"flat"},
     "side effects": {"hide"},
     "catches": {"inner.other"},
@@ -47,7 +44,7 @@ NO_CUT = {
 def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
     network, x = build(name), image()
     frames = [x, x.flip(3) * 0.7, x]
-    wholes = [depth_of(plain(network, frame)) for frame in frames]
+    wholes = [plain(network, frame) for frame in frames]
     layers = [layer for layer, _ in network.named_modules(remove_duplicate=False) if layer]
     can, cannot = 0, set()
     while layers:
@@ -57,7 +54,7 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
                 for frame, whole in zip(frames, wholes, strict=True):
                     z = split.front(frame)
                     for _ in range(3):
-                        assert torch.equal(depth_of(split.rear(z)), whole), layer
+                        assert torch.equal(split.rear(z), whole), layer
             can += 1
         except LayerError as error:
             if "say which" in str(error):
@@ -66,7 +63,7 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
                 cannot.add(layer)
     assert cannot == NO_CUT.get(name, set())
     assert can > 1
-    assert torch.equal(depth_of(plain(network, x)), wholes[0])
+    assert torch.equal(plain(network, x), wholes[0])
 
 
 def test_torch_transformer_layers_with_their_fast_path_come_out_the_same() -> None:
@@ -179,20 +176,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
 
 
 # ------------------------------------------------------------------ naming the layer
-
-
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("decoder.up1", LayerName("decoder.up1")),
-        ("relu#2", LayerName("relu", 2)),
-        ("a[hidden_states][3]", LayerName("a", None, ("hidden_states", "3"))),
-        ("a#12[0]", LayerName("a", 12, ("0",))),
-        (LayerName("a.b").of_output(("out", "1")), LayerName("a.b", None, ("out", "1"))),
-    ],
-)
-def test_a_name_has_its_parts(text: str, name: LayerName) -> None:
-    assert LayerName.parse(text) == name
 
 
 def with_an_unused_layer() -> nn.Module:

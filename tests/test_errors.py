@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pnpdepth_cli.core.user_code import describe, wrap_user_errors
-from pnpdepth_cli.errors import LayerError, ModelError
+from pnpdepth_cli.errors import LayerError, ModelError, describe, wrap_user_errors
 
 
 def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> None:
