@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pnpdepth_cli.errors import UsageError
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Image = NDArray[np.float32]
-    Counts = NDArray[np.float64]
+    Floats = NDArray[np.float64]
 
 DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of δ1 to δ3 (Eigen et al. 2014). The paper's KITTI rows use 1.01^k."""
@@ -63,27 +63,16 @@ class Pixels:
 
 
 OfPixels = Callable[[Pixels], "Tensor"]
-"""Of N pixels: a value of each, (N,), or a measure of all, a scalar."""
+"""Function of N pixels that returns a scalar."""
 
 
-def mean(term: OfPixels, factor: float = 1.0) -> OfPixels:
-    """Returns the formula factor · mean of the term."""
-    return lambda pixels: factor * term(pixels).mean()
+def _rms(values: Tensor) -> Tensor:
+    return values.square().mean().sqrt()
 
 
-def rms(term: OfPixels) -> OfPixels:
-    """Returns the formula √ mean of the squared term."""
-    return lambda pixels: term(pixels).square().mean().sqrt()
-
-
-def deviation(term: OfPixels, factor: float = 1.0) -> OfPixels:
-    """Returns the formula factor · standard deviation of the term."""
-    return lambda pixels: factor * (term(pixels) - term(pixels).mean()).square().mean().sqrt()
-
-
-def fraction_below(number: int) -> OfPixels:
-    """Returns the formula of δ: the fraction of pixels whose ratio is below a threshold."""
-    return mean(lambda pixels: (pixels.ratio < pixels.thresholds[number - 1]).double())
+def _fraction_below(pixels: Pixels, number: int) -> Tensor:
+    """δ: the fraction of pixels whose ratio is below a threshold."""
+    return (pixels.ratio < pixels.thresholds[number - 1]).double().mean()
 
 
 @dataclass(frozen=True)
@@ -117,9 +106,8 @@ class Measure:
     def heading(self) -> str:
         """A title such as `RMSE [m] ↓`."""
         unit = self.shown_unit or self.unit
-        unit = f" [{unit}]" if unit else ""
-        arrow = {"lower": " ↓", "higher": " ↑", "neither": ""}[self.better]
-        return f"{self.title}{unit}{arrow}"
+        arrow = {-1: " ↓", 0: "", 1: " ↑"}[self.sign]
+        return f"{self.title} [{unit}]{arrow}" if unit else f"{self.title}{arrow}"
 
     @property
     def sign(self) -> int:
@@ -134,7 +122,7 @@ class Measure:
             return f"{value:.{self.decimals}%}"
         return f"{value * self.shown_factor:,.{self.decimals}f} {unit}".rstrip()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Returns all but the formula."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
@@ -156,22 +144,22 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
 
 
 MEASURES = (
-    Measure("rmse", "RMSE", unit="m", main=True, of_pixels=rms(lambda p: p.error)),
-    Measure("mae", "MAE", unit="m", main=True, of_pixels=mean(lambda p: p.error.abs())),
-    Measure("mre", "MRE", main=True, of_pixels=mean(lambda p: p.error.abs() / p.truth)),
-    Measure("sq_rel", "SqRel", unit="m", of_pixels=mean(lambda p: p.error.square() / p.truth)),
-    Measure("log10", "log10", of_pixels=mean(lambda p: p.log_error.abs(), 1 / math.log(10))),
-    Measure("rmse_log", "RMSE log", of_pixels=rms(lambda p: p.log_error)),
-    Measure("irmse", "iRMSE", unit="1/km", decimals=2, of_pixels=rms(lambda p: p.inverse_error)),
+    Measure("rmse", "RMSE", unit="m", main=True, of_pixels=lambda p: _rms(p.error)),
+    Measure("mae", "MAE", unit="m", main=True, of_pixels=lambda p: p.error.abs().mean()),
+    Measure("mre", "MRE", main=True, of_pixels=lambda p: (p.error.abs() / p.truth).mean()),
+    Measure("sq_rel", "SqRel", unit="m", of_pixels=lambda p: (p.error.square() / p.truth).mean()),
+    Measure("log10", "log10", of_pixels=lambda p: 1 / math.log(10) * p.log_error.abs().mean()),
+    Measure("rmse_log", "RMSE log", of_pixels=lambda p: _rms(p.log_error)),
+    Measure("irmse", "iRMSE", unit="1/km", decimals=2, of_pixels=lambda p: _rms(p.inverse_error)),
     Measure(
-        "imae", "iMAE", unit="1/km", decimals=2, of_pixels=mean(lambda p: p.inverse_error.abs())
+        "imae", "iMAE", unit="1/km", decimals=2, of_pixels=lambda p: p.inverse_error.abs().mean()
     ),
     Measure(
         "silog",
         "SILog",
         unit="100·log m",
         decimals=2,
-        of_pixels=deviation(lambda p: p.log_error, 100),
+        of_pixels=lambda p: 100 * _rms(p.log_error - p.log_error.mean()),
     ),
     *(
         Measure(
@@ -181,7 +169,7 @@ MEASURES = (
             percent=True,
             decimals=2,
             main=number == 1,
-            of_pixels=fraction_below(number),
+            of_pixels=partial(_fraction_below, number=number),
         )
         for number in (1, 2, 3)
     ),
@@ -258,7 +246,7 @@ def _boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
 
 def _boundary_counts(
     predicted: Image, truth: Image, offsets: Sequence[tuple[int, int]], *, margin: int
-) -> Counts:
+) -> Floats:
     """(3, N, ratios) how many pixels have a farther neighbour, in each of N places of it.
 
     Pairs of known true depth count that are farther by the ratio in both images, in the prediction,
@@ -290,7 +278,7 @@ def _boundary_counts(
     return counts if pairs else counts * math.nan
 
 
-def _weigh(hits: Counts, of: Counts, weights: Sequence[float]) -> float:
+def _weigh(hits: Floats, of: Floats, weights: Sequence[float]) -> float:
     """The weighted mean of hits / of, which is 0 where there is nothing."""
     import numpy as np
 
@@ -340,7 +328,7 @@ def _sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float
     return float(area / by_sigma[0]) if by_sigma[0] else 0.0
 
 
-def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[Any, Any]:
+def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[Floats, Floats]:
     """(N,) absolute errors and standard deviations, float64, of the pixels with all three."""
     import numpy as np
 

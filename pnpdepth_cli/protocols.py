@@ -8,7 +8,7 @@ no library.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from pnpdepth_cli.errors import SizeError, UsageError
 
@@ -102,15 +102,11 @@ ODOMETRY_PART = FramePart(crop=(228, 912), anchor="bottom")
 """Parts of the seed paper (Wang et al. 2019, section on data sets), and of many after it."""
 
 
-class ForegroundFilter(NamedTuple):
-    """Removes points behind others: LiDAR points that the camera does not see.
+ForegroundFilter = tuple[int, float]
+"""(pixels, metres): removes LiDAR points that the camera does not see, behind others.
 
-    A point goes if another point in its window has, in its own window, a point that is nearer than
-    the first by more than `metres` (Conti et al. 2022).
-    """
-
-    window_px: int
-    metres: float
+A point goes if another point in its window of that many pixels has, in its own window, a point that
+is nearer than the first by more than those metres (Conti et al. 2022)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +191,7 @@ PROTOCOLS = {
             note="the paper resizes images to 640×480 and does not say how it draws its points",
         ),
         Protocol(name="marigold-dc-void", part=WHOLE),
-        Protocol(name="marigold-dc-lidar", part=WHOLE, foreground=ForegroundFilter(7, 1.5)),
+        Protocol(name="marigold-dc-lidar", part=WHOLE, foreground=(7, 1.5)),
         Protocol(
             name="omni-dc-nyu",
             part=NYU_PART,

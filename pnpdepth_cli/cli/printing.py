@@ -13,13 +13,16 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from pnpdepth_cli.cli.terminal import printable, say
-from pnpdepth_cli.commands.error_tables import (
+from pnpdepth_cli.commands.requests import check_outputs
+from pnpdepth_cli.commands.tables import (
+    Cell,
+    Table,
+    count_of,
     mean_weights_text,
     means_tables,
     refinement_tables,
+    write_text,
 )
-from pnpdepth_cli.commands.requests import check_outputs
-from pnpdepth_cli.commands.tables import Cell, Table, count_of, write_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.stages import GT

@@ -85,9 +85,9 @@ def evaluate(
         print_json(evaluation.to_json())
     elif not to_stdout:
         print_table(command.means_table(evaluation))
-    scored, frames = len(evaluation.scored), len(evaluation.frames)
-    if scored < frames:
-        raise FramesFailedError(f"{frames - scored:,} of {frames:,} frames were not scored")
+    frames = evaluation.counts["frames"]
+    if failed := frames - evaluation.counts["scored"]:
+        raise FramesFailedError(f"{failed:,} of {frames:,} frames were not scored")
 
 
 @click.command(short_help="Compare runs that eval or batch scored.")
@@ -141,13 +141,12 @@ def compare(
     """
     from pnpdepth_cli.cli.printing import check_tables, print_notes, print_table, write_tables
     from pnpdepth_cli.commands.evaluation import compare as command
-    from pnpdepth_cli.commands.evaluation.plot import plot_comparison
 
     inputs = [Path(run) for run in runs]
     check_tables(csv, latex, inputs=inputs, overwrite=overwrite, as_json=as_json)
     comparison = command.compare(runs, columns=columns)
     if plot is not None:
-        plot_comparison(comparison, plot, overwrite=overwrite)
+        command.plot_comparison(comparison, plot, overwrite=overwrite)
     print_notes(comparison.notes)
     table = command.comparison_table(comparison)
     methods = command.methods_table(comparison)

@@ -140,7 +140,7 @@ def interval(
 
     The jackknife leaves out one cluster after the other; its pseudo-values are a sample whose mean
     is the statistic. Each end is that of Student's t, or of t corrected for the skewness of the
-    sample (Hall 1992), whichever is farther out. NaN for fewer than MIN_CLUSTERS clusters.
+    sample (Hall 1992, equation 5), whichever is farther out. NaN for fewer than MIN_CLUSTERS.
 
     Args:
         statistic: Function of the mean of each run, or of as many means (G,), which it keeps apart.
@@ -161,19 +161,11 @@ def interval(
     if error > 1e-8 * max(abs(value), 1.0):
         skew = float(stats.skew(pseudo, bias=False)) / math.sqrt(size)
     reach = float(stats.t.ppf((1 + LEVEL) / 2, size - 1))
-    below, above = np.clip(
-        [_correct_for_skewness(reach, skew), -_correct_for_skewness(-reach, skew)],
-        reach,
-        _WIDEST * reach,
-    )
+    t = np.array([reach, -reach])
+    if abs(skew) >= 1e-6:
+        t = 3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1)
+    below, above = np.clip([t[0], -t[1]], reach, _WIDEST * reach).tolist()
     return value - below * error, value + above * error
-
-
-def _correct_for_skewness(t: float, skew: float) -> float:
-    """The value that t has in samples of this skewness over √n (Hall 1992, equation 5)."""
-    if abs(skew) < 1e-6:
-        return t
-    return float(3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1))
 
 
 def swap_p_value(first: Floats, other: Floats, clusters: Clusters) -> float:

@@ -1,20 +1,54 @@
-"""One table for every place it goes to: the terminal, CSV, LaTeX and the page of a report."""
+"""One table for every place it goes to: the terminal, CSV, LaTeX and the page of a report.
+
+The table of errors, of a refined frame or in the mean over a batch, has a row for each stage.
+"""
 
 from __future__ import annotations
 
+import csv
 import io
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
-from pnpdepth_cli.io.file_bytes import write_csv
-from pnpdepth_cli.measures import Measure
+from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.measures import MEASURES, Measure, choose_measures
+from pnpdepth_cli.stages import (
+    AFTER,
+    ALONE,
+    BASES,
+    BEFORE,
+    GT,
+    HELD_OUT,
+    LINEAR,
+    PROPAGATED,
+    UPDATED,
+    USED,
+)
 
 Style = Literal["", "bold", "dim", "good", "bad"]
+Errors = Mapping[str, Mapping[str, Scores]]
+"""Scores by basis, then by stage, as `FrameRecord.errors` has them."""
 
+_LINEAR = "linear interpolation of all points"
+_ROWS = {
+    BEFORE: ("{name}, aligned with the points", "before"),
+    UPDATED: ("{name}, z updated", "z updated"),
+    PROPAGATED: ("{name}, residual propagated", "residual propagated"),
+    ALONE: ("{fusing} alone", "included network alone"),
+    AFTER: ("fused ({weights})", "after"),
+    LINEAR: (_LINEAR, _LINEAR),
+}
+"""What the row of a stage is called: of a frame of the default method, and of a batch."""
+_OF_BATCH = {stage: row for stage, (_, row) in _ROWS.items()} | {
+    name: name for name in BASELINES if name != LINEAR
+}
 _LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -24,6 +58,7 @@ _LATEX = str.maketrans(
         "…": r"\ldots{}", "σ": r"$\sigma$", "\n": " ",
     }
 )  # fmt: skip
+_NAMED = 5  # of a long list
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
@@ -46,7 +81,7 @@ class Table:
     title: str = ""
     columns: Sequence[Measure | str]
     """A measure, or the heading of any other column."""
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Sequence[object]]
     """Texts, numbers, and None."""
 
     @property
@@ -60,10 +95,10 @@ class Table:
         return [list(map(_text, row)) for row in self.rows]
 
     def csv(self) -> str:
-        """Returns the cells as they are, below the keys of the measures, as `write_csv` does."""
+        """Returns the cells as they are, None as nothing, below the keys of the measures."""
         buffer = io.StringIO()
         keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
-        write_csv(buffer, keys, self.rows)
+        csv.writer(buffer, lineterminator="\n").writerows([keys, *self.rows])
         return buffer.getvalue()
 
     def latex(self) -> str:
@@ -79,7 +114,7 @@ class Table:
         return "\n".join(lines)
 
 
-def _text(cell: Any) -> str:
+def _text(cell: object) -> str:
     if isinstance(cell, str):
         return cell
     return "" if cell is None else f"{cell:,}"
@@ -90,9 +125,17 @@ def _in_latex(cell: str) -> str:
     return rf"\textbf{{{text}}}" if getattr(cell, "style", "") == "bold" else text
 
 
-def count_of(number: int, noun: str) -> str:
+def count_of(number: float, noun: str) -> str:
     """Returns a text such as `1 frame` or `2,000 frames`."""
     return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
+def some_names(names: Iterable[str]) -> str:
+    """Returns a few of the names on one line, and how many more there are."""
+    listed = list(names)
+    text = ", ".join(one_line(name) for name in listed[:_NAMED])
+    more = len(listed) - _NAMED
+    return f"{text} and {more:,} more" if more > 0 else text
 
 
 def write_text(path: Path, text: str) -> None:
@@ -100,3 +143,113 @@ def write_text(path: Path, text: str) -> None:
     make_folder(path.parent)
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
+
+
+def bases_of(errors: Errors) -> list[str]:
+    """Returns what errors are shown on: ground truth and held-out points, else the best."""
+    found = [basis for basis in BASES if errors.get(basis)]
+    return [basis for basis in found if basis in (GT, HELD_OUT)] or found[:1]
+
+
+def means_tables(errors: Errors, unit: str, keys: Sequence[str] | None = None) -> list[Table]:
+    """Returns the mean errors of a batch on each basis; its measures have these keys."""
+    bases = bases_of(errors)
+    return [_table("means", basis, errors[basis], unit, _OF_BATCH, keys) for basis in bases]
+
+
+def refinement_tables(record: FrameRecord) -> list[Table]:
+    """Returns the errors of a record on each basis."""
+    assert record.method is not None
+    assert record.model is not None
+    title = f"{record.model.name} cut at {record.settings.get('layer')}"
+    if record.method.kind == "default":
+        title = " + ".join(record.method.networks)
+    of_one = sum(weight > 0 for weight in record.weights.values()) == 1
+    tables = []
+    for basis in bases_of(record.errors):
+        stages = dict(record.errors[basis])
+        # The result is no stage of its own where one expert, the network, has all the weight.
+        if of_one and PROPAGATED in stages and ALONE not in stages:
+            del stages[AFTER]
+        tables.append(_table(title, basis, stages, record.unit, _titles(record)))
+    return tables
+
+
+def _table(
+    about: str,
+    basis: str,
+    stages: Mapping[str, Scores],
+    unit: str,
+    titles: Mapping[str, str],
+    keys: Sequence[str] | None = None,
+) -> Table:
+    """A row for each stage in the order of the titles: its errors, also against linear ones."""
+    shown = [stage for stage in titles if stage in stages]
+    last = AFTER if AFTER in stages else PROPAGATED
+    scores, linear = stages[last], stages.get(LINEAR, {}).get("mae")
+    chosen = choose_measures(MEASURES, keys)
+    measures = [m for m in chosen if m.key in scores and (keys or m.main)]
+    # How many pixels, points or frames they are of.
+    count = f"{scores.get('points'):,} points" if "points" in scores else ""
+    if "frames" in scores:
+        count = f"{scores['frames']:,} frames"
+    elif "coverage" in scores:
+        count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
+    remark = ", where a change proves nothing" * (basis == USED)
+    # The rows.
+    rows = []
+    for stage in shown:
+        own = stages[stage]
+        style: Style = "bold" if stage == last else ""
+        texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
+        against = Cell("") if stage == LINEAR else change(linear, own.get("mae"))
+        rows.append([*(Cell(text, style) for text in (titles[stage], *texts)), against])
+    return Table(
+        title=f"{about}: errors {BASES[basis]}{remark}, {count}",
+        columns=["", *(measure.title for measure in measures), "MAE vs linear"],
+        rows=rows,
+    )
+
+
+def _titles(record: FrameRecord) -> dict[str, str]:
+    """The rows of a frame, by stage."""
+    assert record.method is not None
+    assert record.model is not None
+    if record.method.kind == "default":
+        names = record.method.networks
+        of = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
+        return {stage: title.format(**of) for stage, (title, _) in _ROWS.items()}
+    name, settings = record.model.name, record.settings
+    before = f"{name}, aligned with the points" if settings["align"] != "none" else name
+    steps = [f"{settings['iterations']} updates of z"] if settings["iterations"] else []
+    steps += ["residual propagated"] if settings["propagate"] != "none" else []
+    return {BEFORE: before, AFTER: ", ".join([name, *steps]), LINEAR: _LINEAR}
+
+
+def names_of_depths(record: FrameRecord) -> tuple[str, str]:
+    """Returns what the depth before and the depth after of a record are of, in a few words."""
+    assert record.method is not None
+    titles, name = _titles(record), record.method.networks[0]
+    alone = all(weight == 0 for expert, weight in record.weights.items() if expert != name)
+    return titles[BEFORE], titles[PROPAGATED if alone and PROPAGATED in titles else AFTER]
+
+
+def weights_text(weights: Mapping[str, float]) -> str:
+    """Returns the weights of experts as text, without those below half a per cent."""
+    return ", ".join(f"{name} {w:.0%}" for name, w in weights.items() if w >= 0.005)
+
+
+def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
+    """Returns mean and range of each expert's weight in the frames of a batch, as text."""
+    return ", ".join(
+        f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})"
+        for name, each in weights.items()
+    )
+
+
+def change(before: float | None, after: float | None) -> Cell:
+    """Returns how much an error rose or fell in per cent, as a good or a bad cell."""
+    if not before or after is None or math.isnan(before - after):
+        return Cell("–", "dim")
+    rise = after / before - 1
+    return Cell(f"{rise:+.1%}", "good" if rise < 0 else "bad" if rise > 0 else "dim")

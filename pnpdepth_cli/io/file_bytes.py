@@ -5,7 +5,6 @@ The budget is that of `pnpdepth_cli.budget`. JSON is written whole.
 
 from __future__ import annotations
 
-import csv
 import functools
 import hashlib
 import json
@@ -13,10 +12,10 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -337,8 +336,3 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
             raise FileFormatError(f"{path}, line {number}: {shown!r} is not {count} numbers")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
-
-
-def write_csv(file: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Writes RFC 4180 with lines that end in \\n, None as nothing."""
-    csv.writer(file, lineterminator="\n").writerows([header, *rows])

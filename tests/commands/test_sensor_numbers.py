@@ -182,7 +182,7 @@ def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
     request = EvalRequest(prediction=tmp_path / "prediction.npy", ground_truth=tmp_path / "gt.npy")
     result = evaluate(request)
     assert result.mean["mae"] == pytest.approx(0.25, abs=1e-5)
-    assert result.pixels == np.count_nonzero(truth)
+    assert result.counts["pixels"] == np.count_nonzero(truth)
     assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
     files = {"depth": tmp_path / "gt.npy", "output": tmp_path / "sparse.npy"}
     drawn, _, _ = sample_depth(pattern=SamplePattern(count=3000), **files)

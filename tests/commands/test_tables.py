@@ -9,12 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.error_tables import (
-    change,
-    means_tables,
-    names_of_depths,
-    refinement_tables,
-)
 from pnpdepth_cli.commands.evaluation.compare import (
     ComparedRun,
     Comparison,
@@ -23,7 +17,13 @@ from pnpdepth_cli.commands.evaluation.compare import (
     methods_table,
 )
 from pnpdepth_cli.commands.statistics import find_clusters
-from pnpdepth_cli.commands.tables import Table
+from pnpdepth_cli.commands.tables import (
+    Table,
+    change,
+    means_tables,
+    names_of_depths,
+    refinement_tables,
+)
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 
@@ -120,6 +120,11 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         ["nearest", "3.0000 m", "4.0000 m"],
     ]
     assert means_tables({}, "m") == []
+
+
+def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:
+    table = Table(columns=["name", MEASURES[0]], rows=[["a,b", -1.5], ["c", None]])
+    assert table.csv() == 'name,rmse\n"a,b",-1.5\nc,\n'
 
 
 def styled(table: Table) -> list[list[tuple[str, str]]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import time
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from pnpdepth_cli.io.file_bytes import (
     is_unchanged,
     read_json,
     sha256_of,
-    write_csv,
     write_json,
 )
 
@@ -66,12 +64,6 @@ def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes | None
     with pytest.raises(InputError if content is None else FileFormatError, match=r"r\.json") as no:
         read_json(path)
     assert "\n" not in str(no.value)
-
-
-def test_a_csv_has_lines_that_end_in_a_newline_and_none_is_empty() -> None:
-    file = io.StringIO()
-    write_csv(file, ["name", "x"], [["a,b", -1.5], ["c", None]])
-    assert file.getvalue() == 'name,x\n"a,b",-1.5\nc,\n'
 
 
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:

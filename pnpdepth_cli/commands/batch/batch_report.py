@@ -14,23 +14,10 @@ from pathlib import Path
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.records import BatchSummary
-from pnpdepth_cli.commands.error_tables import (
-    bases_of,
-    mean_weights_text,
-    means_tables,
-    weights_text,
-)
+from pnpdepth_cli.commands.tables import bases_of, mean_weights_text, means_tables, weights_text
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.report import (
-    IMAGES,
-    Head,
-    check_report_folder,
-    image_key,
-    link_image,
-    save_view_3d,
-    write_report,
-)
+from pnpdepth_cli.io import report
 from pnpdepth_cli.measures import MEASURES, Measure
 from pnpdepth_cli.stages import AFTER, BASES, BEFORE, GT, USED, VALIDATION
 
@@ -64,7 +51,7 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
             f" {request.output / 'report'}"
         )
     overwrite = request.refine.overwrite
-    check_report_folder(folder, made_of=_source(request, folder), overwrite=overwrite)
+    report.check_report_folder(folder, made_of=_source(request, folder), overwrite=overwrite)
 
 
 def write_batch_report(
@@ -82,15 +69,30 @@ def write_batch_report(
         records: The records of the frames.
     """
     results = [record for record in records if record.outputs]
-    failed = [(record.name, record.message or "") for record in records if not record.outputs]
     basis = next(iter(bases_of(summary.errors)), USED)
-    head = _head(summary, basis, results, failed)
+    columns, notes = _columns(basis, summary.unit), [*summary.notes]
+    if summary.unmatched:
+        unmatched = f"{len(summary.unmatched):,} files"
+        notes.append(f"warning: {unmatched} are in no frame; summary.json has them")
+    if results and basis == USED:
+        notes.append("Without ground truth or --holdout, no error is measured.")
+    head = report.Head(
+        title=summary.output,
+        facts=_facts(summary, results),
+        notes=notes,
+        tables=means_tables(summary.errors, summary.unit, summary.columns),
+        without=[(record.name, record.message or "") for record in records if not record.outputs],
+        columns=columns,
+        signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],
+        sort_by="rmse_after" if basis == USED else columns[0].key,
+        unit=summary.unit,
+    )
 
     def entries(images: Path) -> Iterator[dict[str, object]]:
         for record in results:
-            yield _entry(record, basis, head.columns) | _views(record, request, images)
+            yield _entry(record, basis, columns) | _views(record, request, images)
 
-    write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
+    report.write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
@@ -118,42 +120,39 @@ def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str
     There are none of a result whose images were deleted.
     """
     files = {kind: request.output / path for kind, path in record.outputs.items()}
-    key, views, figures = image_key(record.name), dict[str, object](), record.figures
+    key, views, figures = report.image_key(record.name), dict[str, object](), record.figures
     there = all(kind in files and files[kind].exists() for kind in figures)
     if "preview" not in figures or not there:
         return {"key": None}
     for kind, figure in figures.items():
         name = f"{key}_{kind}.png"
-        link_image(files[kind], images / name)
+        report.link_image(files[kind], images / name)
         for view, title in _LABELS.items():
             if title in figure.panels:
-                box, src = figure.panels[title], f"{IMAGES}/{name}"
+                box, src = figure.panels[title], f"{report.IMAGES}/{name}"
                 views[view] = {"src": src, "box": box, "size": figure.size}
     view_mb = None
     if request.html_3d and "view" in files:
-        view_mb = save_view_3d(files["view"], images / f"{key}_view.js")
+        view_mb = report.save_view_3d(files["view"], images / f"{key}_view.js")
     gains = figures.get("improvement")
-    return {
-        "key": key,
-        "views": views,
-        "view_mb": view_mb,
-        "scale_m": figures["preview"].scale_m,
-        "map": gains and {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer},
-    }
+    of_gains = gains and {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer}
+    scale_m = figures["preview"].scale_m
+    return {"key": key, "views": views, "view_mb": view_mb, "scale_m": scale_m, "map": of_gains}
 
 
 def _columns(basis: str, unit: str) -> list[Measure]:
     """Errors before and after on a basis; with changes unless it is the points used."""
     columns = []
-    shown = [m for m in MEASURES if m.key == "mae" or (m.key == "rmse" and basis != VALIDATION)]
-    for measure in shown:
-        key, title = measure.key, measure.title
-        if basis != USED:
-            change = replace(measure, key=f"{key}{_CHANGE}", title=f"{title} change", unit="")
-            columns.append(replace(change, percent=True, decimals=1))
-        for stage in ("before", "after"):
-            before_or_after = replace(measure, key=f"{key}_{stage}", title=f"{title} {stage}")
-            columns.append(replace(before_or_after, unit=unit))
+    for measure in MEASURES:
+        if measure.key == "mae" or (measure.key == "rmse" and basis != VALIDATION):
+            key, title = measure.key, measure.title
+            if basis != USED:
+                change = replace(measure, key=f"{key}{_CHANGE}", title=f"{title} change", unit="")
+                columns.append(replace(change, percent=True, decimals=1))
+            columns += [
+                replace(measure, key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
+                for stage in (BEFORE, AFTER)
+            ]
     return columns
 
 
@@ -177,32 +176,6 @@ def _notes(record: FrameRecord, basis: str) -> list[str]:
     if record.weights:
         notes.append(f"Weights: {weights_text(record.weights)}.")
     return [*notes, *record.warnings]
-
-
-def _head(
-    summary: BatchSummary,
-    basis: str,
-    results: Sequence[FrameRecord],
-    failed: list[tuple[str, str]],
-) -> Head:
-    unit, unmatched, notes = summary.unit, len(summary.unmatched), [*summary.notes]
-    if unmatched:
-        notes.append(f"warning: {unmatched:,} files are in no frame; summary.json has them")
-    if results and basis == USED:
-        notes.append("Without ground truth or --holdout, no error is measured.")
-    # The columns and tables.
-    columns = _columns(basis, unit)
-    return Head(
-        title=summary.output,
-        facts=_facts(summary, results),
-        notes=notes,
-        tables=means_tables(summary.errors, unit, summary.columns),
-        without=failed,
-        columns=columns,
-        signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],
-        sort_by="rmse_after" if basis == USED else columns[0].key,
-        unit=unit,
-    )
 
 
 def _facts(summary: BatchSummary, results: Sequence[FrameRecord]) -> list[tuple[str, str]]:

@@ -15,9 +15,8 @@ from pnpdepth_cli.commands.batch.records import (
     remove_all_leftovers,
     write_summary,
 )
-from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.ordered_pool import in_order
-from pnpdepth_cli.commands.tables import count_of
+from pnpdepth_cli.commands.tables import count_of, names_of_depths
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder

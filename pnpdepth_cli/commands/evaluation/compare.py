@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands import statistics
 from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, scoring_of
-from pnpdepth_cli.commands.evaluation.pairing import some_names
-from pnpdepth_cli.commands.statistics import (
-    Clusters,
-    find_clusters,
-    gain,
-    holm,
-    interval,
-    swap_p_value,
-)
-from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of
+from pnpdepth_cli.commands.requests import check_outputs
+from pnpdepth_cli.commands.statistics import Clusters, find_clusters
+from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import groups_by_name
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
 from pnpdepth_cli.protocols import find_protocol
@@ -36,6 +31,10 @@ Means = dict[str, float | None]
 ALPHA = 0.05
 _SUMMARY = "summary.json"
 _STARS = (0.05, 0.01, 0.001)
+_CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
+"""Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
+_SIDE_INCHES = 3.2
+_SEED = "seed"  # an option whose values are draws of the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,22 +46,15 @@ class Run:
     path: str
     measures: list[Measure]
     """Measures that all frames have."""
-    scoring: dict[str, Any]
-    frames: dict[str, FrameRecord]
-    """The frames with scores, by name."""
-    stage: str
-    """BEFORE or AFTER: the depth that is compared."""
+    scoring: dict[str, object]
+    scores: dict[str, Scores]
+    """What is compared, by frame."""
+    before: dict[str, Scores]
+    """Scores before refinement, where the frame has them."""
+    groups: dict[str, str | None]
+    """The sequence that the data set says a frame is of."""
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
-
-    def scores(self, frame: str, stage: str = "") -> Scores:
-        """Returns the scores of a frame at that stage, else at the run's own."""
-        return self.frames[frame].errors[GT].get(stage or self.stage, {})
-
-    def means(self, frames: Sequence[str], keys: Sequence[str], stage: str = "") -> Means:
-        """Returns the means of these values over these frames at that stage, else its own."""
-        scores = (self.scores(frame, stage) for frame in frames)
-        return frame_means({key: own.get(key) for key in keys} for own in scores)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,17 +93,16 @@ class Comparison:
 
     frames: tuple[str, ...]
     measures: tuple[Measure, ...]
-    scoring: dict[str, Any]
+    scoring: dict[str, object]
     runs: tuple[ComparedRun, ...]
     clusters: Clusters
     notes: list[str]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Returns what `--json` prints."""
         measures = [measure.to_json() for measure in self.measures]
         own = {"clusters": self.clusters.to_json(), "measures": measures}
-        result: dict[str, Any] = plain({"command": "compare", **vars(self), **own})
-        return result
+        return {"command": "compare", **plain(vars(self) | own)}
 
 
 def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Comparison:
@@ -120,25 +111,27 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
 
     Args:
-        paths: Files as `read_run` takes them; the first is the reference.
+        paths: Outputs of `pnpdepth eval --json`, summaries of batches, or the folders of these; the
+            first is the reference. `FILE:before` is the prediction that a refinement started from.
         columns: Keys of the measures to compare by, instead of the main ones.
 
     Raises:
         UsageError: For fewer than two runs.
+        FileFormatError: For a file without scores.
         InputError: If they were scored by different rules, or have no frame in common.
     """
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
-    runs = [read_run(path) for path in paths]
+    runs = [_read_run(path) for path in paths]
     names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
-    scores = [[[*map(run.scores(name).get, keys)] for name in names] for run in runs]
+    scores = [[[*map(run.scores[name].get, keys)] for name in names] for run in runs]
     values = np.array(scores, np.float64)  # (runs, frames, measures)
     known = np.asarray(np.isfinite(values).all(axis=0))
     values[:, ~known] = math.nan
     # the tests, over frames that count as independent
     by_name = zip(names, groups_by_name(names), strict=True)
-    groups = [runs[0].frames[name].group or group for name, group in by_name]
+    groups = [runs[0].groups[name] or group for name, group in by_name]
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [
         frame_means(dict(zip(keys, row, strict=True)) for row in of_run)
@@ -148,26 +141,32 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     run_names = [run.name for run in runs]
     if len({*run_names}) < len(runs):
         run_names = [run.path for run in runs]
-    compared = zip(runs, run_names, means, [{}, *gains], strict=True)
-    return Comparison(
-        frames=names,
-        measures=measures,
-        scoring=runs[0].scoring,
-        runs=tuple(
+    compared = []
+    for run, name, mean, of_first in zip(runs, run_names, means, gains, strict=True):
+        coverage = _means([run.scores[name] for name in names], [COVERAGE.key])
+        compared.append(
             ComparedRun(
                 name=name,
                 path=run.path,
                 mean=mean,
-                before=run.means(names, keys, BEFORE),
+                before=_means([run.before[name] for name in names], keys),
                 varied=run.varied,
-                coverage=run.means(names, [COVERAGE.key])[COVERAGE.key],
+                coverage=coverage[COVERAGE.key],
                 gains=of_first,
             )
-            for run, name, mean, of_first in compared
-        ),
+        )
+    return Comparison(
+        frames=names,
+        measures=measures,
+        scoring=runs[0].scoring,
+        runs=tuple(compared),
         clusters=clusters,
-        notes=[*_notes(runs, names, measures, known, clusters)],
+        notes=[*_notes(runs, compared, names, measures, known, clusters)],
     )
+
+
+def _means(scores: Sequence[Scores], keys: Sequence[str]) -> Means:
+    return frame_means({key: own.get(key) for key in keys} for own in scores)
 
 
 def _shared(
@@ -183,9 +182,9 @@ def _shared(
                     f"{first.path} and {run.path} were scored by different rules ({rule} {own} and"
                     f" {others}); score both by one protocol"
                 )
-    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
+    names = tuple(name for name in first.scores if all(name in run.scores for run in runs))
     if not names:
-        own, other = (some_names(run.frames) or "none" for run in (first, runs[-1]))
+        own, other = (some_names(run.scores) or "none" for run in (first, runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
     every = [measure for measure in first.measures if measure.key in shared]
@@ -198,31 +197,30 @@ def _gains(
     measures: Sequence[Measure],
     clusters: Clusters,
 ) -> list[dict[str, Gain]]:
-    """The gain of each run but the first by measure, of values (runs, frames, measures)."""
+    """The gains of each run by measure, none of the first, of values (runs, frames, measures)."""
     first, *others = values.transpose(0, 2, 1)
-    p_values = [
-        [swap_p_value(*pair, clusters) for pair in zip(first, other, strict=True)]
-        for other in others
-    ]
-    adjusted = holm(np.array(p_values)).tolist()
-    gains: list[dict[str, Gain]] = [{} for _ in others]
-    for run, place in np.ndindex(len(others), len(measures)):
-        measure = measures[place]
-        change = functools.partial(gain, sign=measure.sign)
-        before, after = np.array([each[measure.key] for each in (means[0], means[run + 1])], float)
-        low, high = interval(change, (first[place], others[run][place]), clusters)
-        gains[run][measure.key] = Gain(
+    swap = functools.partial(statistics.swap_p_value, clusters=clusters)
+    p_values = np.array([[*map(swap, first, other)] for other in others])
+    adjusted = statistics.holm(p_values)
+    gains = [dict[str, Gain]() for _ in values]
+    for (run, place), p_value in np.ndenumerate(p_values):
+        key, sign = measures[place].key, measures[place].sign
+        before, after = np.array([each[key] for each in (means[0], means[run + 1])], float)
+        change = functools.partial(statistics.gain, sign=sign)
+        low, high = statistics.interval(change, (first[place], others[run][place]), clusters)
+        gains[run + 1][key] = Gain(
             percent=float(change(before, after)),
             low_percent=low,
             high_percent=high,
-            p_value=p_values[run][place],
-            p_adjusted=adjusted[run][place],
+            p_value=float(p_value),
+            p_adjusted=float(adjusted[run, place]),
         )
     return gains
 
 
 def _notes(
     runs: Sequence[Run],
+    compared: Sequence[ComparedRun],
     names: Sequence[str],
     measures: Sequence[Measure],
     known: NDArray[np.bool_],
@@ -231,15 +229,14 @@ def _notes(
     """What not all runs scored, and whether frames are too dependent or too few to conclude."""
     # Frames, pixels and measures that not all runs have.
     for run in runs:
-        if unshared := [name for name in run.frames if name not in names]:
+        if unshared := [name for name in run.scores if name not in names]:
             yield (
                 f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
                 f" left out: {some_names(unshared)}"
             )
-    pixels = (len({run.scores(name).get("pixels") for run in runs}) for name in names)
+    pixels = (len({run.scores[name].get("pixels") for run in runs}) for name in names)
     if others := sum(count > 1 for count in pixels):
-        means = (run.means(names, [COVERAGE.key])[COVERAGE.key] for run in runs)
-        shares = ", ".join(map(COVERAGE.text, means))
+        shares = ", ".join(COVERAGE.text(run.coverage) for run in compared)
         yield (
             f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
             f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
@@ -260,17 +257,8 @@ def _notes(
         )
 
 
-def read_run(text: str) -> Run:
-    """Returns the run in a file, or in the summary of a batch's folder.
-
-    A run is the output of `pnpdepth eval --json`, or a batch's summary.
-
-    Args:
-        text: The path; `FILE:before` means the prediction that a refinement started from.
-
-    Raises:
-        FileFormatError: For a file without scores.
-    """
+def _read_run(text: str) -> Run:
+    """The run in a file, or in the summary of a batch's folder."""
     # The file, and which side of the refinement.
     path, stage = Path(text), AFTER
     if text.endswith(f":{BEFORE}") and not path.exists():
@@ -282,17 +270,18 @@ def read_run(text: str) -> Run:
     try:
         records = [FrameRecord.from_json(entry, path) for entry in content.get("frames") or ()]
         frames = {f.name: f for f in records if f.status != "failed" and GT in f.errors}
-        scores = [frame.errors[GT][stage] for frame in frames.values()]
+        scores = {name: frame.errors[GT][stage] for name, frame in frames.items()}
         if not scores:
             raise ValueError("no frame has scores")
         measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
-            measures=[m for m in measures if all(m.key in own for own in scores)],
+            measures=[m for m in measures if all(m.key in own for own in scores.values())],
             scoring=dict(content.get("scoring") or scoring_of(find_protocol("paper"))),
-            frames=frames,
-            stage=stage,
+            scores=scores,
+            before={name: frame.errors[GT].get(BEFORE, {}) for name, frame in frames.items()},
+            groups={name: frame.group for name, frame in frames.items()},
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -361,3 +350,79 @@ def _describe_tests(comparison: Comparison) -> str:
     tests = count_of(measures, "measure") + (f" of {others} runs" if others > 1 else "")
     tested = f"over {comparison.clusters.text}, p adjusted for {tests} (Holm)"
     return tested + WITHOUT_SPARSE * bool(comparison.scoring.get("exclude_sparse"))
+
+
+def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = False) -> None:
+    """Writes a plot of each measure over a varied option, and of its improvement by refinement.
+
+    Numbers, and of several options the one of most values, lie along the axis; each combination of
+    the others is a line. A point is the mean over random seeds, where these vary. The means before
+    refinement are dashed; the improvement is in per cent of them.
+
+    Raises:
+        UsageError: The runs are not of `batch --vary` with the same options, the suffix is of no
+            known format, or matplotlib is not installed.
+        OutputError: The file exists and is not to be replaced.
+    """
+    if path.suffix not in _CHANGING:
+        raise UsageError(f"--plot {path}: name a file that ends in {', '.join(_CHANGING)}")
+    check_outputs([path], overwrite=overwrite)
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
+    # where each value lies, and the runs of each line in this order
+    across, positions = _axis(comparison.runs)
+    lines = defaultdict[str, dict[float, list[ComparedRun]]](dict)
+    for run in sorted(comparison.runs, key=lambda run: positions[run.varied[across]]):
+        others = [f"{k}={value}" for k, value in run.varied.items() if k not in (across, _SEED)]
+        lines[", ".join(others)].setdefault(positions[run.varied[across]], []).append(run)
+    # a column of two panels for each measure
+    measures = comparison.measures
+    size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
+    with mpl.rc_context({"svg.hashsalt": "pnpdepth", "font.size": 8, "axes.grid": True}):
+        figure = Figure(size, layout="constrained", dpi=150)
+        panels = figure.subplots(2, len(measures), squeeze=False, sharex=True)
+        for measure, above, below in zip(measures, *panels, strict=True):
+            for number, (label, line) in enumerate(lines.items()):
+                x, key = [*line], measure.key
+                means = [
+                    np.mean(np.array([[run.before[key], run.mean[key]] for run in runs], float), 0)
+                    for runs in line.values()
+                ]  # None becomes NaN
+                before, after = np.array(means).T * measure.shown_factor
+                improved = statistics.gain(before, after, measure.sign)
+                above.plot(x, before, f"C{number}--", linewidth=0.8)
+                above.plot(x, after, f"C{number}o-", label=label or "after refinement")
+                below.plot(x, improved, f"C{number}o-")
+            above.set_ylabel(measure.heading)
+            below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=across)
+            below.set_xscale("log" if min(positions.values()) > 0 else "linear")
+            below.set_xticks([*positions.values()], [*positions])
+            below.set_xticks([], minor=True)
+        panels[0][0].plot([], "k--", linewidth=0.8, label="before refinement")
+        figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center")
+        with atomic_path(path) as temporary:
+            metadata = {_CHANGING[path.suffix]: None}
+            figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)
+
+
+def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:
+    """The option that lies along the axis, and where its values do: names from 0 on."""
+    options = {tuple(run.varied) for run in runs}
+    if len(options) > 1 or () in options:
+        raise UsageError("--plot needs results of `batch --vary`, all of the same options")
+    names = [name for name in options.pop() if name != _SEED] or [_SEED]
+    values = {name: [*dict.fromkeys(run.varied[name] for run in runs)] for name in names}
+    across = max(values, key=lambda name: (_numbers(values[name]) is not None, len(values[name])))
+    places = {value: float(place) for place, value in enumerate(values[across])}
+    return across, _numbers(values[across]) or places
+
+
+def _numbers(texts: Sequence[str]) -> dict[str, float] | None:
+    """The number that each of the texts is; None if one is none."""
+    try:
+        return {text: float(text.removesuffix("%")) for text in texts}
+    except ValueError:
+        return None

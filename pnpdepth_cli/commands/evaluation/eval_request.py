@@ -10,14 +10,7 @@ from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.measures import (
-    MEASURES,
-    OF_SIGMA,
-    Measure,
-    by_depth,
-    choose_measures,
-    parse_keys,
-)
+from pnpdepth_cli.measures import MEASURES, OF_SIGMA, Measure, by_depth, choose_measures, parse_keys
 from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
 

@@ -2,37 +2,41 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.eval_request import (
-    WITHOUT_SPARSE,
-    EvalRequest,
-    scoring_of,
-)
+from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest, scoring_of
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
-from pnpdepth_cli.commands.evaluation.pairing import pair_frames, some_names
-from pnpdepth_cli.commands.evaluation.scoring import FILES, score_pair, scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
+from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.stopwatch import versions
-from pnpdepth_cli.commands.tables import Table, count_of
+from pnpdepth_cli.commands.tables import Table, count_of, some_names
+from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import scale_warning
-from pnpdepth_cli.io.file_bytes import one_line, plain
+from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
+from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, scale_warning
+from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, frame_means
 from pnpdepth_cli.points import METRES
+from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _LISTED = 3
 _COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
+_MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)
+# KITTI's selection names the kind of file in the middle.
+_KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +46,13 @@ class Evaluation:
     request: EvalRequest
     frames: list[FrameRecord]
     """The scores of each frame of the ground truth, in its order."""
+    counts: dict[str, float]
+    """Number of frames, and of those in the means; number of pixels that are scored in these, and
+    the fraction of their ground truth that has a prediction."""
     measures: tuple[Measure, ...]
     """Measures of the request, and of the standard deviation where a frame has one."""
+    shown: tuple[Measure, ...]
+    """Measures of the tables."""
     mean: dict[str, float | None]
     """Mean of each measure; None where no frame has it."""
     interval: dict[str, tuple[float, float]] | None
@@ -51,51 +60,25 @@ class Evaluation:
     clusters: Clusters
     notes: list[str]
 
-    @property
-    def scored(self) -> list[FrameRecord]:
-        """The frames that are in the means."""
-        return [frame for frame in self.frames if frame.status == "done"]
-
-    @property
-    def pixels(self) -> int:
-        """Number of scored pixels of all frames in the means."""
-        return int(sum(_numbers(self.scored, "pixels")))
-
-    @property
-    def coverage(self) -> float:
-        """Fraction of the ground truth of the frames in the means that has a prediction."""
-        known = sum(_numbers(self.scored, "known"))
-        return sum(_numbers(self.scored, "predicted")) / known if known else math.nan
-
-    @property
-    def shown(self) -> tuple[Measure, ...]:
-        """The measures of tables."""
-        return self.measures if self.request.columns is None else self.request.shown
-
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Returns what `--json` prints and `pnpdepth compare` reads; NaN and infinity are null."""
         # What was scored and how, the results, and the frames.
         request = self.request
-        return dict(plain({
+        return {
             "command": "eval",
             "versions": versions(),
-            "prediction": request.prediction,
-            "truth": request.ground_truth,
+            "prediction": str(request.prediction),
+            "truth": str(request.ground_truth),
             "protocol": request.protocol,
             "scoring": scoring_of(request.rules, request.scale_by),
             "measures": [measure.to_json() for measure in self.measures],
-            "counts": {
-                "frames": len(self.frames),
-                "scored": len(self.scored),
-                "pixels": self.pixels,
-                "coverage": self.coverage,
-            },
-            "mean": self.mean,
-            "interval": self.interval,
+            "counts": plain(self.counts),
+            "mean": plain(self.mean),
+            "interval": plain(self.interval),
             "clusters": self.clusters.to_json(),
             "frames": [frame.to_json() for frame in self.frames],
             "notes": self.notes,
-        }))  # fmt: skip
+        }
 
 
 def evaluate(
@@ -112,25 +95,23 @@ def evaluate(
     Raises:
         PnpDepthError: For what concerns all frames, or if none could be scored.
     """
-    pairs, notes = pair_frames(request.prediction, request.ground_truth, request.rules.part)
+    pairs, notes = _pair_frames(request.prediction, request.ground_truth, request.rules.part)
     rows: list[FrameRecord] = []
-    for row in in_order(lambda pair: score_pair(pair, request), pairs, THREADS):
+    for row in in_order(lambda pair: score_frame(*pair, request), pairs, THREADS):
         rows.append(row)
         on_frame(len(rows), len(pairs))
-    scored = [row for row in rows if row.status == "done"]
-    if not scored:
+    if not (scored := [row for row in rows if row.status == "done"]):
         raise InputError(f"no frame could be scored; the first: {rows[0].message}")
     # means, and how sure they are over frames that count as independent
     scores = [scores_of(row) for row in scored]
     of_sigma = [m for m in OF_SIGMA if any(m.key in each for each in scores)]
     measures = (*request.measures, *of_sigma)
-    keys = [measure.key for measure in measures]
-    values = np.array([[each.get(key) for key in keys] for each in scores], np.float64)
-    mean = frame_means({key: each.get(key) for key in keys} for each in scores)
+    measured = [{m.key: each.get(m.key) for m in measures} for each in scores]
+    mean, values = frame_means(measured), np.array([[*each.values()] for each in measured], float)
     clusters = find_clusters([row.group or "" for row in scored], values)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
-        mean |= dict(zip(keys, exact, strict=False))
+        mean |= dict(zip(mean, exact, strict=False))
     ends = {}
     for measure, column in zip(measures, values.T, strict=True):
         if clusters.count >= MIN_CLUSTERS:
@@ -143,17 +124,120 @@ def evaluate(
             f"no interval: {clusters.text} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"
         )
-    notes += _notes_on_files(rows)
-    notes += _notes_on_depths(scored, request)
     return Evaluation(
         request=request,
         frames=rows,
+        counts={
+            "frames": len(rows),
+            "scored": len(scored),
+            "pixels": sum(_numbers(scored, "pixels")),
+            "coverage": sum(_numbers(scored, "predicted")) / sum(_numbers(scored, "known")),
+        },
         measures=measures,
+        shown=measures if request.columns is None else request.shown,
         mean=mean,
         interval=ends or None,
         clusters=clusters,
-        notes=notes,
+        notes=[*notes, *_notes_on_files(rows), *_notes_on_depths(scored, request)],
     )
+
+
+def _pair_frames(
+    prediction: Path, ground_truth: Path, part: FramePart | None
+) -> tuple[list[tuple[FrameFiles, ResultFrame | None]], list[str]]:
+    """The frames of the ground truth in its order, each with its prediction, and notes."""
+    # Two files, two folders, or a folder and a data set.
+    for path in (prediction, ground_truth):
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder; check the path")
+    layout, frames = _data_set(prediction, ground_truth)
+    if prediction.is_dir() != (layout is not None or ground_truth.is_dir()):
+        raise UsageError(
+            f"give two files, two folders, or a folder and a data set: {prediction}, {ground_truth}"
+        )
+    # The predictions by name, and the frames with ground truth.
+    notes: list[str] = []
+    predictions = _depth_files(prediction)
+    if layout is not None:
+        frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
+        if not frames:
+            raise InputError(
+                f"{ground_truth} looks like {layout!r}, and no frame in it has ground truth"
+            )
+        cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
+        note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
+        notes.append(note + (f", of which {cuts} is used" if cuts else ""))
+    elif ground_truth.is_dir():
+        frames = [FrameFiles(name=name, gt=gt) for name, gt in _depth_files(ground_truth).items()]
+    else:
+        frames = [FrameFiles(name=name, gt=ground_truth) for name in predictions]
+    # At least one name must be common to both.
+    names = [frame.name for frame in frames]
+    extra = sorted(predictions.keys() - {*names})
+    if len(extra) == len(predictions):
+        raise InputError(
+            "no prediction has the name of a ground truth file: predictions are"
+            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
+        )
+    if extra:
+        notes.append(
+            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
+            f" and are not scored: {some_names(extra)}"
+        )
+    return [
+        _pair(replace(frame, group=frame.group or group), predictions.get(frame.name))
+        for frame, group in zip(frames, groups_by_name(names), strict=True)
+    ], notes
+
+
+def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
+    """The layout and the frames of a data set: as the batch read it, else recognised anew."""
+    summary = prediction / "summary.json"
+    stated = read_json(summary).get("layout") if summary.is_file() else None
+    for layout in (stated if stated in LAYOUTS else None, None):
+        with contextlib.suppress(InputError, OSError):
+            return list_frames(folder, layout)[:2]
+    return None, []
+
+
+def _pair(files: FrameFiles, prediction: Path | None) -> tuple[FrameFiles, ResultFrame | None]:
+    """The frame with what the record of a refinement, beside its depth, says of its inputs."""
+    if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
+        files = replace(files, sparse=None)  # a scan
+    if prediction is None:
+        return files, None
+    try:
+        (result,) = result_frames(prediction)
+    except PnpDepthError:  # the record is damaged
+        return files, ResultFrame(name=files.name, depth=prediction)
+    sparse = result.record.inputs.get("sparse")
+    if sparse is not None and not (sparse.sampled or sparse.calibration):
+        path = Path(sparse.path)
+        files = replace(files, sparse=path if path.is_file() else files.sparse)
+    return replace(files, image=result.image or files.image), result
+
+
+def _frame_name(stem: str) -> str:
+    """The frame of a file with this stem: without `_depth` and KITTI's file kind."""
+    return _MARK.sub("", _KITTI_KIND.sub("_sync_", stem))
+
+
+def _depth_files(folder: Path) -> dict[str, Path]:
+    """The depth files below a folder, or a single one, by frame name, sorted.
+
+    Where files `x_depth` are, all others are no depth.
+    """
+    if not folder.is_dir():
+        return {_frame_name(folder.stem): folder}
+    found, problems = find_files(folder, DEPTH_SUFFIXES)
+    marked = {stem: path for stem, path in found.items() if _MARK.search(stem)} or found
+    files, ambiguous = one_of_each((_frame_name(stem), path) for stem, path in marked.items())
+    if problems or ambiguous:
+        raise InputError(str([*problems, *ambiguous][0]))
+    if not files:
+        suffixes = " ".join(DEPTH_SUFFIXES)
+        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
+    return dict(sorted(files.items()))
 
 
 def _readings(rows: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:
@@ -198,10 +282,10 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
     known = sum(_numbers(scored, "known"))
     if empty := known - sum(_numbers(scored, "predicted")):
         yield (
-            f"warning: {count_of(round(empty), 'pixel')} ({empty / known:.2%}) of the ground truth"
+            f"warning: {count_of(empty, 'pixel')} ({empty / known:.2%}) of the ground truth"
             " without prediction"
         )
-    given = round(sum(_numbers(scored, "given")))
+    given = sum(_numbers(scored, "given"))
     if given and not request.rules.exclude_sparse:
         yield (
             f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
@@ -231,17 +315,16 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
 
 def means_table(evaluation: Evaluation) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
-    intervals, scored = evaluation.interval, f"{len(evaluation.scored):,} of "
-    if len(evaluation.scored) == len(evaluation.frames):
-        scored = ""
-    title = f"Means and coverage over {scored}{count_of(len(evaluation.frames), 'frame')}"
-    title += f", {count_of(evaluation.pixels, 'pixel')}"
+    intervals, counts = evaluation.interval, evaluation.counts
+    scored = f"{counts['scored']:,} of " if counts["scored"] < counts["frames"] else ""
+    title = f"Means and coverage over {scored}{count_of(counts['frames'], 'frame')}"
+    title += f", {count_of(counts['pixels'], 'pixel')}"
     columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
         title += f"; 95 % interval over {evaluation.clusters.text}"
     rows = []
-    mean = evaluation.mean | {COVERAGE.key: evaluation.coverage}
+    mean = evaluation.mean | {COVERAGE.key: counts["coverage"]}
     for measure in (*evaluation.shown, COVERAGE):
         ends = [] if intervals is None else [intervals.get(measure.key, ())]
         texts = (" … ".join(map(measure.text, each)) for each in ends)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.measures import Measure
 
 Floats = NDArray[np.float32]
-_MISSING = np.float32(-1)
 
 
 def fill_background(depth: Floats) -> Floats:
@@ -31,18 +30,14 @@ def fill_background(depth: Floats) -> Floats:
     Args:
         depth: (H, W) metres, 0 where unknown.
     """
-    known = depth > 0
-    column = np.arange(depth.shape[1])
-    left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
-    right = np.where(known, column, len(column))[:, ::-1]
-    right = np.minimum.accumulate(right, axis=1)[:, ::-1]
-    far = np.float32(np.inf)
-    padded = np.pad(depth, ((0, 0), (1, 1)), constant_values=far)
-    filled = np.minimum(
-        np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
-    )
-    filled = np.where(np.isinf(filled), _MISSING, filled)
-    rows = np.flatnonzero(known.any(axis=1))
+    filled, column = np.full_like(depth, -1), np.arange(depth.shape[1])
+    rows = np.flatnonzero((depth > 0).any(axis=1))
+    for row in rows:
+        known = np.flatnonzero(depth[row] > 0)
+        left = np.searchsorted(known, column, side="right") - 1
+        right = np.searchsorted(known, column)
+        ends = known[np.clip([left, right], 0, len(known) - 1)]
+        filled[row] = depth[row, ends].min(axis=0)
     if len(rows):
         filled[: rows[0]] = filled[rows[0]]
         filled[rows[-1] + 1 :] = filled[rows[-1]]

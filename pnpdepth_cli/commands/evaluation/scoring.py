@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
-from pnpdepth_cli.commands.evaluation.pairing import FramePair
 from pnpdepth_cli.commands.results import ResultFrame
 from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
 from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, read_image
@@ -25,7 +24,7 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
-from pnpdepth_cli.io.formats import Reading
+from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
@@ -54,7 +53,7 @@ _CROPS = {
 }
 
 
-def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
+def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequest) -> FrameRecord:
     """Returns the scores of a frame's files, or why it has none.
 
     Beside the measures, the scores have numbers of pixels: "pixels" are scored, "known" have ground
@@ -62,7 +61,6 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
     the network was given a point. "coverage" is predicted over known. "median_ratio" is that of
     prediction over ground truth. A prediction that was scaled has "factor" and "shift".
     """
-    files, result = pair
     paths = (result and result.depth, files.gt, files.sparse, files.image)
     named = zip(FILES, paths, strict=True)
     inputs = {name: FileRecord(path=str(path)) for name, path in named if path is not None}
@@ -71,27 +69,42 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         return replace(record, message="there is no prediction")
     record = replace(record, unit=result.record.unit)
     try:
-        # The ground truth that is scored, and the prediction as the protocol changes it.
-        gt, of_gt, notes = _read_truth(files, result, request)
-        given = _given_points(files, result.record, gt, required=request.rules.exclude_sparse)
-        truth = np.where(_where_scored(gt, given, request.rules), gt, np.float32(0))
-        if not truth.any():
-            raise InputError(
-                f"{files.gt} has no known depth where protocol {request.protocol} scores"
-            )
-        values, of_prediction = _read_prediction(result.depth, truth.shape, request)
-        depth, fit = scale_prediction(values, truth, request.scale_by)
-        depth = _within_bounds(depth, request.rules)
-        both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
-        if not both.any() and not request.is_devkit:
-            raise InputError(f"{result.depth} holds no valid depth where the truth is known")
-        # The measures, and the numbers of pixels.
-        scores = _measure(depth, truth, request)
-        if result.sigma is not None and fit is None:
-            sigma = result.of_size(result.sigma, depth)
-            scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
+        scores, readings, notes = _score(files, result, request)
     except PnpDepthError as error:
         return replace(record, message=str(error))
+    for name, each in zip(FILES, readings, strict=False):
+        inputs[name] = replace(
+            inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed
+        )
+    return replace(record, status="done", notes=notes, errors={GT: {AFTER: scores}})
+
+
+def _score(
+    files: FrameFiles, result: ResultFrame, request: EvalRequest
+) -> tuple[Scores, tuple[Reading, Reading], list[str]]:
+    """The scores, how prediction and ground truth were read, and notes."""
+    # The ground truth that is scored, and the prediction as the protocol changes it.
+    rules = request.rules
+    gt, of_gt, notes = _read_truth(files, result, request)
+    given = _given_points(files, result.record, gt, required=rules.exclude_sparse)
+    truth = np.where(_where_scored(gt, given, rules), gt, np.float32(0))
+    if not truth.any():
+        raise InputError(f"{files.gt} has no known depth where protocol {request.protocol} scores")
+    values, of_prediction = _read_prediction(result.depth, truth.shape, request)
+    depth, fit = scale_prediction(values, truth, request.scale_by)
+    if rules.clip:
+        clipped = np.clip(depth, rules.min_depth, rules.max_depth)
+        depth = np.where(depth > 0, clipped, 0).astype(np.float32)
+    if rules.missing == "min":
+        depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
+    both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
+    if not both.any() and not request.is_devkit:
+        raise InputError(f"{result.depth} holds no valid depth where the truth is known")
+    # The measures, and the numbers of pixels.
+    scores = _measure(depth, truth, request)
+    if result.sigma is not None and fit is None:
+        sigma = result.of_size(result.sigma, depth)
+        scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
     predicted = int(((values > 0) & (truth > 0)).sum())
     scores |= {
         "pixels": int(both.sum()),
@@ -102,11 +115,7 @@ def score_pair(pair: FramePair, request: EvalRequest) -> FrameRecord:
         "median_ratio": float(np.median(depth[both] / truth[both])) if both.any() else None,
     }
     scores["factor"], scores["shift"] = fit or (None, None)
-    for name, each in (("prediction", of_prediction), ("gt", of_gt)):
-        inputs[name] = replace(
-            inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed
-        )
-    return replace(record, status="done", notes=notes, errors={GT: {AFTER: scores}})
+    return scores, (of_prediction, of_gt), notes
 
 
 def scores_of(record: FrameRecord) -> Scores:
@@ -130,11 +139,8 @@ def _read_truth(
     """The ground truth in the part of the frame that is kept, how it was read, and notes."""
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
-    if (raw := raw_depth(frame.gt, frame.image)) is not None:
-        values, reading = raw.values, raw.reading
-    else:
-        values, reading = _read(frame.gt, scale, request)
-    values = apply_masks(values, frame.masks)
+    file = raw_depth(frame.gt, frame.image) or _read(frame.gt, scale, request)
+    values, reading = apply_masks(file.values, frame.masks), file.reading
     values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
     gt = np.ascontiguousarray(frame.part.apply(values))
     if request.gt_range:
@@ -164,18 +170,17 @@ def _depth_of_distances(
 
 def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
     """(H, W) true where the protocol scores: its crop, its bounds, and no input points."""
-    scored = np.zeros(gt.shape, bool)
-    scored[crop_window(rules.crop, gt.shape)] = True
     highest = np.inf if rules.max_depth is None else rules.max_depth
-    scored &= (gt > rules.min_depth) & (gt < highest)
-    if given is not None and rules.exclude_sparse:
-        scored &= ~given
-    return scored
+    inside = np.zeros(gt.shape, bool)
+    inside[crop_window(rules.crop, gt.shape)] = True
+    scored = inside & (gt > rules.min_depth) & (gt < highest)
+    return scored & ~given if given is not None and rules.exclude_sparse else scored
 
 
 def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Depth, Reading]:
     """The prediction at the ground truth's size, and how it was read."""
-    values, reading = _read(path, request.pred_scale, request)
+    file = _read(path, request.pred_scale, request)
+    values = file.values
     if values.shape != size and not request.resize:
         advice = "; --resize scales predictions if both show the same view"
         raise _different(f"prediction {path}", values.shape, size, advice)
@@ -184,29 +189,18 @@ def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Dept
         total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
         # a resized pixel is known where most of its interpolation weight is on known pixels
         values = np.where(weight > 0.5, total / np.maximum(weight, 0.5), np.float32(0))
-    return values, reading
+    return values, file.reading
 
 
-def _within_bounds(depth: Depth, rules: Protocol) -> Depth:
-    """The depth (H, W) clipped and filled in as the protocol says."""
-    if rules.clip:
-        clipped = np.clip(depth, rules.min_depth, rules.max_depth)
-        depth = np.where(depth > 0, clipped, 0).astype(np.float32)
-    if rules.missing == "min":
-        depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
-    return depth
-
-
-def _read(path: Path, scale: float | None, request: EvalRequest) -> tuple[Depth, Reading]:
+def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
     """The depth image; codes are metres × the scale, else the file's own, else the protocol's."""
     stored = load_stored(path)
     assumed = scale is None and stored.reading.scale is None and stored.values.dtype.kind != "f"
     image = depth_from_stored(path, stored, request.rules.scale if assumed else scale)
-    values = image.values
     if request.is_devkit and image.reading.scale is not None and stored.values.ndim == 2:
         # the development kit reads every code but 0 as a depth, the largest too
-        values = known_metres(stored.values / image.reading.scale)
-    return values, image.reading._replace(assumed=assumed)
+        image = replace(image, values=known_metres(stored.values / image.reading.scale))
+    return replace(image, reading=image.reading._replace(assumed=assumed))
 
 
 def _given_points(

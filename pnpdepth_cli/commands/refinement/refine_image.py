@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.error_tables import names_of_depths
 from pnpdepth_cli.commands.refinement.outputs import (
     plan_outputs,
     remove_outdated,
@@ -22,6 +21,7 @@ from pnpdepth_cli.commands.refinement.outputs import (
 )
 from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
 from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.commands.tables import names_of_depths
 from pnpdepth_cli.completion.baselines import Baseline
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score

@@ -1,7 +1,8 @@
-"""Evaluations of files and folders: values by hand and by plain numpy, and every warning."""
+"""Evaluations of files and folders: which belong together, values by numpy, and every warning."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -14,13 +15,14 @@ import pytest
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, means_table
-from pnpdepth_cli.commands.evaluation.scoring import scores_of
+from pnpdepth_cli.commands.evaluation.scoring import FILES, scores_of
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
-from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.sensors.pixels import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
+from tests.empty_files import touch
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
@@ -31,6 +33,113 @@ def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
 
 def scored(root: Path, **options: Any) -> Evaluation:
     return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
+
+
+def folders(root: Path, predictions: list[str], truths: list[str]) -> Path:
+    """Depth of 2 m in these files of out/ and gt/."""
+    for folder, names in (("out", predictions), ("gt", truths)):
+        (root / folder).mkdir()
+        for name in names:
+            depth_file(root / folder / name, np.full((3, 4), 2))
+    return root
+
+
+DRIVE = "2011_09_26_drive_0002_sync{}_0000000005_image_02"
+MATCHED: list[tuple[list[str], list[str], dict[str, str | None]]] = [
+    (  # the files of a refinement, and ground truth without images
+        ["b_depth.png", "b_preview.png", "b_improvement.png", "b.png", "ä ö_depth.exr"],
+        ["b.png", "ä ö.npy"],
+        {"b": "b_depth.png", "ä ö": "ä ö_depth.exr"},
+    ),
+    (  # frames in folders of their own
+        ["one/1_depth.png", "two/1_depth.png"],
+        ["one/1.png", "two/1.png", "two/2.png"],
+        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None},
+    ),
+    (
+        [f"{DRIVE.format('_image')}_depth.png", "frame-000000.depth.png"],
+        [f"{DRIVE.format('_groundtruth_depth')}.png", "frame-000000.png"],
+        {
+            DRIVE.format(""): f"{DRIVE.format('_image')}_depth.png",
+            "frame-000000": "frame-000000.depth.png",
+        },
+    ),
+    (["_depth.png", ".a.png", ".hidden/c.png"], ["_depth.png"], {"_depth": "_depth.png"}),
+]
+
+
+@pytest.mark.parametrize(("predictions", "truths", "expected"), MATCHED)
+def test_files_are_matched_by_name(
+    tmp_path: Path, predictions: list[str], truths: list[str], expected: dict[str, str | None]
+) -> None:
+    found = scored(folders(tmp_path, predictions, truths))
+    names = {
+        frame.name: Path(frame.inputs["prediction"].path).name
+        if "prediction" in frame.inputs
+        else None
+        for frame in found.frames
+    }
+    assert names == expected
+
+
+def test_predictions_that_are_left_are_reported(tmp_path: Path) -> None:
+    found = scored(folders(tmp_path, [f"{name}.png" for name in "avwxyz"], ["a.png"]))
+    left = "warning: 5 of 6 predictions have no ground truth and are not scored: v, w, x, y, z"
+    assert found.notes[0] == left
+
+
+UNMATCHED = [
+    (["a.npy", "a.png"], ["a.png"], "out", "gt", InputError, "one frame"),
+    (["a_depth.png", "a.depth.png"], ["a.png"], "out", "gt", InputError, "one frame"),
+    (["a.png"], [], "out", "gt", InputError, "gt holds no depth file"),
+    (["a.png"], ["a.png"], "out/b.png", "gt/a.png", InputError, "b.png"),
+    (["1.png"], ["0001.png"], "out", "gt", InputError, "are 1; ground truth is 0001"),
+    (["a.png"], ["a.png"], "out/a.png", "gt", UsageError, "two files"),
+    (["a.png"], ["a.png"], "out/a.png", "list.csv", UsageError, "two files"),
+    (["a.png"], ["a.png"], "out", "list.csv", InputError, "'manifest'"),  # without ground truth
+]
+
+
+@pytest.mark.parametrize(("out", "gt", "first", "second", "error", "message"), UNMATCHED)
+def test_what_cannot_be_matched_is_refused(
+    tmp_path: Path,
+    out: list[str],
+    gt: list[str],
+    first: str,
+    second: str,
+    error: type[Exception],
+    message: str,
+) -> None:
+    touch(folders(tmp_path, out, gt) / "a.png")
+    (tmp_path / "list.csv").write_text("image,sparse,name\na.png,out/a.png,a")
+    with pytest.raises(error, match=message):
+        evaluate(EvalRequest(prediction=tmp_path / first, ground_truth=tmp_path / second))
+
+
+def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> None:
+    for place in ("north", "south"):
+        touch(tmp_path / f"gt/{place}/image/0.png")
+        depth_file(tmp_path / f"gt/{place}/depth/0.png", [[2]])
+        depth_file(tmp_path / f"out/{place}/0_depth.png", [[2]])
+    (tmp_path / "out/summary.json").write_text(json.dumps({"layout": "image-depth"}))
+    frames = scored(tmp_path).frames
+    assert [(frame.name, frame.status) for frame in frames] == [
+        ("north/0", "done"),
+        ("south/0", "done"),
+    ]
+
+
+def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
+    out = folders(tmp_path, [f"{n}_depth.png" for n in "abc"], [f"{n}.png" for n in "abc"]) / "out"
+    sparse, image = (depth_file(tmp_path / name, np.ones((3, 4))) for name in ("s.png", "i.png"))
+    inputs = {"sparse": FileRecord(path=str(sparse)), "image": FileRecord(path=str(image))}
+    FrameRecord(inputs=inputs).write(out / "a.json")
+    scan = FileRecord(path=str(sparse), calibration="calib.txt")
+    FrameRecord(inputs={"sparse": scan}).write(out / "b.json")
+    (out / "c.json").write_text("not JSON at all")
+    files = [frame.inputs for frame in scored(tmp_path).frames]
+    assert [[*each] for each in files] == [[*FILES], [*FILES][:2], [*FILES][:2]]
+    assert (files[0]["sparse"].path, files[0]["image"].path) == (str(sparse), str(image))
 
 
 @pytest.fixture
@@ -53,7 +162,7 @@ def test_images_count_alike_and_one_without_prediction_in_neither_means_nor_cove
         FrameRecord(inputs={"sparse": sparse}).write(two / "out" / f"{name}.json")
     result = scored(two, exclude_sparse=exclude_sparse)
     assert [frame.name for frame in result.frames if frame.status == "failed"] == ["c"]
-    assert (result.mean["rmse"], result.coverage) == ((1 + 3) / 2, pixels / known)
+    assert (result.mean["rmse"], result.counts["coverage"]) == ((1 + 3) / 2, pixels / known)
     assert "coverage over 2 of 3 frames" in means_table(result).title
     counts = {"frames": 3, "scored": 2, "pixels": pixels, "coverage": pixels / known}
     assert result.to_json()["counts"] == counts
@@ -139,7 +248,7 @@ def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     assert result.mean == {
         key: pytest.approx(np.mean([row[key] for row in rows]), rel=1e-9) for key in rows[0]
     }
-    assert result.coverage < 1
+    assert result.counts["coverage"] < 1
 
 
 def test_empty_predictions_are_skipped_or_scored_as_the_lower_bound(tmp_path: Path) -> None:
@@ -148,10 +257,10 @@ def test_empty_predictions_are_skipped_or_scored_as_the_lower_bound(tmp_path: Pa
     depth_file(tmp_path / "out" / "a.npy", prediction)
     depth_file(tmp_path / "gt" / "a.npy", np.full((20, 30), 5))
     skipped, lowest = scored(tmp_path), scored(tmp_path, protocol="garg")
-    assert (skipped.mean["mae"], skipped.coverage) == (3, 0.5)
+    assert (skipped.mean["mae"], skipped.counts["coverage"]) == (3, 0.5)
     # the crop has columns 1 to 27, of which the prediction has 14
     assert lowest.mean["mae"] == pytest.approx((14 * 3 + 13 * (5 - 0.001)) / 27)
-    assert lowest.coverage == 14 / 27
+    assert lowest.counts["coverage"] == 14 / 27
 
 
 def test_an_interval_ends_at_what_the_measure_can_be_and_few_groups_have_none(
@@ -270,7 +379,7 @@ def test_a_smaller_prediction_is_resized_on_request(tmp_path: Path) -> None:
     assert scored(tmp_path, resize=True).mean["mae"] == 0.25
     depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
     result = scored(tmp_path, resize=True)
-    assert (result.pixels, result.mean["mae"]) == (4, 0)
+    assert (result.counts["pixels"], result.mean["mae"]) == (4, 0)
 
 
 def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
@@ -279,7 +388,7 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
         cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
-    assert scored(tmp_path).pixels == 1
+    assert scored(tmp_path).counts["pixels"] == 1
 
 
 def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
