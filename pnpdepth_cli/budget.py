@@ -28,10 +28,8 @@ class Budget:
 
     max_pixels: int
     """Pixels of an image, and rows or elements of any other array of numbers."""
-
     max_file_bytes: int
     """Bytes of a file with an image, depth, points or text, as stored."""
-
     max_decoded_bytes: int
     """Bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
 

@@ -26,14 +26,8 @@ class OpenList(Mapping[str, Any]):
     file. Files that start with "_", and subpackages, are no entries.
 
     An entry of another package is its entry point `<name>` in the group `pnpdepth.<group>`. The
-    package's own entries win.
-
-    Args:
-        module: Name of the module or package, such as "pnpdepth_cli.core.losses".
-        group: Last part of the entry point group.
-        names: All names in the module's table, in the order of their listing.
-        attribute: Name of the object in each file of the package.
-        in_file: Name of the object in a user's Python file, whose path is then a name too.
+    package's own entries win. With `in_file`, the path of a user's Python file is a name, too, and
+    the entry is the object of that name in it.
     """
 
     def __init__(
@@ -90,7 +84,7 @@ class OpenList(Mapping[str, Any]):
 
 
 @functools.cache
-def _from_file(path: str, attribute: str) -> Any:
+def _from_file(path: str, attribute: str) -> object:
     """The object in a Python file, which is run. UsageError if there is none."""
     values: dict[str, object] = {"__name__": Path(path).stem, "__file__": path}
     try:

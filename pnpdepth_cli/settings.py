@@ -18,14 +18,11 @@ from pnpdepth_cli.errors import UsageError
 LARGEST_SEED = 2**32 - 1
 
 
-def option(default: Any, help: str, **details: Any) -> Any:
-    """Returns a dataclass field that the user can set.
+def option(default: Any, help: str, **details: object) -> Any:
+    """Returns a dataclass field that the user can set, with its help on the command line.
 
-    Args:
-        default: Default of the field.
-        help: Help text of the command line.
-        **details: Arguments of the option in click, such as its metavar; and `flag`, its spelling
-            where that is not the field's name, `choices`, `least` and `most` of a whole number.
+    The details are arguments of the option in click, such as its metavar; and `choices`, `least`
+    and `most` of a whole number, and `flag`, its spelling where that is not the field's name.
     """
     return field(default=default, metadata={"help": help, **details})
 

@@ -115,8 +115,7 @@ def doctor() -> None:
     from pnpdepth_cli.commands.doctor import examine
 
     report = examine()
-    for name, value in report.items():
-        for number, line in enumerate(value if isinstance(value, list) else [value]):
-            click.echo(f"{'' if number else name:<12}{line}")
-    if str(report["self-test"]).startswith("FAILED"):
+    for name, lines in report.items():
+        click.echo(f"{name:<12}" + f"\n{'':<12}".join(lines))
+    if report["self-test"][0].startswith("FAILED"):
         click.get_current_context().exit(1)

@@ -152,7 +152,7 @@ class GroupedCommand(click.Command):
         self,
         *args: Any,
         groups: Mapping[str, tuple[str | type, ...]],
-        common: frozenset[str],
+        common: tuple[str, ...],
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)

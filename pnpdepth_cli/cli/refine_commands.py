@@ -44,11 +44,9 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
 @click.command(
     short_help="Refine the depth of one image.",
     cls=options.GroupedCommand,
-    common=frozenset(
-        {
-            *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),
-            *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
-        }
+    common=(
+        *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),
+        *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
     ),
     groups={
         "Input": (
@@ -116,11 +114,9 @@ def refine(as_json: bool, **values: Any) -> None:
 @click.command(
     short_help="Refine all frames of a folder or a list.",
     cls=options.GroupedCommand,
-    common=frozenset(
-        {
-            *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--method"),
-            *("--holdout", "--uncertainty", "--output", "--html", "--vary"),
-        }
+    common=(
+        *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--method"),
+        *("--holdout", "--uncertainty", "--output", "--html", "--vary"),
     ),
     groups={
         "Frames": (
@@ -253,7 +249,7 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 def _combinations(
     context: click.Context, varied: Sequence[str]
-) -> dict[str, tuple[dict[str, str], dict[str, Any]]]:
+) -> dict[str, tuple[dict[str, str], dict[str, object]]]:
     """The values of all combinations of `--vary`, by the folder of the results.
 
     They are as the user wrote them, by the option's name, and by the command's parameter.
@@ -264,7 +260,7 @@ def _combinations(
         raise UsageError("--vary must be NAME=VALUE,VALUE with no value empty")
     combinations, chosen = {}, list(itertools.product(*axes))
     for words in chosen:
-        texts, values = dict[str, str](), dict[str, Any]()
+        texts, values = dict[str, str](), dict[str, object]()
         for option, word in zip(varying, words, strict=True):
             texts[option.opts[-1].removeprefix("--")] = word
             if word != DEFAULT:

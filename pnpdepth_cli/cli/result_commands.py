@@ -22,9 +22,9 @@ _OUTPUT = ("--csv", "--columns", "--overwrite", "--json")
     name="eval",
     short_help="Score depth files against ground truth.",
     cls=options.GroupedCommand,
-    common=frozenset(
-        {"--protocol", "--max-depth", "--scale-by", "--gt-scale", "--pred-scale", "--resize"}
-        | {*_OUTPUT}
+    common=(
+        *("--protocol", "--max-depth", "--scale-by", "--gt-scale", "--pred-scale", "--resize"),
+        *_OUTPUT,
     ),
     groups={
         "Protocol": (EvalRequest,),

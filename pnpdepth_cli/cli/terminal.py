@@ -42,15 +42,15 @@ def print_json(value: object) -> None:
 
 
 @contextlib.contextmanager
-def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
-    """Yields `show(done, total, text="")`, which draws a bar for work of more than a second.
+def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Yields `show(done, total)`, which draws a bar for work of more than a second.
 
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
     """
     bar: tqdm[None] | None = None
     began = printed_at = 0.0
 
-    def show(done: int, total: int, text: str = "") -> None:
+    def show(done: int, total: int) -> None:
         nonlocal bar, began, printed_at
         from tqdm import tqdm
 
@@ -64,8 +64,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
             began = printed_at = now
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
             printed_at = now
-            say(tqdm.format_meter(done, total, now - began, 0, title, unit=unit, postfix=text))
-        bar.set_postfix_str(text, refresh=False)
+            say(tqdm.format_meter(done, total, now - began, 0, title, unit=unit))
         bar.update(done - bar.n)
 
     try:
@@ -78,8 +77,8 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[..., None]]:
 class BatchProgress:
     """Progress of a run over frames on stderr; its counts are numbers of frames."""
 
-    def __init__(self, show: Callable[..., None], stopped: Callable[[], bool]) -> None:
-        self.done = self.to_do = self.failed = 0
+    def __init__(self, show: Callable[[int, int], None], stopped: Callable[[], bool]) -> None:
+        self.done = self.to_do = 0
         self.stopped, self._show = stopped, show
 
     def say(self, text: str) -> None:
@@ -98,5 +97,4 @@ class BatchProgress:
         if record.status != "done":
             self.say(f"{record.status}: {record.name}: {record.message}")
         self.done += 1
-        self.failed += record.status == "failed"
-        self._show(self.done, self.to_do, f"{self.failed:,} failed" if self.failed else "")
+        self._show(self.done, self.to_do)

@@ -18,20 +18,16 @@ _DEVELOPERS = ("test", "docs", "train")
 """Extras that no command needs."""
 
 
-def examine() -> dict[str, str | list[str]]:
-    """Returns the report, a line or several by topic.
-
-    Raises:
-        PnpDepthError: The small frame cannot be refined.
-    """
+def examine() -> dict[str, list[str]]:
+    """Returns the lines of the report by topic."""
     memory = psutil.virtual_memory()
     return {
-        "pnpdepth": pnpdepth_cli.__version__,
-        "python": f"{platform.python_version()}, {platform.system()} {platform.machine()}",
+        "pnpdepth": [pnpdepth_cli.__version__],
+        "python": [f"{platform.python_version()}, {platform.system()} {platform.machine()}"],
         "packages": list(_packages()),
         "devices": _devices(),
-        "memory": f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB available",
-        "self-test": _self_test(),
+        "memory": [f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB available"],
+        "self-test": [_self_test()],
     }
 
 
