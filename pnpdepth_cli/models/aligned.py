@@ -29,28 +29,21 @@ class AlignedDepth:
 
     def __init__(self, network: Network, points: SparsePoints, kind: str) -> None:
         self._network, self._points, self._kind = network, points, kind
-        stated = network.definition.output_kind
-        self._spaces = (stated,) if stated in SPACES else ("depth", "inverse")
         self._read = False
         self.alignment: Alignment | None = None
         self.notes: tuple[str, ...] = ()
 
     def __call__(self, output: object) -> Tensor:
         """Returns depth in metres, (1, 1, h, w), from the network's output; NaN where unknown."""
-        if self._kind == "none":
-            depth = self._network.depth_of(output)
-            self._note_first(depth.detach())
-            return depth
-        raw = self._network.raw_of(output)
-        self._note_first(raw.detach())
-        assert self.alignment is not None
-        return self.alignment.depth(raw)
+        plain = self._kind == "none"
+        raw = self._network.depth_of(output) if plain else self._network.raw_of(output)
+        if not self._read:
+            self._read = True
+            self._fit(raw.detach())
+        return raw if self.alignment is None else self.alignment.depth(raw)
 
-    def _note_first(self, raw: Tensor) -> None:
+    def _fit(self, raw: Tensor) -> None:
         """Fits the alignment to the plain prediction, and notes what a person should know of it."""
-        if self._read:
-            return
-        self._read = True
         at_points = self._points.sample(raw)
         seen = at_points.isfinite()
         self.notes = self._unknown_notes(raw, seen)
@@ -59,7 +52,9 @@ class AlignedDepth:
         if self._kind == "none":
             self.notes += self._plain_notes(at_points)
             return
-        self.alignment = align(at_points, self._points, self._spaces, self._kind)
+        stated = self._network.definition.output_kind
+        spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+        self.alignment = align(at_points, self._points, spaces, self._kind)
         self.notes += self._notes(self.alignment, raw)
 
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
@@ -93,19 +88,16 @@ class AlignedDepth:
                 "warning: the network's output falls where its kind says it should rise; is it"
                 f" {fit.space!r}? its definition can say otherwise"
             )
-        if len(self._points) >= _ENOUGH and fit.misfit > _NO_BETTER * self._misfit_of_median():
+        # What the misfit is for the median depth of the points everywhere.
+        log_depth = self._points.depth.cpu().double().log()
+        of_median = float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
+        if len(log_depth) >= _ENOUGH and fit.misfit > _NO_BETTER * of_median:
             notes.append(
                 f"warning: network {self._network.definition.name!r} says nothing about this scene:"
                 f" aligned, it is off by {fit.misfit:.1%} at the points, their median depth by"
-                f" {self._misfit_of_median():.1%}; check the network, its input range"
-                " (normalise) and the image"
+                f" {of_median:.1%}; check the network, its input range (normalise) and the image"
             )
         return tuple(notes)
-
-    def _misfit_of_median(self) -> float:
-        """What `Alignment.misfit` is for the median depth of the points everywhere."""
-        log_depth = self._points.depth.cpu().double().log()
-        return float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
 
     def _plain_notes(self, at_points: Tensor) -> tuple[str, ...]:
         ratio = float((at_points / self._points.depth).median())

@@ -21,7 +21,6 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.errors import ModelError
@@ -37,14 +36,11 @@ _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 
 def _check(owner: object, field: str, good: bool, wanted: str) -> None:
-    """ModelError with type and name of the owner, the field and its value, unless it is good."""
-    if good:
-        return
-    name = getattr(owner, "name", None)
-    named = f"{type(owner).__name__} {name!r}" if isinstance(name, str) else type(owner).__name__
-    shown = " ".join(repr(getattr(owner, field)).split())
-    shown = shown if len(shown) <= _MAX_SHOWN else f"{shown[: _MAX_SHOWN - 1]}…"
-    raise ModelError(f"{named}: {field}={shown} is not {wanted}")
+    """ModelError with the field and its value, unless it is good."""
+    if not good:
+        name, shown = getattr(owner, "name", ""), " ".join(repr(getattr(owner, field)).split())
+        named = f"{type(owner).__name__} {name!r}" if name else type(owner).__name__
+        raise ModelError(f"{named[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
 
 
 def _check_choice(owner: object, field: str, valid: Collection[str]) -> None:
@@ -55,12 +51,8 @@ def _check_choice(owner: object, field: str, valid: Collection[str]) -> None:
 def _check_whole(owner: object, *fields: str) -> None:
     for field in fields:
         value = getattr(owner, field)
-        good = isinstance(value, Integral) and _is_number(value) and int(value) > 0
+        good = isinstance(value, Integral) and not isinstance(value, bool) and int(value) > 0
         _check(owner, field, good, "a whole number of at least 1")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -121,9 +113,9 @@ class Normalisation:
         for field, least in (("mean", -math.inf), ("std", 0.0)):
             value = getattr(self, field)
             numbers = list(value) if isinstance(value, Iterable) else []
-            good = len(numbers) == 3 and all(_is_number(n) and n > least for n in numbers)
-            above = " above 0" if least == 0 else ""
-            _check(self, field, good, f"three numbers{above}, for red, green and blue")
+            good = len(numbers) == 3 and all(isinstance(n, Real) for n in numbers)
+            good = good and all(least < n < math.inf for n in numbers)
+            _check(self, field, good, "a finite number each for red, green and blue, std above 0")
 
 
 UNTUNED_DEFAULTS = Settings(
@@ -229,8 +221,8 @@ class ModelDefinition:
             ("checkpoint", (Path, none), "a pathlib.Path"),
         ):
             _check(self, field, isinstance(getattr(self, field), kinds), wanted)
-        names = self.layers if isinstance(self.layers, tuple | list) else [None]
-        good = all(isinstance(name, str) for name in names)
+        good = isinstance(self.layers, tuple | list)
+        good = good and all(isinstance(name, str) for name in self.layers)
         _check(self, "layers", good, "a tuple of texts, as in ('encoder', 'decoder.up1')")
         for hook in ("build", "read_checkpoint", "arguments", "output", "verify", "coarse"):
             value = getattr(self, hook)
@@ -271,7 +263,7 @@ def file_and_part(path: Path) -> tuple[Path, str]:
     return (path.with_name(name), part) if name and not path.exists() else (path, "")
 
 
-def assume_definition(**known: Any) -> ModelDefinition:
+def assume_definition(**known: object) -> ModelDefinition:
     """Returns a definition for a network that brings no description of its numbers.
 
     It is of rgb, and sides of images are padded to multiples of `ASSUMED_MULTIPLE`, unless other
@@ -289,7 +281,7 @@ def assume_definition(**known: Any) -> ModelDefinition:
 
 
 def graph_definition(
-    shapes: Sequence[Sequence[Any]], file: Path, stated: Mapping[str, Any], **known: Any
+    shapes: Sequence[Sequence[object]], file: Path, stated: Mapping[str, object], **known: object
 ) -> ModelDefinition:
     """Returns the definition of a graph that was exported with its weights.
 
@@ -302,7 +294,7 @@ def graph_definition(
     Raises:
         ModelError: The inputs are others than those stated, without any one rgb image.
     """
-    kind = stated.get("input_kind", "rgb")
+    kind = str(stated.get("input_kind", "rgb"))
     wanted = [*kind.split("+"), *["intrinsics"] * bool(stated.get("takes_intrinsics"))]
     # The image, or the sparse depth where there is none, has the sides; 1×3×H×W or 1×H×W×3.
     channels = 3 if "rgb" in kind else 1
@@ -316,23 +308,19 @@ def graph_definition(
         )
     height, width = image[1:] if image[0] == channels else image[:2]
 
-    def fit(tensor: Tensor, shape: Sequence[Any]) -> Tensor:
-        """The tensor without a batch axis, or with the channels last, where the graph has it so."""
-        if tensor.ndim > len(shape):
-            return tensor[0]
-        last = len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3)
-        return tensor.permute(0, 2, 3, 1).contiguous() if last else tensor
-
     def arguments(*given: Tensor | None) -> tuple[Tensor, ...]:
-        tensors = (tensor for tensor in given if tensor is not None)
-        return tuple(fit(*pair) for pair in zip(tensors, shapes, strict=True))
+        """The tensors without a batch axis, or with the channels last, where the graph has it."""
+        tensors = [tensor for tensor in given if tensor is not None]
+        for index, shape in enumerate(shapes):
+            if tensors[index].ndim > len(shape):
+                tensors[index] = tensors[index][0]
+            elif len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3):
+                tensors[index] = tensors[index].permute(0, 2, 3, 1).contiguous()
+        return tuple(tensors)
 
     if "rgb" not in kind:
         known["normalisation"] = Normalisation()
     if isinstance(height, int) and isinstance(width, int):
-        claim = f"{file} takes images of {width}×{height} pixels"
-        limit = "allow more pixels"
-        check_claim(claim, height * width, budget().max_pixels, error=ModelError, way_out=limit)
         known["size"] = Fixed(height, width)
     known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
     return assume_definition(**known | dict(stated))

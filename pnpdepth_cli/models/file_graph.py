@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, fx, nn
-from torch.fx.node import Argument
+from torch._ops import OpOverload
+from torch.fx.node import Argument, Target
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.flop_counter import flop_registry
@@ -119,7 +119,7 @@ class FileGraph(nn.Module):
         self._graph.output(values if len(values) > 1 else values[0])
         self.values.clear()
 
-    def forward(self, *inputs: Tensor) -> Any:
+    def forward(self, *inputs: Tensor) -> object:
         """Returns the output, or a tuple of several.
 
         Raises:
@@ -143,11 +143,13 @@ class _Runner(fx.Interpreter):
         super().__init__(module, graph=module._graph)
         self.extra_traceback, self._most = False, most
 
-    def call_module(self, target: Any, args: Any, kwargs: Any) -> Any:
+    def call_module(
+        self, target: Target, args: tuple[Argument, ...], kwargs: dict[str, object]
+    ) -> object:
         """The result of a submodule, whose name may have dots in it."""
-        return self.submodules[target](*args, **kwargs)
+        return self.submodules[str(target)](*args, **kwargs)
 
-    def run_node(self, node: fx.Node) -> Any:
+    def run_node(self, node: fx.Node) -> object:
         """The node's result, without what debuggers of graphs would note of it."""
         args, kwargs = self.fetch_args_kwargs_from_env(node)
         result = getattr(self, node.op)(node.target, args, kwargs)
@@ -177,8 +179,12 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self._largest, self._left, self._work = largest, in_all, work
 
     def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+        self,
+        func: OpOverload,
+        types: object,
+        args: tuple[object, ...] = (),
+        kwargs: dict[str, object] | None = None,
+    ) -> object:
         """Runs the operation if its result fits; see TorchDispatchMode."""
         kwargs = kwargs or {}
         expected = _shaped_result(func, args, kwargs)
@@ -195,7 +201,7 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return func(*args, **kwargs)
 
 
-def _shaped_result(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str, object]) -> object:
     """Tensors without memory that are at least as large as the operation's results."""
     without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))

@@ -54,27 +54,26 @@ class FrameMap:
 
     def rgb_to_network(self, rgb: Tensor) -> Tensor:
         """(1, 3, H, W) → (1, 3, h, w); antialiased when shrinking, edge pixels in the padding."""
-        top, left, height, width = self.crop
-        image = rgb[..., top : top + height, left : left + width]
-        if (height, width) != self.resized:
-            image = F.interpolate(
-                image, self.resized, mode="bilinear", align_corners=False, antialias=True
-            )
-        bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
-        return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+        image = _resize(self._cropped(rgb), self.resized, antialias=True)
+        return F.pad(image, self._padding, mode="replicate") if any(self._padding) else image
 
     def prior_to_network(self, depth: Tensor) -> Tensor:
         """Depth (1, 1, H, W), 0 = unknown → (1, 1, h, w); unknown in the padding.
 
         A pixel is known where everything that it is interpolated from is.
         """
+        depth = self._cropped(depth)
+        known = _resize((depth > 0).to(depth.dtype), self.resized)
+        depth = _resize(depth, self.resized)
+        return F.pad(torch.where(known > 1 - _ROUNDING, depth, 0.0), self._padding)
+
+    def _cropped(self, image: Tensor) -> Tensor:
         top, left, height, width = self.crop
-        depth = depth[..., top : top + height, left : left + width]
-        known = (depth > 0).to(depth.dtype)
-        if (height, width) != self.resized:
-            depth, known = (_resize(each, self.resized) for each in (depth, known))
-        bottom, right = (self.network[0] - self.resized[0], self.network[1] - self.resized[1])
-        return F.pad(torch.where(known > 1 - _ROUNDING, depth, 0.0), (0, right, 0, bottom))
+        return image[..., top : top + height, left : left + width]
+
+    @property
+    def _padding(self) -> tuple[int, int, int, int]:
+        return 0, self.network[1] - self.resized[1], 0, self.network[0] - self.resized[0]
 
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """The points inside the crop, at pixel coordinates of the network."""
@@ -90,7 +89,7 @@ class FrameMap:
 
     def depth_to_image(self, depth: Tensor) -> Tensor:
         """Depth (1, 1, h', w') over the network's pixels → (H, W); 0 outside the crop."""
-        if self.network != self.resized:
+        if any(self._padding):
             depth = _resize(depth, self.network)[..., : self.resized[0], : self.resized[1]]
         top, left, height, width = self.crop
         depth = _resize(depth, (height, width))
@@ -99,10 +98,10 @@ class FrameMap:
         return image
 
 
-def _resize(depth: Tensor, size: tuple[int, int]) -> Tensor:
-    if tuple(depth.shape[-2:]) == size:
-        return depth
-    return F.interpolate(depth, size, mode="bilinear", align_corners=False)
+def _resize(image: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
+    if tuple(image.shape[-2:]) == size:
+        return image
+    return F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=antialias)
 
 
 def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints, Camera]:

@@ -161,30 +161,23 @@ class Network:
         name = self.definition.name
         if self.definition.output is not None:
             with wrap_user_errors(f"output of network {name!r}"):
-                chosen = self.definition.output(output)
-            if not isinstance(chosen, Tensor):
-                raise ModelError(
-                    f"output of network {name!r} gives a {type(chosen).__name__}, where a tensor is"
-                    " expected"
-                )
-        else:
-            tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
-            if len(tensors) != 1:
-                paths = ", ".join(".".join(path) for path, _ in tensors)
-                raise ModelError(
-                    f"network {name!r} returns a {type(output).__name__} with {len(tensors)}"
-                    f" tensors in it ({paths}); `output` of its definition must pick the depth"
-                )
-            chosen = tensors[0][1]
-        # One map, with or without axes of batch and channel.
-        tensor = chosen.float()
-        if tensor.ndim in (2, 3):
-            tensor = tensor[:, None] if tensor.ndim == 3 else tensor[None, None]
-        if tensor.ndim != 4 or tuple(tensor.shape[:2]) != (1, 1):
+                output = self.definition.output(output)
+        tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
+        if len(tensors) != 1:
+            paths = ", ".join(".".join(path) for path, _ in tensors)
             raise ModelError(
-                f"network {name!r} gives a tensor of shape {tuple(chosen.shape)}, where one depth"
-                " map (1, 1, h, w) is expected; pick it by the definition's output"
+                f"network {name!r} gives a {type(output).__name__} with {len(tensors)} tensors in"
+                f" it ({paths}); `output` of its definition must pick the depth"
             )
+        # One map, with or without axes of batch and channel.
+        tensor = tensors[0][1].float()
+        shape = tuple(tensor.shape)
+        if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
+            raise ModelError(
+                f"network {name!r} gives a tensor of shape {shape}, where one depth map (1, 1, h,"
+                " w) is expected; pick it by the definition's output"
+            )
+        tensor = tensor.reshape(1, 1, *shape[-2:])
         # Where it is not finite, it is NaN, and no gradient comes from there.
         known = tensor.isfinite()
         if bool(known.all()):
@@ -242,6 +235,10 @@ def load_network(
             f"build of network {definition.name!r} gives no torch module; a class or a function"
             " that makes one is expected, as in lambda: net"
         )
+    if isinstance(size := definition.size, Fixed):
+        claim = f"network {definition.name!r} takes images of {size.width}×{size.height} pixels"
+        pixels, most = size.height * size.width, budget().max_pixels
+        check_claim(claim, pixels, most, error=ModelError, way_out="allow more pixels")
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []
     notes += _load_weights(module, definition, checkpoint)
@@ -291,10 +288,6 @@ def _with_suggested_layers(network: Network) -> Network:
         sides = size.height, size.width
     else:
         sides = (-(-_SUGGESTION_SIDE // size.of) * size.of,) * 2
-    claim = f"network {network.definition.name!r} takes images of {sides[0]}×{sides[1]} pixels"
-    check_claim(
-        claim, math.prod(sides), budget().max_pixels, error=ModelError, way_out="allow more pixels"
-    )
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(FrameMap.fit(size, *sides))
         layers = suggest_layers(network.module, arguments, network.raw_of)

@@ -36,8 +36,11 @@ _MEMORY_FORMATS = {1: torch.contiguous_format, 2: torch.channels_last, 4: torch.
 _STRIDED = 7
 _KEYWORD = 2
 
+_Json = Mapping[str, Any]
+"""An object of the archive's JSON; what is not as expected in it raises one of CONTENT_ERRORS."""
 
-def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
+
+def exported_definition(file: Path, **stated: object) -> ModelDefinition:
     """Returns the definition of a network saved by torch.export.save.
 
     Args:
@@ -68,7 +71,7 @@ def exported_definition(file: Path, **stated: Any) -> ModelDefinition:
     )  # fmt: skip
 
 
-def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
+def _read(file: Path) -> tuple[_Json, dict[str, Tensor]]:
     """The program, and its tensors by name."""
     with zipfile.ZipFile(file) as archive:
         entries = {info.filename.partition("/")[2]: info for info in archive.infolist()}
@@ -87,7 +90,7 @@ def _read(file: Path) -> tuple[Mapping[str, Any], dict[str, Tensor]]:
     return program, tensors
 
 
-def _graph(program: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FileGraph:
+def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
     """The program of models/model.json as a module, whose submodules are its nodes."""
     graph, module = FileGraph(), program["graph_module"]
     for spec in module["signature"]["input_specs"]:
@@ -106,9 +109,7 @@ def _graph(program: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FileGra
     return graph
 
 
-def _add_node(
-    graph: FileGraph, target: str, inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]
-) -> None:
+def _add_node(graph: FileGraph, target: str, inputs: list[_Json], outputs: list[_Json]) -> None:
     positional: list[Argument] = []
     keywords: dict[str, Argument] = {}
     for one in inputs:
@@ -124,7 +125,7 @@ def _add_node(
     graph.add_operation(name, operation, positional, keywords, str(named[0]) if alone else named)
 
 
-def _tensor(content: bytearray, meta: Mapping[str, Any]) -> Tensor:
+def _tensor(content: bytearray, meta: _Json) -> Tensor:
     dtype = _DTYPES[meta["dtype"]]
     flat = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
     shape, stride = ([one["as_int"] for one in meta[key]] for key in ("sizes", "strides"))
@@ -143,7 +144,7 @@ def _function(target: str) -> Callable[..., object]:
     raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
 
 
-def _argument(stated: Mapping[str, Any], values: Mapping[str, fx.Node]) -> Argument:
+def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
     """An argument of a call, with the nodes of what the graph computes."""
     ((kind, value),) = dict(stated).items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
@@ -171,7 +172,7 @@ def _argument(stated: Mapping[str, Any], values: Mapping[str, fx.Node]) -> Argum
     raise BrokenFileError(f"it has an argument {str(kind)[:40]!r}")
 
 
-def _outputs_in(stated: Mapping[str, Any]) -> list[str | None]:
+def _outputs_in(stated: _Json) -> list[str | None]:
     """The names that a stated output gives to values; None for a part without one."""
     ((kind, value),) = dict(stated).items()
     if kind == "as_tensors":

@@ -10,7 +10,7 @@ import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -37,7 +37,7 @@ MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
 
 
-def onnx_definition(file: Path, output: str | None = None, **stated: Any) -> ModelDefinition:
+def onnx_definition(file: Path, output: str | None = None, **stated: object) -> ModelDefinition:
     """Returns the definition of an ONNX depth network.
 
     Args:

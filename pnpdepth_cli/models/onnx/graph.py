@@ -137,7 +137,7 @@ def _names(nodes: Iterable[NodeProto]) -> list[str]:
     return names
 
 
-def _attribute(proto: AttributeProto, path: Path) -> Any:
+def _attribute(proto: AttributeProto, path: Path) -> object:
     from onnx import AttributeProto, helper
 
     if proto.type == AttributeProto.TENSOR:

@@ -51,7 +51,7 @@ class Node:
     op: str
     opset: int
     outputs: int = 1
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    attributes: Mapping[str, object] = field(default_factory=dict)
 
     def get(self, name: str, default: Any = None) -> Any:
         """Returns an attribute, or the standard's default for it."""
@@ -110,6 +110,7 @@ _PLAIN: dict[str, Callable[..., Tensor]] = {
     "Equal": torch.eq, "GreaterOrEqual": torch.ge, "LessOrEqual": torch.le, "Div": _divide,
     "And": torch.logical_and, "Or": torch.logical_or, "Not": torch.logical_not,
     "Identity": torch.clone, "Dropout": lambda x, *_: x.clone(),
+    "PRelu": lambda x, slope: torch.where(x < 0, x * slope, x),
     "Pow": lambda base, exponent: torch.pow(base, exponent).to(base.dtype),
     "Max": lambda *each: functools.reduce(torch.maximum, each),
     "Min": lambda *each: functools.reduce(torch.minimum, each),
@@ -147,12 +148,6 @@ def clip(node: Node, inputs: Inputs) -> Tensor:
         if bound is not None:
             x = function(x, torch.as_tensor(bound, dtype=x.dtype, device=x.device))
     return x
-
-
-@operator("PRelu")
-def prelu(node: Node, inputs: Inputs) -> Tensor:
-    x, slope = inputs
-    return torch.where(x < 0, x * slope, x)
 
 
 @operator("Softmax", "LogSoftmax")
@@ -222,6 +217,7 @@ register(
 register(
     {
         "Tile": lambda _, i: i[0].repeat(whole_numbers(i[1])),
+        "Expand": lambda _, i: i[0].expand(torch.broadcast_shapes(i[0].shape, whole_numbers(i[1]))),  # type: ignore[no-untyped-call]
         "Squeeze": lambda node, i: i[0].squeeze(stated(node, "axes", i, 1) or [*range(i[0].ndim)]),
     },
     host=(1,),
@@ -247,14 +243,6 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     return x
 
 
-@operator("Expand", host=(1,))
-def expand(node: Node, inputs: Inputs) -> Tensor:
-    x, wanted = inputs[0], whole_numbers(inputs[1])
-    wanted = [1] * (x.ndim - len(wanted)) + wanted
-    own = [1] * (len(wanted) - x.ndim) + list(x.shape)
-    return x.expand([n if w == 1 else w for n, w in zip(own, wanted, strict=True)])
-
-
 @operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     x, axis = inputs[0], node.get("axis", 0)
@@ -264,6 +252,9 @@ def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
         each = math.ceil(total / parts)
         sizes = [min(each, total - each * i) for i in range(parts)]
     return torch.split(x, sizes, axis)
+
+
+_PAD_MODES = {"edge": "replicate", "reflect": "reflect"}
 
 
 @operator("Pad", host=(1, 2))
@@ -277,32 +268,18 @@ def pad(node: Node, inputs: Inputs) -> Tensor:
     if mode == "constant":
         value = node.get("value", 0.0) if optional(inputs, 2) is None else inputs[2].item()
         return F.pad(x, [n for pair in reversed(sides) for n in pair], value=value)
-    for axis, (begin, end) in enumerate(sides):
-        if begin or end:
-            index = _indices_of_padding(mode, x.shape[axis], begin, end)
-            x = x.index_select(axis, index.to(x.device))
-    return x
-
-
-def _indices_of_padding(mode: str, size: int, begin: int, end: int) -> Tensor:
-    """The index of the input element for each element of the padded axis."""
-    index = torch.arange(-begin, size + end)
-    if mode == "edge":
-        return index.clamp(0, size - 1)
-    if mode != "reflect" or size <= max(begin, end):
-        raise Unsupported(f"mode {mode} of {size} element(s)")
-    index = index.abs()
-    return torch.minimum(index, 2 * size - 2 - index)
+    if mode not in _PAD_MODES or x.ndim < 3 or any((*sides[0], *sides[1])):
+        raise Unsupported(f"mode {mode} of {x.ndim} axes")
+    return F.pad(x, [n for pair in reversed(sides[2:]) for n in pair], _PAD_MODES[mode])
 
 
 @operator("DepthToSpace")
 def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
-    x, b = inputs[0], node.get("blocksize")
-    n, c, h, w = x.shape
-    if node.get("mode", "DCR") == "CRD":
-        return F.pixel_shuffle(x, b)
-    x = x.reshape(n, b, b, c // b**2, h, w).permute(0, 3, 4, 1, 5, 2)
-    return x.reshape(n, c // b**2, h * b, w * b)
+    x, side = inputs[0], node.get("blocksize")
+    if node.get("mode", "DCR") == "DCR":  # torch has the channels of a block the other way round
+        blocks = x.reshape(x.shape[0], side**2, -1, *x.shape[2:])
+        x = blocks.transpose(1, 2).reshape(x.shape)
+    return F.pixel_shuffle(x, side)
 
 
 @operator("Cast")
@@ -315,11 +292,10 @@ def cast(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Constant")
 def constant(node: Node, inputs: Inputs) -> Tensor:
-    for name in ("value", "value_float", "value_floats", "value_int", "value_ints"):
-        if name in node.attributes:
-            value = node.attributes[name]
-            return value if isinstance(value, Tensor) else torch.tensor(value)
-    raise Unsupported("a constant of text or of a sparse tensor")
+    ((name, value),) = node.attributes.items()
+    if name not in ("value", "value_float", "value_floats", "value_int", "value_ints"):
+        raise Unsupported("a constant of text or of a sparse tensor")
+    return value if isinstance(value, Tensor) else torch.tensor(value)
 
 
 @operator("ConstantOfShape", host=(0,))

@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.errors import CheckpointError, ModelError, describe
+from pnpdepth_cli.errors import CheckpointError, ModelError, wrap_user_errors
 from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file
@@ -29,7 +29,8 @@ _PREFIXES = ("module.", "_orig_mod.", "model.")
 """Prefixes of torch's DataParallel, of torch.compile, and of modules that hold the network."""
 
 _WRAPPED = re.compile(f"^(?:{'|'.join(map(re.escape, _PREFIXES))})+")
-_READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+_Reader = Callable[[Path], dict[str, Tensor] | tuple[object, list[str]]]
+_READERS: dict[str, tuple[str, _Reader]] = {
     ".safetensors": ("safetensors file", load_file),
     ".npy": ("numpy file", read_numpy_file),
     ".index": ("TensorFlow checkpoint", read_tensor_bundle),
@@ -76,19 +77,17 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
             raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content
     # The state dict in that.
-    content, names = content
+    whole, names = content
     if names:
         notes.append(f"checkpoint {path.name}: its pickle names {_some(names)}; none of it was run")
-    return _state_in(content, path, key, notes)
+    return _state_in(whole, path, key, notes)
 
 
 def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:
     files = sorted(file for file in folder.iterdir() if file.suffix in WEIGHT_SUFFIXES)
     if not files:
-        raise CheckpointError(
-            f"checkpoint {folder} is a folder without weights; it may hold"
-            f" {', '.join(WEIGHT_SUFFIXES)}"
-        )
+        kinds = ", ".join(WEIGHT_SUFFIXES)
+        raise CheckpointError(f"checkpoint {folder} is a folder without weights; these are {kinds}")
     notes.append(f"checkpoint {folder.name}: {', '.join(file.name for file in files)}")
     if len(files) == 1:
         return read_checkpoint(files[0], notes)
@@ -122,18 +121,17 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
         return _state_in(content[key], path, "", notes)
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
     held = _some([str(name) for name in content]) or "nothing"
-    way_out = f"; {path}:KEY reads that of {_some(list(states), ' or ')}"
-    raise CheckpointError(f"checkpoint {path} has {fact}; it holds {held}{way_out * bool(states)}")
+    raise CheckpointError(f"checkpoint {path} has {fact}, which {path}:KEY reads; it holds {held}")
 
 
 def _only_tensors(mapping: Mapping[Any, object]) -> bool:
     return all(isinstance(k, str) and isinstance(v, Tensor) for k, v in mapping.items())
 
 
-def _some(names: list[str], between: str = ", ") -> str:
+def _some(names: list[str]) -> str:
     """The first few of the names, and how many more there are."""
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-    return f"{between.join(map(_short, names[:_SHOWN_NAMES]))}{more}"
+    return f"{', '.join(map(_short, names[:_SHOWN_NAMES]))}{more}"
 
 
 def _short(word: str) -> str:
@@ -178,7 +176,12 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     notes = list[str]()
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
     stored = _without_prefixes(read_checkpoint(path, notes), path, notes, own)
-    state = _renamed(definition, stored, path)
+    state: Mapping[str, Tensor] = stored
+    if definition.read_checkpoint is not None:
+        with wrap_user_errors(f"read_checkpoint of network {definition.name!r} for {path}"):
+            state = definition.read_checkpoint(stored)
+        if not isinstance(state, Mapping) or not _only_tensors(state):
+            raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
     _check_fit(own, state, f"checkpoint {path} does not fit network {definition.name!r}")
     # A sum shows a value that is not finite, without a copy of the tensor.
     broken = [
@@ -193,24 +196,6 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
         )
     network.load_state_dict(state, strict=False)
     return notes
-
-
-def _renamed(
-    definition: ModelDefinition, stored: Mapping[str, Tensor], path: Path
-) -> Mapping[str, Tensor]:
-    """The tensors as the definition renames those of a published file."""
-    if definition.read_checkpoint is None:
-        return stored
-    try:
-        state = definition.read_checkpoint(stored)
-    except Exception as error:  # what a definition raises at an unknown layout is its own
-        raise CheckpointError(
-            f"checkpoint {path} is not in a layout that {definition.name!r} reads"
-            f" ({describe(error)})"
-        ) from None
-    if not isinstance(state, Mapping) or not _only_tensors(state):
-        raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
-    return state
 
 
 def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: str) -> None:

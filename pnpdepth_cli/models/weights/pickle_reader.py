@@ -18,11 +18,11 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from mmap import mmap
-from typing import Any, cast
+from typing import Any
 
 from torch import Tensor
 
@@ -45,7 +45,7 @@ _OPCODES = (
 )
 """Opcodes of protocols 2 to 5; no others are done, as some take the memory that a size claims."""
 
-LoadStorage = Callable[[tuple[Any, ...]], Tensor]
+LoadStorage = Callable[[tuple[object, ...]], Tensor]
 """Function that returns the flat tensor for ("storage", type, key, location, elements, ...)."""
 
 
@@ -203,7 +203,7 @@ def read_pickle(
     return unpickler.load(), list(unpickler.stood_for)
 
 
-def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
+def view_of(storage: Tensor, offset: int, shape: Sequence[int], stride: Sequence[int]) -> Tensor:
     """Returns a tensor over a flat one by `as_strided`, which refuses what lies beyond it.
 
     Raises:
@@ -213,4 +213,4 @@ def view_of(storage: Any, offset: Any, shape: Any, stride: Any) -> Tensor:
     count = math.prod(shape)
     most = max(len(storage), _MAX_EXPANDED)
     check_claim(f"a tensor has {count:.6g} elements", count, most, error=BrokenFileError)
-    return cast(Tensor, storage.as_strided(shape, stride, int(offset) if count else 0))
+    return storage.as_strided(shape, stride, int(offset) if count else 0)

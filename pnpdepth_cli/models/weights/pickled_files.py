@@ -168,7 +168,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
 
 
 def _load_storage(
-    storages: dict[str, Tensor], read: Callable[[str, int], bytearray], pid: tuple[Any, ...]
+    storages: dict[str, Tensor], read: Callable[[str, int], bytearray], pid: tuple[object, ...]
 ) -> Tensor:
     """The storage for ("storage", type, key, location, elements, view) as a flat tensor.
 
@@ -177,9 +177,10 @@ def _load_storage(
     kind, key = pid[1].path.rpartition(".")[2] if isinstance(pid[1], StandIn) else "", pid[2]
     if kind not in _DTYPES:
         raise BrokenFileError(f"a storage of type {kind[:40] or '?'}")
-    if not isinstance(key, str | int):
-        raise BrokenFileError("a storage without a key")
-    key, dtype, count = str(key), _DTYPES[kind], int(pid[4])
+    count = pid[4]
+    if not isinstance(key, str | int) or not isinstance(count, int):
+        raise BrokenFileError("a storage without a key or a size")
+    key, dtype = str(key), _DTYPES[kind]
     if key not in storages:
         data = read(key, count * dtype.itemsize)
         storages[key] = torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
