@@ -197,7 +197,7 @@ def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
             key=f"{measure.key}_{name}",
             title=f"{measure.title} {title}",
             main=False,
-            of_pixels=_within(measure.of_pixels, low_m, high_m),
+            of_pixels=partial(_within, of=measure.of_pixels, low_m=low_m, high_m=high_m),
         )
         for name, title, low_m, high_m in parts
         for measure in MEASURES
@@ -205,15 +205,10 @@ def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
     )
 
 
-def _within(of_pixels: OfPixels, low_m: float, high_m: float) -> OfPixels:
-    """The formula of the pixels whose true depth lies in [low_m, high_m)."""
-
-    def within(pixels: Pixels) -> Tensor:
-        inside = (pixels.truth >= low_m) & (pixels.truth < high_m)
-        part = Pixels(pixels.predicted[inside], pixels.truth[inside], pixels.thresholds)
-        return of_pixels(part)
-
-    return within
+def _within(pixels: Pixels, of: OfPixels, low_m: float, high_m: float) -> Tensor:
+    """The value of the pixels whose true depth lies in [low_m, high_m)."""
+    inside = (pixels.truth >= low_m) & (pixels.truth < high_m)
+    return of(Pixels(pixels.predicted[inside], pixels.truth[inside], pixels.thresholds))
 
 
 _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))
@@ -255,22 +250,23 @@ def _boundary_counts(
     """
     import numpy as np
 
+    height, width = truth.shape
+    predicted, truth = (np.pad(image, 1) for image in (predicted, truth))  # unknown around them
+
+    def moved(down: int, right: int) -> tuple[slice, slice]:
+        rows = slice(1 + margin + down, 1 + height - margin + down)
+        return rows, slice(1 + margin + right, 1 + width - margin + right)
+
     counts, pairs = np.zeros((3, len(offsets), len(_RATIOS))), 0
     for number, offset in enumerate(offsets):
-        # the pixels and their neighbours
-        windows = []
-        for step, side in zip(offset, truth.shape, strict=True):
-            start, stop = max(margin, -step), side - max(margin, step)
-            windows.append((slice(start, stop), slice(start + step, stop + step)))
-        here, there = zip(*windows, strict=True)
+        # the pixels and their neighbours, and by which factor these are farther
+        here, there = moved(0, 0), moved(*offset)
         known = (truth[here] > 0) & (truth[there] > 0)
         pairs += int(np.count_nonzero(known))
-        # by which factor the neighbours are farther
         factors = []
         for image in (predicted, truth):
             own, other = (image[part][known].astype(np.float64) for part in (here, there))
-            has_both = (own > 0) & (other > 0)
-            factors.append(np.divide(other, own, out=np.zeros_like(own), where=has_both))
+            factors.append(np.divide(other, own, out=np.zeros_like(own), where=own > 0))
         for place, ratio in enumerate(_RATIOS):
             is_own, is_true = (factor > ratio for factor in factors)
             found = (is_own & is_true, is_own, is_true)

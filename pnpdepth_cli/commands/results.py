@@ -16,8 +16,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 
-DEPTH_ENDING = "_depth"
-"""End of the stem of a depth file."""
+_DEPTH = "_depth"  # end of the stem of a depth file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,15 +74,15 @@ def result_frames(root: Path) -> list[ResultFrame]:
         InputError: There is none, or a record cannot be read.
     """
     if not root.is_dir():
-        return [_frame(root.stem.removesuffix(DEPTH_ENDING), root)]
+        return [_frame(root.stem.removesuffix(_DEPTH), root)]
     files, _ = find_files(root, DEPTH_SUFFIXES)
     frames = [
-        _frame(name.removesuffix(DEPTH_ENDING), path)
+        _frame(name.removesuffix(_DEPTH), path)
         for name, path in files.items()
-        if name.endswith(DEPTH_ENDING)
+        if name.endswith(_DEPTH)
     ]
     if not frames:
-        raise InputError(f"{root} has no files NAME{DEPTH_ENDING}.png or of another format")
+        raise InputError(f"{root} has no files NAME{_DEPTH}.png or of another format")
     return frames
 
 
@@ -98,5 +97,5 @@ def _frame(name: str, depth: Path) -> ResultFrame:
 
 
 def _beside(depth: Path, ending: str) -> Path | None:
-    path = depth.with_name(depth.stem.removesuffix(DEPTH_ENDING) + ending)
+    path = depth.with_name(depth.stem.removesuffix(_DEPTH) + ending)
     return path if path != depth and path.is_file() else None

@@ -15,21 +15,14 @@ import torch
 from pnpdepth_cli import __version__
 
 
-class Stopwatch:
-    """`with watch("read"):` adds the seconds of the block to `seconds["read"]`."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Adds the time spent inside to the stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            spent = time.perf_counter() - start
-            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + spent, 4)
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Adds the time spent inside to the seconds of the stage."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] = round(seconds.get(stage, 0.0) + time.perf_counter() - start, 4)
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:

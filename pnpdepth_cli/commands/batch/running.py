@@ -29,7 +29,7 @@ from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
 from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.commands.stopwatch import Stopwatch
+from pnpdepth_cli.commands.stopwatch import timed
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import (
@@ -131,7 +131,7 @@ class _Work:
     """A frame on its way: what was read and refined, or the error that ended it."""
 
     request: RefineRequest
-    watch: Stopwatch = field(default_factory=Stopwatch)
+    seconds: dict[str, float] = field(default_factory=dict)
     inputs: dict[str, Fingerprint] = field(default_factory=dict)
     frame: Frame | None = None
     refined: Refined | None = None
@@ -141,7 +141,7 @@ class _Work:
     def step(self, name: str) -> Iterator[None]:
         """Measures the time of the block; an error in it is this frame's alone, and kept."""
         try:
-            with self.watch(name):
+            with timed(self.seconds, name):
                 yield
         except Exception as error:
             self.error = error
@@ -210,7 +210,7 @@ def _write(work: _Work, method: Method | None, records: Records) -> FrameRecord:
         try:
             return write_refined(
                 request, records.outputs_of(request.files), method, work.frame, work.refined,
-                work.watch, batch=records.state(request, work.inputs),
+                work.seconds, batch=records.state(request, work.inputs),
                 folder=records.request.output,
             )  # fmt: skip
         except StorageError:

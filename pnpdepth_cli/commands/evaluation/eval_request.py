@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
@@ -133,7 +132,7 @@ class EvalRequest:
         return f"{self.protocol}{changed}: {', '.join(texts)}; mean over the images"
 
 
-def scoring_of(rules: Protocol, scale_by: str = "none") -> dict[str, Any]:
+def scoring_of(rules: Protocol, scale_by: str = "none") -> dict[str, object]:
     """Returns the rules that decide figures, by their names."""
     names = ("min_depth", "max_depth", "clip", "crop", "missing", "exclude_sparse")
     return {name: getattr(rules, name) for name in names} | {

@@ -20,7 +20,7 @@ from pnpdepth_cli.commands.refinement.outputs import (
     write_outputs,
 )
 from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
-from pnpdepth_cli.commands.stopwatch import Stopwatch, peak_memory_mb, versions
+from pnpdepth_cli.commands.stopwatch import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.tables import names_of_depths
 from pnpdepth_cli.completion.baselines import Baseline
 from pnpdepth_cli.completion.interpolation import linear
@@ -58,15 +58,15 @@ def refine_image(request: RefineRequest) -> FrameRecord:
     Raises:
         PnpDepthError: Any of its kinds; then nothing is written.
     """
-    watch = Stopwatch()
+    seconds = dict[str, float]()
     outputs = plan_outputs(request)
-    with watch("read"):
+    with timed(seconds, "read"):
         inputs = read_requested(request)
-    with watch("load network"):
+    with timed(seconds, "load network"):
         method = load_method(request, inputs)
-    with watch("refine"), method:
+    with timed(seconds, "refine"), method:
         frame = method.refine(inputs)
-    return write_refined(request, outputs, method, inputs, frame, watch)
+    return write_refined(request, outputs, method, inputs, frame, seconds)
 
 
 def read_requested(request: RefineRequest) -> Frame:
@@ -114,7 +114,7 @@ def write_refined(
     method: Method,
     inputs: Frame,
     frame: Refined,
-    watch: Stopwatch,
+    seconds: dict[str, float],
     *,
     batch: BatchState | None = None,
     folder: Path | None = None,
@@ -129,7 +129,7 @@ def write_refined(
         method: The method that refined it.
         inputs: The frame as it was read.
         frame: The refined frame.
-        watch: Gets the time of writing.
+        seconds: Seconds by what they were spent on; gets those of writing.
         batch: What the record keeps for the batch that the frame is of.
         folder: Output folder of that batch, which the record's paths start from.
     """
@@ -138,7 +138,7 @@ def write_refined(
     make_folder(outputs["depth"].parent, below=folder)
     remove_outdated(outputs)
     with all_or_none(outputs.values()):
-        with watch("write"):
+        with timed(seconds, "write"):
             figures = write_outputs(outputs, inputs, frame, names_of_depths(record))
         record = replace(
             record,
@@ -148,7 +148,7 @@ def write_refined(
                 kind: path.relative_to(folder).as_posix() if folder else str(path)
                 for kind, path in outputs.items()
             },
-            seconds=watch.seconds,
+            seconds=seconds,
             peak_memory_mb=peak_memory_mb(method.own.network.device),
         )
         if "record" in outputs:
