@@ -1,5 +1,8 @@
 """An ONNX file as a definition. On the first image, onnxruntime checks what torch computes.
 
+The network's submodules are the graph's nodes, under their own names. What depends on no input is
+computed once, when the module is made, and arithmetic on shapes is no layer.
+
 `net.onnx`, or `net.onnx:OUTPUT` if the graph has several outputs. Needs `pip install
 pnpdepth[onnx]`.
 """
@@ -8,12 +11,14 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
+from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
@@ -23,15 +28,25 @@ from pnpdepth_cli.models.definition import (
     Multiple,
     graph_definition,
 )
-from pnpdepth_cli.models.file_graph import FileGraph
-from pnpdepth_cli.models.onnx.graph import onnx_graph, opset_of
+from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit, Unsupported
+from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
+from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
 
 if TYPE_CHECKING:
-    from onnx import ModelProto, ValueInfoProto
+    from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
 
 _OPSETS = range(7, 25)  # onnxruntime runs none that is older
 _MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
 _SHARED = 2  # tensors that may have the same bytes of a file beside the model
+
+_STANDARD = ("", "ai.onnx")
+_TO_SHAPES = ("Shape", "Size")
+_CONSTANT_ELEMENTS, _CONSTANT_GROWTH, _CONSTANTS = 1 << 24, 4, 4
+"""One computed constant may have so many elements, or so many times those stored in the file; all
+of them together so many times as many as one."""
+
+_WORK = 1 << 32
+"""Elements that may be read, and products summed, for all computed constants: seconds."""
 
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
@@ -59,7 +74,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
         list(inputs.values()), file, stated,
         size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
         build=lambda: onnx_graph(model, file),
-        summary=f"ONNX, opset {opset_of(model)}, from {model.producer_name or 'no name'}",
+        summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'no name'}",
         output=_as_map,
         verify=functools.partial(_compare, source, file),
     )  # fmt: skip
@@ -98,9 +113,9 @@ def _read(file: Path) -> ModelProto:
         words = (node.name, node.op_type, node.domain, *node.input, *node.output)
         if not all(isinstance(word, str) for word in words):
             raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
-    if opset_of(model) not in _OPSETS:
+    if _opset(model) not in _OPSETS:
         raise ModelError(
-            f"ONNX file {file} is of opset {opset_of(model)}; export it with one from"
+            f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
             f" {_OPSETS[0]} to {_OPSETS[-1]}"
         )
     return model
@@ -218,3 +233,129 @@ def _deviation(actual: Tensor, expected: Tensor) -> float:
     actual, expected = actual[both].float(), expected[both]
     largest, difference = float(expected.abs().amax()), float((actual - expected).abs().amax())
     return difference / largest if largest else difference
+
+
+def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
+    """Returns an ONNX model as a module: called with the graph's inputs, it returns its output.
+
+    Args:
+        model: The onnx.ModelProto with one output, its nodes in order.
+        path: File of the model, for messages.
+
+    Raises:
+        ModelError: An operator is not covered; the message names every one.
+    """
+    _check_operators(model.graph.node, path)
+    graph, opset = FileGraph(), _opset(model)
+    constants = {tensor.name: _tensor(tensor, path) for tensor in model.graph.initializer}
+    stored = sum(constant.numel() for constant in constants.values())
+    largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * stored)
+    limit = SizeLimit(largest, in_all=_CONSTANTS * largest, work=_WORK)
+    for value in model.graph.input:
+        if value.name not in constants:
+            graph.add_input(value.name)
+    shapes = set[str]()
+    for name, proto in zip(_names(model.graph.node), model.graph.node, strict=True):
+        # The operator and its inputs, of which one may be left out.
+        attributes = {a.name: _attribute(a, path) for a in proto.attribute}
+        used = sum(bool(output) for output in proto.output)
+        node = Node(op=proto.op_type, opset=opset, outputs=used, attributes=attributes)
+        title = f"ONNX file {path}: node {name!r}: {node.op}"
+        operation = Operation(title, functools.partial(_compute, node))
+        handed_in = [n for n in proto.input if n and n not in constants]
+        if not graph.values.keys() >= {*handed_in}:
+            raise ModelError(f"{title} reads a value that nothing before it gives")
+        # What only constants go into is computed now.
+        if not handed_in:
+            with torch.no_grad(), limit, wrap_user_errors(title):
+                result = operation(*map(constants.get, proto.input))
+            results = result if isinstance(result, tuple) else (result,)
+            constants.update(zip(proto.output, results, strict=False))
+            continue
+        on_shapes = node.op in _TO_SHAPES or shapes.issuperset(handed_in)
+        shapes.update(filter(None, proto.output if on_shapes else ()))
+        # Constants become weights, but for those that stay on the CPU.
+        inputs: list[Argument] = []
+        for index, n in enumerate(proto.input):
+            if n in constants and (on_shapes or index in HOST_INPUTS[node.op]):
+                inputs.append(constants[n])
+            elif n in constants and n not in graph.values:
+                inputs.append(graph.add_tensor(n, constants[n]))
+            else:
+                inputs.append(graph.values.get(n))
+        outputs = proto.output if node.op == "Split" else proto.output[0]
+        graph.add_operation(name, operation, inputs, {}, outputs, is_layer=not on_shapes)
+    output = model.graph.output[0].name
+    if output in constants:
+        raise ModelError(f"ONNX file {path}: its output depends on no input")
+    graph.set_outputs([output])
+    return graph
+
+
+def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
+    """The node's outputs. Arithmetic on shapes stays on the CPU."""
+    if node.outputs > 1 and node.op != "Split":
+        raise Unsupported("more than its first output")
+    for name, only in ONLY.items():
+        if node.get(name, only) != only:
+            raise Unsupported(f"{name} {node.get(name)!r}")
+    devices = [value.device for value in inputs if value is not None and not value.is_cpu]
+    moved: list[Any] = []
+    for index, value in enumerate(inputs):
+        device = "cpu" if index in HOST_INPUTS[node.op] or not devices else devices[0]
+        moved.append(value if value is None else value.to(device))
+    return OPERATORS[node.op](node, moved)
+
+
+def _opset(model: ModelProto) -> int:
+    return max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
+
+
+def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
+    unknown: Counter[str] = Counter()
+    for proto in nodes:
+        standard = proto.domain in _STANDARD
+        if not standard or proto.op_type not in OPERATORS:
+            unknown[proto.op_type if standard else f"{proto.domain}.{proto.op_type}"] += 1
+    if unknown:
+        listed = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
+        raise ModelError(
+            f"ONNX file {path} uses operators that are not covered: {listed}; export the network"
+            " with others, or bring it as a Python file"
+        )
+
+
+def _names(nodes: Iterable[NodeProto]) -> list[str]:
+    """Names of the nodes for --layer; a node without a name has operator and output."""
+    names: list[str] = []
+    for proto in nodes:
+        first = next((output for output in proto.output if output), "")
+        name = proto.name or f"{proto.op_type}_{first}"
+        if name.replace(".", "").isdigit():
+            name = f"{proto.op_type}_{name}"
+        names.append(name.translate(str.maketrans("#[]", "___")))
+    return names
+
+
+def _attribute(proto: AttributeProto, path: Path) -> object:
+    from onnx import AttributeProto, helper
+
+    if proto.type == AttributeProto.TENSOR:
+        return _tensor(proto.t, path)
+    value = helper.get_attribute_value(proto)
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return list(value) if proto.type in (AttributeProto.INTS, AttributeProto.FLOATS) else value
+
+
+def _tensor(proto: TensorProto, path: Path) -> Tensor:
+    from onnx import numpy_helper
+
+    if proto.data_type in (proto.FLOAT16, proto.BFLOAT16):
+        raise ModelError(f"ONNX file {path} is in half precision; export the network in float32")
+    try:
+        return torch.tensor(numpy_helper.to_array(proto))
+    except (ValueError, TypeError, KeyError, RuntimeError) as error:
+        raise ModelError(
+            f"ONNX file {path}: tensor {proto.name!r} cannot be read ({error})"
+        ) from None

@@ -19,7 +19,7 @@ import onnx.backend.test.case.node as standard  # noqa: E402
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 from pnpdepth_cli.errors import ModelError  # noqa: E402
-from pnpdepth_cli.models.onnx.graph import onnx_graph  # noqa: E402
+from pnpdepth_cli.models.onnx import onnx_graph  # noqa: E402
 from pnpdepth_cli.models.onnx.operators import OPERATORS  # noqa: E402
 
 F32, I64 = np.float32, np.int64
