@@ -20,8 +20,8 @@ _COEFFICIENTS = {
     "SIMPLE_RADIAL_FISHEYE": "-0.03",
 }
 CAMERAS = {
-    name: f"{'50' if model.focals == 1 else '50 52'} 32.5 23 {_COEFFICIENTS.get(name, '')}".strip()
-    for name, model in MODELS.items()
+    name: f"{'50' if focals == 1 else '50 52'} 32.5 23 {_COEFFICIENTS.get(name, '')}".strip()
+    for name, (_, focals, *_) in MODELS.items()
 }
 """Parameters by the name of the camera model."""
 

@@ -38,7 +38,7 @@ def test_the_cloud_lies_on_the_points_of_the_model(folder: Path) -> None:
     points = np.array([model.points3D[n].xyz for n in seen if model.points3D[n].track.length() > 2])
     pose = image.cam_from_world()
     depth = (points @ pose.rotation.matrix().T + pose.translation)[:, 2]
-    cloud = read_scan(folder / "room" / "scene.ply").points[:, :3]
+    cloud = read_scan(folder / "room" / "scene.ply")[0][:, :3]
     assert len(cloud) > 10_000
     near = depth < 1.5 * np.median(depth)
     off, _ = cKDTree(cloud).query(points[near])

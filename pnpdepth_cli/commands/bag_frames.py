@@ -239,7 +239,7 @@ def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np
     scans = sorted((folder / "sparse").iterdir())
     for scan in scans[:: math.ceil(len(scans) / _COMPARED_FRAMES)]:
         (image,) = (folder / "rgb").glob(f"{scan.stem}.*")
-        yield read_rgb(image).values, read_scan(scan).points
+        yield read_rgb(image).values, read_scan(scan)[0]
 
 
 def _calibration_text(calibration: Calibration) -> str:

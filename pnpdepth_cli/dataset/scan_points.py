@@ -83,8 +83,8 @@ def read_scan_points(
         raise SizeError(f"{named} does not give the image's size; give --image")
     warnings = check_size(named, calibration.camera, size, image)
     # The returns of the scan.
-    scan = read_scan(path)
-    xyz, no_returns, mended = scan_returns(path, scan.points, scale)
+    stored, source = read_scan(path)
+    xyz, no_returns, mended = scan_returns(path, stored, scale)
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, xyz)]
         calibration, note = choose_camera(calibration, frames)
@@ -107,7 +107,7 @@ def read_scan_points(
             visible = project_velodyne(xyz, camera, scanner, size)
         warnings += _better_reading(visible, calibration, options, image)
     # What a person should know, and what a record keeps.
-    reading = Reading(f"{scan.source} of {len(xyz):,} points, {camera.source}")
+    reading = Reading(f"{source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
     if lost := describe_dropped(points.dropped):
         notes.append(f"sparse: dropped {lost}")

@@ -253,19 +253,19 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     camera = image.camera
     assert camera.size is not None
     # The points of the image's tracks, else all.
-    row = np.flatnonzero(np.isin(points.number, image.points))
+    row = np.flatnonzero(np.isin(points["number"], image.points))
     untracked = not len(row)
     if untracked:
-        row = np.arange(len(points.number))
+        row = np.arange(len(points["number"]))
     # Points of short tracks and with large reprojection errors go.
     total, drops = len(row), DropCounter()
     least = min(_LEAST_TRACK, len(model.images))
-    if points.track.any():
-        row = row[drops.keep(points.track[row] >= least, f"seen in fewer than {least} images")]
+    if points["track"].any():
+        row = row[drops.keep(points["track"][row] >= least, f"seen in fewer than {least} images")]
     why = f"with a reprojection error above {_MOST_REPROJECTION_PX:g} px"
-    row = row[drops.keep(points.error[row] <= _MOST_REPROJECTION_PX, why)]
+    row = row[drops.keep(points["error"][row] <= _MOST_REPROJECTION_PX, why)]
     # The others are projected.
-    seen = image.pose.apply(points.xyz[row])
+    seen = image.pose.apply(points["xyz"][row])
     front = drops.keep(seen[:, 2] > 0, "behind the camera")
     if len(row) and not front.any():
         raise InputError(
@@ -291,8 +291,8 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
 
 def _output_scale(model: ColmapModel) -> float:
     """A power of two, one for the whole model, so that its depths use the codes of 16 bits."""
-    centre = np.median(model.points.xyz, axis=0)
-    extent = float(np.median(np.linalg.norm(model.points.xyz - centre, axis=1)))
+    centre = np.median(model.points["xyz"], axis=0)
+    extent = float(np.median(np.linalg.norm(model.points["xyz"] - centre, axis=1)))
     poses = model.images.values()
     path = [np.linalg.norm(image.pose.inverse().translation - centre) for image in poses]
     farthest = _SIZES_IN_RANGE * max(extent, float(np.median(path)), 1e-9)

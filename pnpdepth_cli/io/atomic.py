@@ -106,8 +106,7 @@ def make_folder(folder: Path, *, below: Path | None = None) -> None:
 
 def remove_leftovers(folder: Path) -> int:
     """Removes what killed writers left, while nobody writes there; returns how many there were."""
-    names = [entry.name for entry in os.scandir(folder)] if folder.is_dir() else []
-    leftovers = [folder / name for name in names if _TEMPORARY.fullmatch(name)]
+    leftovers = [path for path in folder.glob(".*") if _TEMPORARY.fullmatch(path.name)]
     for path in leftovers:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -154,7 +153,7 @@ def in_turn(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _hold(path: Path, timeout_s: float | None = None) -> Iterator[None]:
+def _hold(path: Path, timeout_s: float = _TRIED_S) -> Iterator[None]:
     """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
     from filelock import FileLock, Timeout  # it imports asyncio
 
@@ -162,7 +161,7 @@ def _hold(path: Path, timeout_s: float | None = None) -> Iterator[None]:
         raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
     lock = FileLock(path)
     try:
-        lock.acquire(timeout=_TRIED_S if timeout_s is None else timeout_s)
+        lock.acquire(timeout=timeout_s)
     except Timeout:
         raise OutputError(f"another batch writes to {path.parent}; wait for it to end") from None
     except OSError as error:

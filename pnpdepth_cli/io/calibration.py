@@ -38,8 +38,15 @@ _PERSPECTIVE, _FROM_CAMERA_0 = "perspective.txt", "calib_cam_to_velo.txt"  # of 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
-_MATRICES = ("camera_matrix", "cameraMatrix", "K", "k")
-_DISTORTIONS = ("distortion_coefficients", "distCoeffs", "distortion", "D", "d")
+_MATRICES = ("camera_matrix", "cameraMatrix", "K", "k", "intrinsics")
+_DISTORTIONS = (
+    "distortion_coefficients",
+    "distCoeffs",
+    "distortion_coeffs",
+    "distortion",
+    "D",
+    "d",
+)
 _POSES = ("T_camera_lidar", "T_cam_lidar")
 _LENSES = dict.fromkeys(
     ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"),
@@ -49,8 +56,9 @@ _LENSES = dict.fromkeys(
 
 _COEFFICIENTS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
 _FALSE = ("0", "false", "False")
-_FIELD = re.compile(r"^\s*([A-Za-z_]\w*)(?:\s*:|\s+(?=[-+.\d]))(.*)$")
-"""A name and its value; KITTI's tracking set has names without a colon."""
+_FIELD = re.compile(r"^[ \t]*([A-Za-z_]\w*)(?:[ \t]*:|[ \t]+(?=[-+.\d]))", re.MULTILINE)
+"""A name at the beginning of a line; KITTI's tracking set has names without a colon."""
+_COMMENT = re.compile(r"#.*|^---[ \t]*$", re.MULTILINE)
 
 _LARGEST = 1e9
 """Largest number of a calibration, in pixels or metres; beyond it, products overflow."""
@@ -85,7 +93,7 @@ class _Fields:
 
     def text(self, name: str, default: str) -> str:
         """Returns a value as a word; an empty one is the default."""
-        return str(self.values.get(name) or default).strip(" \"'") or default
+        return str(self.values.get(name) or default).strip(" \n\"'") or default
 
     def numbers(self, name: str, count: int | None = None) -> list[float]:
         """Returns the finite numbers of a value; so many, if there is a count."""
@@ -140,9 +148,12 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
         fields = _named_values(path, text)
     else:
-        fields = _Fields(path, _bare_intrinsics(text))
+        numbers = numbers_in(text) or []
+        sized = {"K": numbers[:4], "size": numbers[4:]}
+        fields = _Fields(path, sized if len(numbers) == 6 else {"K": text})
     if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
-        return _kitti(fields, camera)
+        name = fields.first(("Tr", "Tr_velo_cam")) or "Tr_velo_to_cam"
+        return _kitti(fields, camera, "KITTI", pose_of_matrix(path, name, fields.numbers(name)))
     if unknown := sorted(set(fields.values) - set(_PLAIN)):
         fact = f"{unknown[0]!r} is not part of a calibration"
         raise FileFormatError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
@@ -161,17 +172,16 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
         name = f"cam{0 if camera is None else camera}"
         if name not in chain:
             raise UsageError(f"{path} has no {name}; --camera can be one of: {', '.join(chain)}")
-        calibration = _kalibr(_Fields(path, chain[name]), name)
-    else:
-        kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
-        fields = {name: content[name] for name in content if name != "R"}  # the rectification
-        calibration = _single(_Fields(path, fields), camera, kind)
-        rectified = _rectified_cameras(_Fields(path, content), calibration.camera)
-        calibration = replace(calibration, rectified=rectified)
-    read = calibration.camera
-    if not read.distortion:
-        return calibration
-    return replace(calibration, camera=replace(read, source=f"{read.source}, {read.lens} lens"))
+        fields = _Fields(path, chain[name])
+        if (model := fields.text("camera_model", "pinhole")) != "pinhole":
+            fact = f"{name} is of model {one_line(model)[:20]}"
+            raise FileFormatError(f"{path}: {fact}; calibrate it as a pinhole camera")
+        return _single(fields, None, f"Kalibr camchain, {name}")
+    kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
+    plain = {name: content[name] for name in content if name != "R"}  # the rectification
+    calibration = _single(_Fields(path, plain), camera, kind)
+    rectified = _rectified_cameras(_Fields(path, content), calibration.camera)
+    return replace(calibration, rectified=rectified)
 
 
 def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
@@ -201,19 +211,37 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
     return {name: (plain, pose) for name, pose in {**poses, "P": SAME_PLACE}.items()}
 
 
-def _kitti(fields: _Fields, camera: int | None) -> Calibration:
-    """KITTI's object set (R0_rect, Tr_velo_to_cam), tracking set (R_rect, Tr_velo_cam) and odometry
-    set (Tr, already rectified)."""
-    number = _camera(fields, camera, r"P(\d)")
-    scanner = fields.first(("Tr", "Tr_velo_cam")) or "Tr_velo_to_cam"
-    matrix = fields.matrix(scanner, 3, 4)
-    turn = fields.first(("R_rect",)) or "R0_rect"
-    return _rectified_calibration(
-        fields.path,
-        fields.matrix(f"P{number}", 3, 4),
-        np.eye(3) if scanner == "Tr" else fields.matrix(turn, 3, 3),
-        check_pose(fields.path, "rotation of the scanner", matrix[:, :3], matrix[:, 3]),
-        f"KITTI calibration, camera {number}",
+def _kitti(
+    fields: _Fields, camera: int | None, kind: str, scanner: Extrinsics | None
+) -> Calibration:
+    """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset.
+
+    Of KITTI's object set (R0_rect), tracking set (R_rect), odometry set (already rectified, its
+    pose is named Tr), raw data and KITTI-360 (R_rect_00: camera 0's rectification is that of all).
+    """
+    # The number of the camera.
+    number, path = CAMERA if camera is None else camera, fields.path
+    matches = (re.fullmatch(r"P(?:_rect_0)?(\d)", name) for name in fields.values)
+    present = sorted(int(match[1]) for match in matches if match)
+    if number not in present:
+        listing = ", ".join(map(str, present)) or "none"
+        raise UsageError(f"{path} has no camera {number}; --camera can be one of: {listing}")
+    # Its intrinsics, and the rotation and offset that rectify it.
+    projection = fields.matrix(fields.first((f"P{number}",)) or f"P_rect_0{number}", 3, 4)
+    turn = fields.first(("R_rect", "R_rect_00")) or "R0_rect"
+    rectify = np.eye(3) if "Tr" in fields.values else fields.matrix(turn, 3, 3)
+    intrinsics = _check_intrinsics(path, projection[:, :3])
+    offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
+    pose = check_pose(path, "rectification", rectify, offset)
+    size = fields.first((f"S_rect_0{number}",))
+    return Calibration(
+        camera=Camera(
+            intrinsics=intrinsics,
+            size=_height_width(path, fields.numbers(size, 2)) if size else None,
+            source=f"{kind} calibration, camera {number}",
+        ),
+        scanner=None if scanner is None else pose @ scanner,
+        rectification=pose,
     )
 
 
@@ -230,90 +258,49 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
         pose = pose_of_matrix(scanner, "the matrix", numbers_in(read_text(scanner)) or []).inverse()
     elif scanner.is_file():
         pose = _named_values(scanner, read_text(scanner)).pose("T")
-    # The camera. The development kit of the raw data rotates each by camera 0's rectification.
     fields = _named_values(cameras, read_text(cameras))
-    number = _camera(fields, 0 if is_360 and camera is None else camera, r"P_rect_(\d\d)")
-    return _rectified_calibration(
-        cameras,
-        fields.matrix(f"P_rect_{number:02}", 3, 4),
-        fields.matrix("R_rect_00", 3, 3),
-        pose,
-        f"{'KITTI-360' if is_360 else 'KITTI raw'} calibration, camera {number}",
-        _height_width(cameras, fields.numbers(f"S_rect_{number:02}", 2)),
-    )
-
-
-def _bare_intrinsics(text: str) -> Mapping[str, object]:
-    """K, and the size if it is there, of numbers without names."""
-    numbers = numbers_in(text) or []
-    if len(numbers) == 16:  # ScanNet's, by rows
-        return {"K": [numbers[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]}
-    if len(numbers) in (4, 6):
-        return {"K": _by_rows(*numbers[:4])} | ({"size": numbers[4:]} if numbers[4:] else {})
-    return {"K": text}
-
-
-def _by_rows(fx: float, fy: float, cx: float, cy: float) -> list[float]:
-    return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-
-
-def _rectified_calibration(
-    path: Path,
-    projection: Floats,
-    rectify: Floats,
-    scanner: Extrinsics | None,
-    source: str,
-    size: tuple[int, int] | None = None,
-) -> Calibration:
-    """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
-    intrinsics = _check_intrinsics(path, projection[:, :3])
-    offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
-    rectify_pose = check_pose(path, "rectification", rectify, offset)
-    return Calibration(
-        camera=Camera(intrinsics=intrinsics, size=size, source=source),
-        scanner=None if scanner is None else rectify_pose @ scanner,
-        rectification=rectify_pose,
-    )
-
-
-def _kalibr(fields: _Fields, name: str) -> Calibration:
-    model, values = fields.text("camera_model", "pinhole"), fields.numbers("intrinsics")
-    if model != "pinhole" or len(values) != 4:
-        fact = f"a {one_line(model)[:20]} camera with {len(values)} intrinsics"
-        raise FileFormatError(f"{fields.path}: {name} is {fact}; calibrate it as a pinhole one (4)")
-    plain = {key: fields.values[key] for key in _POSES if key in fields.values}
-    plain |= {"K": _by_rows(*values), "lens": fields.text("distortion_model", "none")}
-    plain["distortion"] = fields.values.get("distortion_coeffs", [])
-    if "resolution" in fields.values:
-        plain["size"] = fields.values["resolution"]
-    return _single(_Fields(fields.path, plain), None, f"Kalibr camchain, {name}")
+    if is_360:
+        return _kitti(fields, camera or 0, "KITTI-360", pose)
+    return _kitti(fields, camera, "KITTI raw", pose)
 
 
 def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
-    """The camera of a plain file, or of one of OpenCV or ROS."""
+    """The camera of a plain file, or of one of OpenCV, ROS or Kalibr."""
     path = fields.path
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
-    intrinsics = _check_intrinsics(path, fields.matrix(fields.first(_MATRICES) or "K", 3, 3))
+    # The intrinsics: fx fy cx cy, 3×3, or 4×4 as ScanNet has them.
+    name = fields.first(_MATRICES) or "K"
+    numbers = fields.numbers(name)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+    if len(numbers) not in (9, 16):
+        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers, not 4, 9 or 16")
+    matrix = np.reshape(numbers, (math.isqrt(len(numbers)), -1))[:3, :3]
     lens, distortion = _lens(fields)
+    if distortion:
+        source += f", {lens} lens"
     # The pose of the scanner, as a matrix or as R and t.
     scanner = None
-    if name := fields.first(_POSES):
-        scanner = pose_of_matrix(path, name, fields.numbers(name))
+    if pose := fields.first(_POSES):
+        scanner = pose_of_matrix(path, pose, fields.numbers(pose))
     elif "R" in fields.values or "t" in fields.values:
         scanner = fields.pose("t")
     # The size of the image.
     size, sides = None, [fields.first((f"image_{side}", side)) for side in ("width", "height")]
-    if "size" in fields.values:
-        size = _height_width(path, fields.numbers("size", 2))
+    if both := fields.first(("size", "resolution")):
+        size = _height_width(path, fields.numbers(both, 2))
     elif None not in sides:
         size = _height_width(path, [fields.numbers(str(side), 1)[0] for side in sides])
-    return Calibration(
-        camera=Camera(
-            intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source
-        ),
-        scanner=scanner,
+    camera_read = Camera(
+        intrinsics=_check_intrinsics(path, matrix),
+        lens=lens,
+        distortion=distortion,
+        size=size,
+        source=source,
     )
+    return Calibration(camera=camera_read, scanner=scanner)
 
 
 def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
@@ -336,33 +323,13 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
 
 def _named_values(path: Path, text: str) -> _Fields:
     """`name: value`; a line without a name continues the value before it."""
-    values: dict[str, list[str]] = {}
-    name = None
-    for number, line in enumerate(text.splitlines(), start=1):
-        content = line.split("#", 1)[0]
-        match = _FIELD.match(content)
-        if match:
-            name = match[1]
-            if name in values:
-                raise FileFormatError(f"{path}, line {number}: {name} occurs twice; keep one")
-            values[name] = [match[2]]
-        elif content.strip() and content.strip() != "---":
-            if name is None:
-                shown = one_line(content)[:60]
-                raise FileFormatError(f"{path}, line {number}: {shown!r} has no name before it")
-            values[name].append(content)
-    return _Fields(path, {name: " ".join(parts) for name, parts in values.items()})
-
-
-def _camera(fields: _Fields, wanted: int | None, pattern: str) -> int:
-    """The number of the camera, which must be among those of the names of this pattern."""
-    number = CAMERA if wanted is None else wanted
-    matches = (re.fullmatch(pattern, name) for name in fields.values)
-    present = sorted(int(match[1]) for match in matches if match)
-    if number not in present:
-        listing = ", ".join(map(str, present)) or "none"
-        raise UsageError(f"{fields.path} has no camera {number}; --camera can be one of: {listing}")
-    return number
+    before, *parts = _FIELD.split(_COMMENT.sub("", text))
+    names, values = parts[::2], parts[1::2]
+    if before.strip():
+        raise FileFormatError(f"{path}: {one_line(before)[:60]!r} has no name before it")
+    if len(set(names)) < len(names):
+        raise FileFormatError(f"{path} has a name twice ({one_line(', '.join(names))}); keep one")
+    return _Fields(path, dict(zip(names, values, strict=True)))
 
 
 def _check_intrinsics(path: Path, matrix: Floats) -> Floats:

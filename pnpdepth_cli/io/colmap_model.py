@@ -7,13 +7,14 @@ claims: every count of a binary file is checked against the bytes there are.
 from __future__ import annotations
 
 import functools
-import struct
+import io
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +24,15 @@ from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
+    numbered_lines,
     one_line,
     read_bytes,
     size_of_regular_file,
 )
 from pnpdepth_cli.io.poses import rotation_of
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,55 +45,45 @@ class ColmapImage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapPoints:
-    """The points of a model, sorted by number."""
-
-    number: Integers  # (N,) COLMAP's numbers
-    xyz: Floats  # (N, 3) in model units
-    error: Floats  # (N,) mean reprojection error in pixels, negative where it was not computed
-    track: Integers  # (N,) images that observe the point
-
-
-@dataclass(frozen=True, kw_only=True)
 class ColmapModel:
     """A sparse model."""
 
     folder: Path
     images: dict[str, ColmapImage]  # by name, a path below the image folder
-    points: ColmapPoints
-
-
-class _CameraModel(NamedTuple):
-    number: int  # in binary files
-    focals: int
-    lens: str
-    coefficients: int
+    points: NDArray[np.void]
+    """(N,) of type `POINT`, sorted by number. The error is the mean reprojection error in pixels,
+    negative where it was not computed; the track, the number of images that observe the point."""
 
 
 _RADIAL, _FISHEYE = "radial-tangential", "fisheye"
 MODELS = {
-    "SIMPLE_PINHOLE": _CameraModel(0, 1, _RADIAL, 0),
-    "PINHOLE": _CameraModel(1, 2, _RADIAL, 0),
-    "SIMPLE_RADIAL": _CameraModel(2, 1, _RADIAL, 1),
-    "RADIAL": _CameraModel(3, 1, _RADIAL, 2),
-    "OPENCV": _CameraModel(4, 2, _RADIAL, 4),
-    "OPENCV_FISHEYE": _CameraModel(5, 2, _FISHEYE, 4),
-    "FULL_OPENCV": _CameraModel(6, 2, _RADIAL, 8),
-    "SIMPLE_RADIAL_FISHEYE": _CameraModel(8, 1, _FISHEYE, 1),
-    "RADIAL_FISHEYE": _CameraModel(9, 1, _FISHEYE, 2),
-    "SIMPLE_FISHEYE": _CameraModel(14, 1, _FISHEYE, 0),
-    "FISHEYE": _CameraModel(15, 2, _FISHEYE, 0),
+    "SIMPLE_PINHOLE": (0, 1, _RADIAL, 0),
+    "PINHOLE": (1, 2, _RADIAL, 0),
+    "SIMPLE_RADIAL": (2, 1, _RADIAL, 1),
+    "RADIAL": (3, 1, _RADIAL, 2),
+    "OPENCV": (4, 2, _RADIAL, 4),
+    "OPENCV_FISHEYE": (5, 2, _FISHEYE, 4),
+    "FULL_OPENCV": (6, 2, _RADIAL, 8),
+    "SIMPLE_RADIAL_FISHEYE": (8, 1, _FISHEYE, 1),
+    "RADIAL_FISHEYE": (9, 1, _FISHEYE, 2),
+    "SIMPLE_FISHEYE": (14, 1, _FISHEYE, 0),
+    "FISHEYE": (15, 2, _FISHEYE, 0),
 }
-"""COLMAP's camera models whose lenses are in `choices.LENSES`."""
-_NAMES = {model.number: name for name, model in MODELS.items()}
+"""COLMAP's camera models whose lenses are in `choices.LENSES`: the number in binary files, how many
+focal lengths, the lens, and how many of its coefficients."""
+_NAMES = {number: name for name, (number, *_) in MODELS.items()}
 _LARGEST = 1e9
 
 MODEL_PARTS = ("cameras", "images", "points3D")
 _LOCK = threading.Lock()  # threads that read frames of one model wait for it
-_COUNT, _CAMERA = struct.Struct("<Q"), struct.Struct("<IiQQ")
-_IMAGE, _POINT = struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
+# Records of binary files.
+_COUNT, _NUMBER, _BYTE, _TRACK_ENTRY = (np.dtype(kind) for kind in ("<u8", "<f8", "u1", "<i8"))
+_CAMERA = np.dtype("<u4, <i4, <u8, <u8")
+_IMAGE = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera", "<u4")])
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-_TRACK_ENTRY = 8
+POINT = np.dtype(
+    [("number", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+)
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -134,26 +126,23 @@ def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
     """The model in files of this size and time; kept for other images of a batch."""
     camera_file, image_file, point_file = (path for path, _, _ in states)
     is_binary = camera_file.suffix == ".bin"
-    # The cameras.
-    cameras = dict((_binary_cameras if is_binary else _text_cameras)(camera_file))
+    with _naming(camera_file):
+        cameras = dict((_binary_cameras if is_binary else _text_cameras)(camera_file))
     # The images, each of a name of its own and a camera that is there.
     images: dict[str, ColmapImage] = {}
-    for name, camera, pose, seen in (_binary_images if is_binary else _text_images)(image_file):
-        if name in images:
-            raise _damaged(image_file, f"has two images {name!r}")
-        if camera not in cameras:
-            raise _damaged(image_file, f"has an image of camera {camera}, which is not described")
-        points = np.unique(seen[seen != -1])
-        images[name] = ColmapImage(camera=cameras[camera], pose=pose, points=points)
+    with _naming(image_file):
+        for name, camera, pose, seen in (_binary_images if is_binary else _text_images)(image_file):
+            if name in images or camera not in cameras:
+                raise ValueError(f"the name or the camera of {name!r}")
+            points = np.unique(seen[seen != -1])
+            images[name] = ColmapImage(camera=cameras[camera], pose=pose, points=points)
     # The points.
-    number, rows, track = (_binary_points if is_binary else _text_points)(point_file)
-    if not np.isfinite(rows).all():
-        raise _damaged(point_file, "has points without finite coordinates")
-    order = np.argsort(number, kind="stable")
-    sorted_points = ColmapPoints(
-        number=number[order], xyz=rows[order, :3], error=rows[order, 3], track=track[order]
-    )
-    return ColmapModel(folder=camera_file.parent, images=images, points=sorted_points)
+    with _naming(point_file):
+        found = (_binary_points if is_binary else _text_points)(point_file)
+        if not np.isfinite(np.column_stack([found["xyz"], found["error"]])).all():
+            raise ValueError("points without finite coordinates")
+    found = found[np.argsort(found["number"], kind="stable")]
+    return ColmapModel(folder=camera_file.parent, images=images, points=found)
 
 
 def name_in_model(model: ColmapModel, image: Path) -> str:
@@ -162,18 +151,15 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
     Raises:
         InputError: The model lacks it, or has several of its name.
     """
-    whole = PurePosixPath(image.absolute().as_posix()).parts
-    parts = {name: PurePosixPath(name).parts for name in model.images}
-    ending = [name for name, part in parts.items() if part and whole[-len(part) :] == part]
-    if ending:
+    whole = image.absolute().as_posix()
+    if ending := [name for name in model.images if whole.endswith(f"/{name}")]:
         return max(ending, key=len)
-    alike = [name for name, part in parts.items() if part[-1:] == (image.name,)]
+    alike = [name for name in model.images if name.rpartition("/")[2] == image.name]
     if len(alike) == 1:
         return alike[0]
-    names = ", ".join(sorted(alike or parts)[:3])
     raise InputError(
-        f"{image} is {len(alike)} of the {len(parts):,} images of {model.folder} ({names}, …), not"
-        " one; COLMAP did not register it, or give it in the image folder of the model"
+        f"{image} is {len(alike)} of the {len(model.images):,} images of {model.folder}, not one;"
+        " COLMAP did not register it, or give it in the image folder of the model"
     )
 
 
@@ -187,24 +173,25 @@ def _parameter_count(path: Path, name: str) -> int:
             f"{path}: camera model {one_line(name)[:40]!r} is not one of {', '.join(MODELS)};"
             " `colmap image_undistorter` writes images and a model of pinhole cameras"
         )
-    return MODELS[name].focals + 2 + MODELS[name].coefficients
+    _, focals, _, coefficients = MODELS[name]
+    return focals + 2 + coefficients
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
     """The camera of a model with its parameters in COLMAP's order."""
-    model = MODELS[name]
+    _, focals, lens, _ = MODELS[name]
     check_pixel_count(path, size[1], size[0])
-    fx, fy = parameters[0], parameters[model.focals - 1]
-    cx, cy = parameters[model.focals : model.focals + 2]
+    fx, fy = parameters[0], parameters[focals - 1]
+    cx, cy = parameters[focals : focals + 2]
     if not (np.abs(parameters) < _LARGEST).all() or min(fx, fy) <= 0:
         raise _damaged(path, f"has a {name} camera with parameters {list(parameters)}")
-    distortion = tuple(parameters[model.focals + 2 :])
-    if model.lens == _RADIAL and distortion:
+    distortion = tuple(parameters[focals + 2 :])
+    if lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
     # whole numbers are at pixel centres, where COLMAP has .5
     return Camera(
         intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
-        lens=model.lens,
+        lens=lens,
         distortion=distortion,
         size=size,
         source=f"{name} camera",
@@ -219,126 +206,94 @@ def _pose(path: Path, name: str, numbers: Sequence[float]) -> Extrinsics:
     return Extrinsics(rotation_of(values[:4]), values[4:])
 
 
-class _Reader:
-    """The bytes of a file, read in order."""
+def _read_records(
+    path: Path, stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1
+) -> NDArray[_Kind]:
+    """The next `count` records of a file, which must hold them."""
+    begin, size = stream.tell(), count * layout.itemsize
+    data = stream.read(min(size, sys.maxsize))
+    if len(data) < size:
+        raise _damaged(path, f"is cut short at byte {begin:,}")
+    return np.frombuffer(data, layout)
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.data, self.position = path, read_bytes(path), 0
 
-    def take(self, size: int) -> int:
-        """Moves on by so many bytes, and returns where they begin."""
-        begin = self.position
-        if size > len(self.data) - begin:
-            raise _damaged(self.path, f"is cut short at byte {begin:,}")
-        self.position += size
-        return begin
-
-    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """Returns the numbers of the layout."""
-        return layout.unpack_from(self.data, self.take(layout.size))
-
-    def count(self, smallest: int) -> int:
-        """Returns the number of records that follow, each of at least so many bytes."""
-        (count,) = self.unpack(_COUNT)
-        if count * smallest > len(self.data) - self.position:
-            raise _damaged(self.path, f"claims {count:,} records in {len(self.data):,} bytes")
-        return int(count)
+def _read_count(path: Path, stream: io.BytesIO) -> int:
+    return int(_read_records(path, stream, _COUNT).item())
 
 
 Registered = tuple[str, int, Extrinsics, Integers]
 """Name, number of the camera, pose and points of an image; -1 is no point."""
-Table = tuple[Integers, Floats, Integers]
-"""Numbers (N,), rows (N, 4) of x y z and error, and lengths of the tracks (N,) of points."""
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
-    reader = _Reader(path)
-    for _ in range(reader.count(_CAMERA.size)):
-        number, model, width, height = reader.unpack(_CAMERA)
+    stream = io.BytesIO(read_bytes(path))
+    for _ in range(_read_count(path, stream)):
+        number, model, width, height = _read_records(path, stream, _CAMERA).item()
         name = _NAMES.get(model, f"number {model}")
-        parameters = reader.unpack(struct.Struct(f"<{_parameter_count(path, name)}d"))
+        parameters = _read_records(path, stream, _NUMBER, _parameter_count(path, name)).tolist()
         yield number, _camera(path, name, (height, width), parameters)
 
 
 def _binary_images(path: Path) -> Iterator[Registered]:
-    reader = _Reader(path)
-    for _ in range(reader.count(_IMAGE.size)):
-        _, *pose, camera = reader.unpack(_IMAGE)
-        end = reader.data.find(b"\0", reader.position)
-        begin = reader.take((end if end >= 0 else len(reader.data)) + 1 - reader.position)
-        name = reader.data[begin:end].decode("utf-8", "replace")
-        observations = reader.count(_OBSERVATION.itemsize)
-        begin = reader.take(observations * _OBSERVATION.itemsize)
-        seen = np.frombuffer(reader.data, _OBSERVATION, observations, begin)["point"]
-        yield name, camera, _pose(path, name, pose), seen
+    data = read_bytes(path)
+    stream = io.BytesIO(data)
+    for _ in range(_read_count(path, stream)):
+        _, pose, camera = _read_records(path, stream, _IMAGE)[0]
+        end = data.find(b"\0", stream.tell())
+        length = (len(data) if end < 0 else end) - stream.tell()
+        name = _read_records(path, stream, _BYTE, length + 1)[:-1].tobytes()
+        observations = _read_records(path, stream, _OBSERVATION, _read_count(path, stream))
+        text = name.decode("utf-8", "replace")
+        yield text, int(camera), _pose(path, text, pose), observations["point"]
 
 
-def _binary_points(path: Path) -> Table:
-    reader = _Reader(path)
-    count = reader.count(_POINT.size)
-    rows = np.empty((count, 4))
-    number, track = np.empty(count, np.int64), np.empty(count, np.int64)
-    for row in range(count):
-        point, x, y, z, _, _, _, error, length = reader.unpack(_POINT)
-        reader.take(length * _TRACK_ENTRY)
-        rows[row] = x, y, z, error
-        number[row], track[row] = np.uint64(point).astype(np.int64), length
-    return number, rows, track
+def _binary_points(path: Path) -> NDArray[np.void]:
+    stream, points = io.BytesIO(read_bytes(path)), [np.empty(0, POINT)]
+    for _ in range(_read_count(path, stream)):
+        points.append(_read_records(path, stream, POINT))
+        _read_records(path, stream, _TRACK_ENTRY, int(points[-1]["track"].item()))
+    return np.concatenate(points)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
-    for line, text in _lines(path):
-        with _naming(path, line):
-            number, name, width, height, *parameters = text.split()
-            if len(parameters) != _parameter_count(path, name):
-                raise ValueError(f"a {name} camera has other parameters")
-            size = int(height), int(width)
-            yield int(number), _camera(path, name, size, [float(word) for word in parameters])
+    for _, text in numbered_lines(read_bytes(path)):
+        number, name, width, height, *parameters = text.split()
+        if len(parameters) != _parameter_count(path, name):
+            raise ValueError(f"a {name} camera has other parameters")
+        size = int(height), int(width)
+        yield int(number), _camera(path, name, size, [float(word) for word in parameters])
 
 
 def _text_images(path: Path) -> Iterator[Registered]:
     """Each image has two lines, of which the second may be empty."""
-    lines = _lines(path, with_empty=True)
-    for line, text in lines:
+    whole = read_bytes(path).decode("utf-8", "replace").removesuffix("\n").split("\n")
+    lines = (line for line in whole if not line.startswith("#"))
+    for text in lines:
         if not text.strip():
             continue
-        with _naming(path, line):
-            _, *pose, camera, name = text.split(maxsplit=9)
-            keypoints = next(lines)[1].split()
-            if len(pose) != 7 or len(keypoints) % 3:
-                raise ValueError("a pose has 7 numbers, and each keypoint 3")
-            seen = np.array([int(word) for word in keypoints[2::3]], np.int64)
-            name = name.strip()
-            yield name, int(camera), _pose(path, name, [float(word) for word in pose]), seen
+        _, *pose, camera, name = text.strip().split(maxsplit=9)
+        keypoints = next(lines, "cut short").split()  # these two words are no keypoints
+        if len(pose) != 7 or len(keypoints) % 3:
+            raise ValueError("a pose has 7 numbers, and each keypoint 3")
+        seen = np.array([int(word) for word in keypoints[2::3]], np.int64)
+        yield name, int(camera), _pose(path, name, [float(word) for word in pose]), seen
 
 
-def _text_points(path: Path) -> Table:
-    numbers, rows, tracks = [], [], []
-    for line, text in _lines(path):
+def _text_points(path: Path) -> NDArray[np.void]:
+    points = []
+    for _, text in numbered_lines(read_bytes(path)):
         words = text.split()
-        with _naming(path, line):
-            if len(words) < 8 or len(words) % 2:
-                raise ValueError("a point has 8 numbers, and each observation 2")
-            numbers.append(np.int64(words[0]))
-            rows.append([float(words[i]) for i in (1, 2, 3, 7)])
-        tracks.append(len(words) // 2 - 4)
-    table = np.array(rows, np.float64).reshape(-1, 4)
-    return np.array(numbers, np.int64), table, np.array(tracks, np.int64)
-
-
-def _lines(path: Path, *, with_empty: bool = False) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, without comments."""
-    lines = read_bytes(path).decode("utf-8", "replace").removesuffix("\n").split("\n")
-    for number, line in enumerate(lines, start=1):
-        if not line.startswith("#") and (with_empty or line.strip()):
-            yield number, line
+        if len(words) < 8 or len(words) % 2:
+            raise ValueError("a point has 8 numbers, and each observation 2")
+        x, y, z, error = (float(words[i]) for i in (1, 2, 3, 7))
+        points.append((int(words[0]), (x, y, z), (0, 0, 0), error, len(words) // 2 - 4))
+    return np.array(points, POINT)
 
 
 @contextmanager
-def _naming(path: Path, line: int) -> Iterator[None]:
-    """Names the line in an error of the numbers in it."""
+def _naming(path: Path) -> Iterator[None]:
+    """Names the file in an error of what is in it."""
     try:
         yield
-    except (ValueError, OverflowError, StopIteration) as error:
-        fact = one_line(error) or "the file is cut short"
-        raise _damaged(path, f"has a wrong line {line} ({fact})") from error
+    except (ValueError, OverflowError) as error:
+        raise _damaged(path, f"holds what is wrong: {error}") from error

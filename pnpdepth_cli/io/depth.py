@@ -23,11 +23,11 @@ from pnpdepth_cli.io.formats import (
     Reading,
     array_files,
     check_scale,
-    eight_bits,
     format_of_content,
     format_of_suffix,
     images,
     kind_of,
+    no_depth,
 )
 from pnpdepth_cli.points import SparsePoints
 
@@ -85,16 +85,13 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     """
     data = read_bytes(path)
     depth_format = format_of_content(data)
-    if depth_format is not None:
-        stored = depth_format.read(path, data)
-        if stored.values.dtype.kind == "b" and not is_mask:
-            raise FileFormatError(f"{path} holds bool values; depth is float or integer")
-        return stored
-    kind = kind_of(data)
-    if kind is not None:
-        raise eight_bits(path, kind)
-    names = [kind.name for kind in FORMATS.values() if kind.name != "PNG"]
-    raise FileFormatError(f"{path} is not a depth file; give a 16-bit PNG, {', '.join(names)}")
+    if depth_format is None:
+        kind = kind_of(data)
+        raise no_depth(path, "a file of an unknown kind" if kind is None else f"an 8-bit {kind}")
+    stored = depth_format.read(path, data)
+    if stored.values.dtype.kind == "b" and not is_mask:
+        raise FileFormatError(f"{path} holds bool values; depth is float or integer")
+    return stored
 
 
 def depth_from_stored(
@@ -108,7 +105,12 @@ def depth_from_stored(
     Raises:
         FileFormatError: The numbers are no image of one channel, or exceed the budget.
     """
-    values = _as_image(path, stored.values)
+    values: NDArray[np.generic] = stored.values
+    while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):  # as networks give it
+        values = values[0] if len(values) == 1 else values[..., 0]
+    if values.ndim != 2:
+        fact = f"has the shape {stored.values.shape}"
+        raise FileFormatError(f"{path} {fact}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(stored.reading.source))
@@ -134,16 +136,6 @@ def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:
         metres = np.array(values, dtype=np.float32, order="C")
         metres[~(np.isfinite(metres) & (metres > 0))] = 0
     return metres
-
-
-def _as_image(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The array (H, W) of one channel, also of a batch of one as networks give it."""
-    image = values[0] if values.ndim == 4 and len(values) == 1 else values
-    if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):
-        image = image[0] if len(image) == 1 else image[:, :, 0]
-    if image.ndim != 2:
-        raise FileFormatError(f"{path} has the shape {values.shape}; a depth image is (H, W)")
-    return image
 
 
 def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_SCALE) -> None:
@@ -204,26 +196,30 @@ def read_sparse(
         SizeError: The file is a list, and no size was given.
     """
     check_scale(scale)
-    if path.suffix.lower() in _TEXT_SUFFIXES:
-        data = read_bytes(path)
-        if kind_of(data) is None:
-            return _from_rows(path, read_rows(path, data)[0], "point list", size)
-    stored = load_stored(path)
-    shape = stored.values.shape
-    if (
-        not stored.is_image
-        and len(shape) == 2
-        and (shape[1] == 3 or (3 < shape[1] <= _MOST_COLUMNS and shape[0] > _MANY_ROWS))
-    ):
-        return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
+    stored, header = _load_list(path)
+    shape, of_array = stored.values.shape, f"point list, {stored.reading.source}"
+    if header is not None:
+        return _from_rows(path, stored.values, "point list", size)
+    columns = 0 if stored.is_image or len(shape) != 2 else shape[1]
+    if columns == 3 or (3 < columns <= _MOST_COLUMNS and shape[0] > _MANY_ROWS):
+        return _from_rows(path, stored.values, of_array, size)
     image = depth_from_stored(path, stored, scale, size)
-    rows, columns = np.nonzero(image.valid)
-    if rows.size == 0:
+    known = image.values > 0
+    yx = np.argwhere(known)
+    if not len(yx):
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     height, width = image.values.shape
-    xy = np.stack([columns, rows], axis=1).astype(np.float32)
-    points = SparsePoints(xy=xy, depth=image.values[rows, columns], size=(height, width))
-    return points, image.reading
+    xy, depth = yx[:, ::-1].astype(np.float32), image.values[known]
+    return SparsePoints(xy=xy, depth=depth, size=(height, width)), image.reading
+
+
+def _load_list(path: Path) -> tuple[DepthFile, list[str] | None]:
+    """What the file stores, rows of a text, too; and the words of a text's header, maybe none."""
+    data = read_bytes(path)
+    if path.suffix.lower() not in _TEXT_SUFFIXES or kind_of(data) is not None:
+        return load_stored(path), None
+    rows, header = read_rows(path, data)
+    return DepthFile(values=rows, reading=Reading("text"), is_image=False), header
 
 
 def _from_rows(
@@ -255,16 +251,12 @@ def holds_scan(path: Path) -> bool:
     Raises:
         InputError: The file cannot be read.
     """
-    data = read_bytes(path)
-    if path.suffix.lower() in _TEXT_SUFFIXES and kind_of(data) is None:
-        rows, header = read_rows(path, data)
-        if header:
-            return header[:3] != PIXELS
-    else:
-        stored = load_stored(path)
-        rows = stored.values
-        if stored.is_image or rows.ndim != 2 or rows.dtype.kind != "f":
-            return False
+    stored, header = _load_list(path)
+    rows = stored.values
+    if header:
+        return header[:3] != PIXELS
+    if stored.is_image or rows.ndim != 2 or rows.dtype.kind != "f":
+        return False
     if not 3 <= rows.shape[1] <= _MOST_COLUMNS:
         return False
     with np.errstate(invalid="ignore"):
@@ -282,9 +274,9 @@ def write_sparse(
     if path.suffix.lower() != ".csv":
         write_depth(path, image)
         return
-    rows = [f"{x:.9g},{y:.9g},{z:.9g}" for (x, y), z in zip(xy, depth, strict=True)]
+    rows = np.column_stack([xy, depth])
     with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(["x,y,depth", *rows]) + "\n", encoding="utf-8", newline="\n")
+        np.savetxt(temporary, rows, "%.9g", ",", header="x,y,depth", comments="")
 
 
 def describe_range(
@@ -328,11 +320,10 @@ def scale_warning(what: str, ratio: float, kinds: Mapping[str, Reading | None]) 
         InputError: If the scale of one of them was assumed.
     """
     quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
-    log_ratio = math.log(ratio) if ratio > 0 else math.nan
-    near = (q for q in quotients if abs(log_ratio - math.log(q)) < _QUOTIENT_TOLERANCE)
-    factor = next(near, None)
-    if factor is None:
+    near = [q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE]
+    if not near:
         return None
+    factor = near[0]
     sides = zip(kinds.items(), (factor, 1 / factor), strict=True)
     integer = [(option, kind, by) for (option, kind), by in sides if kind and kind.scale]
     unstated = [side for side in integer if "(from the file)" not in side[1].source]

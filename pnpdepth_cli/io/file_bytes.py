@@ -115,42 +115,28 @@ def one_line(text: object) -> str:
 
 
 def check_pixel_count(
-    path: Path,
-    width: int,
-    height: int,
-    *,
-    channels: int = 1,
-    value_bytes: int = 1,
-    file_bytes: int | None = None,
+    path: Path, width: int, height: int, *, pixel_bytes: int = 1, file_bytes: int | None = None
 ) -> None:
     """Raises FileFormatError for an image without pixels, or with more than the budget.
 
-    To be called with what the header of a file claims, before `channels` values of `value_bytes`
-    are decoded for each pixel; with `file_bytes` where few bytes of the format claim any size.
+    To be called with what the header of a file claims, before so many bytes are decoded for each
+    pixel; with `file_bytes` where few bytes of the format claim any size.
     """
     if width < 1 or height < 1:
         raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
-    what, pixel_bytes = f"{width}x{height} pixels", channels * value_bytes
-    check_value_count(path, width * height, file_bytes, value_bytes=pixel_bytes, what=what)
-
-
-def check_value_count(
-    path: Path,
-    count: int,
-    file_bytes: int | None = None,
-    *,
-    value_bytes: int = 1,
-    what: str | None = None,
-) -> None:
-    """Raises FileFormatError for an array of more values than the budget."""
-    what = what or f"{count:,} values"
-    limits, decoded = budget(), count * value_bytes
-    check_claim(f"{path} has {what}", count, limits.max_pixels, way_out=_SMALLER)
-    as_bytes = f"{path} has {what} in {decoded:,} bytes"
-    check_claim(as_bytes, decoded, limits.max_image_bytes, way_out=_SMALLER)
+    count = width * height
+    check_value_count(path, count, value_bytes=pixel_bytes)
     if file_bytes is not None:
-        claim = f"{path} claims {what} in {file_bytes:,} bytes"
-        check_claim(claim, count, limits.max_values_from(file_bytes), way_out="create it again")
+        claim = f"{path} claims {width}x{height} pixels in {file_bytes:,} bytes"
+        check_claim(claim, count, budget().max_values_from(file_bytes), way_out="create it again")
+
+
+def check_value_count(path: Path, count: int, *, value_bytes: int = 1) -> None:
+    """Raises FileFormatError for an array of more values than the budget."""
+    limits, decoded = budget(), count * value_bytes
+    check_claim(f"{path} has {count:,} values", count, limits.max_pixels, way_out=_SMALLER)
+    claim = f"{path} has {count:,} values of {decoded:,} bytes"
+    check_claim(claim, decoded, limits.max_image_bytes, way_out=_SMALLER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,19 +248,14 @@ def parse_json(data: bytes) -> Any:
     NaN, infinity and numbers that are too large to be finite are no JSON numbers.
     """
     text = data.decode("utf-8-sig")
-    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_whole)
-
-
-def _whole(text: str) -> int:
-    _finite(text)
-    return int(text)
+    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_finite)
 
 
 def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
+    """The number, an integer where it is one."""
+    if not math.isfinite(float(text)):
         raise ValueError(f"{text[:20]} is not a JSON number")
-    return number
+    return int(text) if text.lstrip("-").isdecimal() else float(text)
 
 
 def parse_yaml(path: Path, text: str) -> object:
@@ -317,22 +298,17 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     Raises:
         FileFormatError: A line is not made of as many numbers as the first.
     """
-    rows: list[list[float]] = []
-    header: list[str] = []
-    for number, text in numbered_lines(data):
-        words = _SEPARATOR.split(text)
-        names = [word.strip('"').lower() for word in words]
-        if not rows and not header and names[:3] in _HEADERS:
-            header = names
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        # Every row has as many numbers as the first.
-        count = len(rows[0]) if rows else max(3, len(row))
-        if len(row) != count:
-            shown = one_line(text)[:60]
-            raise FileFormatError(f"{path}, line {number}: {shown!r} is not {count} numbers")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 3), header
+    lines = [_SEPARATOR.sub(" ", text) for _, text in numbered_lines(data)]
+    header = lines[0].replace('"', "").lower().split() if lines else []
+    if header[:3] not in _HEADERS:
+        header = []
+    try:
+        rows = np.array([line.split() for line in lines[bool(header) :]], np.float64)
+    except ValueError as error:
+        fact = f"lines that are not made of as many numbers as the first ({one_line(error)})"
+        raise FileFormatError(f"{path} has {fact}") from error
+    if not rows.size:
+        return np.empty((0, 3)), header
+    if rows.shape[1] < 3:
+        raise FileFormatError(f"{path} has lines of {rows.shape[1]} numbers; give 3 or more")
+    return rows, header

@@ -12,7 +12,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,13 +68,11 @@ def numbers_in(value: object) -> list[float] | None:
         value = value.get("data", list(value.values()))
     if isinstance(value, str):
         value = [word for word in _SEPARATORS.split(value) if word not in ("", "-")]
-    flat: list[Any] = []
-    for item in value if isinstance(value, list) else [value]:
-        flat += item if isinstance(item, list) else [item]
     try:
-        return [float(number) for number in flat]
+        numbers: list[float] = np.array(value, np.float64).ravel().tolist()
     except (TypeError, ValueError, OverflowError):
         return None
+    return numbers
 
 
 def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:

@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
@@ -40,7 +39,7 @@ class Head:
     title: str
     facts: Sequence[tuple[str, str]] = ()
     notes: Sequence[str] = ()
-    tables: Sequence[Any] = ()
+    tables: Sequence[object] = ()
     """Each has title, headings and texts, as `commands.tables.Table`."""
     without: Sequence[tuple[str, str]] = ()
     """Names of frames that were not refined, and why."""
@@ -106,17 +105,7 @@ def write_report(
             report.js shows it. Its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
-    with atomic_folder(folder) as temporary:
-        images = temporary / IMAGES
-        images.mkdir()
-        write_json(temporary / _MADE_OF, made_of)
-        _write_page(temporary, head, frames(images), viewer=viewer)
-
-
-def _write_page(
-    folder: Path, head: Head, frames: Iterable[Mapping[str, object]], *, viewer: bool
-) -> None:
-    style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
+    # What the page's script needs of all frames.
     data = {
         "columns": [measure.to_json() for measure in head.columns],
         "signed": head.signed,
@@ -126,15 +115,22 @@ def _write_page(
         "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
         "logarithmic_from": LOGARITHMIC_FROM,
     }
-    parts = _environment().get_template("report.html").generate(
-        head=head, data=plain(data), frames=map(plain, frames), style=Markup(style),
-        script=Markup(script), policy=_policy(style, script, viewer=viewer), version=__version__,
-    )  # fmt: skip
-    with (folder / PAGE).open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(parts)
-    if viewer:
-        scripts = _source("../three/three.min.js") + "\n" + _source(VIEWER)
-        (folder / VIEWER).write_text(scripts, encoding="utf-8", newline="\n")
+    style, script = (_source(f"report.{kind}") for kind in ("css", "js"))
+    with atomic_folder(folder) as temporary:
+        images = temporary / IMAGES
+        images.mkdir()
+        write_json(temporary / _MADE_OF, made_of)
+        # The page, frame by frame.
+        parts = _environment().get_template("report.html").generate(
+            head=head, data=plain(data), frames=map(plain, frames(images)), style=Markup(style),
+            script=Markup(script), policy=_policy(style, script, viewer=viewer),
+            version=__version__,
+        )  # fmt: skip
+        with (temporary / PAGE).open("w", encoding="utf-8", newline="\n") as file:
+            file.writelines(parts)
+        if viewer:
+            scripts = _source("../three/three.min.js") + "\n" + _source(VIEWER)
+            (temporary / VIEWER).write_text(scripts, encoding="utf-8", newline="\n")
 
 
 def link_image(source: Path, target: Path) -> None:

@@ -130,14 +130,11 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     """
     import cv2
 
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    if pixels.shape[2] in (1, 2):
-        pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
-    rgb = pixels[:, :, 2::-1]  # OpenCV has blue first
+    rgb = pixels[:, :, ::-1]
     white = 255 if 1 < rgb.max() <= 255 else 65535
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
@@ -178,10 +175,7 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
         FileFormatError: It is damaged, beyond the budget, or holds no single image.
     """
     channels = read_exr_channels(path, data)
-    reds = [name for name in channels if name.rpartition(".")[2] == "R"]
-    layer = reds[0][:-1] if len(reds) == 1 else ""
-    names = [layer + letter for letter in "RGB"]
-    grey = [name for name in channels if name != "A"]
+    names, grey = ["R", "G", "B"], [name for name in channels if name != "A"]
     if len(grey) == 1:
         names = grey * 3
     if not channels.keys() >= {*names}:
@@ -259,6 +253,6 @@ def _decode_video(path: Path) -> Iterator[Pixels]:
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
     width, height = (int(capture.get(side)) for side in sides)
-    check_pixel_count(path, width, height, channels=3)
+    check_pixel_count(path, width, height, pixel_bytes=3)
     while (read := capture.read())[0]:
         yield np.asarray(read[1], np.uint8)

@@ -12,7 +12,6 @@ import itertools
 import shutil
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -33,11 +32,10 @@ _LEAST_EXPLAINED = 0.03  # of the variance; numbers in any order have less
 _PCD_TYPES = {k + n: k.lower() + n for k in "IUF" for n in "1248" if k + n not in ("F1", "F2")}
 """NumPy types by TYPE and SIZE of a PCD."""
 _PLY_KINDS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8",
 }  # fmt: skip
+_PLY_KINDS |= {np.dtype(kind).name: kind for kind in _PLY_KINDS.values()}  # such as float32
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 _LONGEST_HEADER = 1 << 16
 _MOST_COMPRESSED = 100
@@ -49,19 +47,15 @@ _MOST_DIGITS = 18
 Points = NDArray[np.float32]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScanFile:
-    """A LiDAR scan as read from a file."""
-
-    points: Points  # (N, 3) metres, x y z in the scanner's coordinates as stored, in file order
-    source: str  # what was read, for a person
-
-
-def read_scan(path: Path) -> ScanFile:
+def read_scan(path: Path) -> tuple[Points, str]:
     """Returns the points of a .bin, a .npy of (N, 3 or more) floats, a .pcd, a .ply, or text.
 
     Args:
         path: The file; its suffix says the format.
+
+    Returns:
+        (N, 3) metres, x y z in the scanner's coordinates as stored, in file order; and what was
+        read, for a person.
 
     Raises:
         FileFormatError: The file is damaged or ambiguous.
@@ -73,8 +67,7 @@ def read_scan(path: Path) -> ScanFile:
     kind = kind_of(data)
     if kind not in (None, "NPY"):
         raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
-    points, source = read(path, data)
-    return ScanFile(points=points, source=source)
+    return read(path, data)
 
 
 def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
@@ -95,8 +88,8 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
     # beams without return say nothing: more zeros in a row than a point has numbers
     zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
-    counted = zeros <= max(_FIELD_COUNTS)
-    explained = {count: _explained_variance(features, counted, count) for count in _FIELD_COUNTS}
+    masked = np.ma.array(features, mask=np.broadcast_to(zeros > max(_FIELD_COUNTS), features.shape))
+    explained = {count: _explained_variance(masked, count) for count in _FIELD_COUNTS}
     most = max(explained.values())  # which multiples of the true count reach, too
     if most < _LEAST_EXPLAINED:
         fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
@@ -105,21 +98,17 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
 
 
 def _explained_variance(
-    features: NDArray[np.float64], counted: NDArray[np.bool_], count: int
+    features: np.ma.MaskedArray[tuple[int, ...], np.dtype[np.float64]], count: int
 ) -> float:
     """Mean fraction 0…1 of the variance of features (F, N) that N modulo `count` explains."""
     rows = features.shape[1] // count
     fields = features[:, : rows * count].reshape(len(features), rows, count)
-    weight = counted[: rows * count].reshape(rows, count).astype(np.float64)
-    number = weight.sum(axis=0)
+    number = fields.count(axis=1)
     if (number < 2).any():
         return 0.0
-    mean = (fields * weight).sum(axis=1) / number
-    within = ((fields - mean[:, None]) ** 2 * weight).sum(axis=1) / (number - 1)
-    total = features[:, counted].var(axis=1)
-    varies = total > 0
-    fractions = 1 - (within * number).sum(axis=1)[varies] / number.sum() / total[varies]
-    return float(fractions.mean()) if varies.any() else 0.0
+    within = (fields.var(axis=1, ddof=1) * number).sum(axis=1) / number.sum(axis=1)
+    # a feature that does not vary is masked
+    return float(np.ma.filled((1 - within / features.var(axis=1)).mean(), 0))
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
@@ -171,11 +160,8 @@ def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes
     data = _lzf(body[8 : 8 + packed])
     if data is None or len(data) != claimed:
         raise damaged(path, "PCD", "cannot be decompressed")
-    ends = np.cumsum([0, *sizes]) * number
-    fields = [
-        np.frombuffer(data, np.uint8, number * size, ends[index]).reshape(number, size)
-        for index, size in enumerate(sizes)
-    ]
+    parts = np.split(np.frombuffer(data, np.uint8), number * np.cumsum(sizes[:-1]))
+    fields = [part.reshape(number, size) for part, size in zip(parts, sizes, strict=True)]
     return np.concatenate(fields, axis=1).tobytes()
 
 
@@ -247,37 +233,22 @@ def _xyz(
         if names.count(name) != 1 or counts[names.index(name)] != 1:
             listing = one_line(", ".join(names))
             raise FileFormatError(f"{path}: a {kind} without one {name} ({listing}); add it")
-    wanted = [names.index(name) for name in "xyz"]
-    if order is None:
-        table = _table(path, kind, number, body, sum(counts))
-        values = [table[:, sum(counts[:index])] for index in wanted]
-    else:
-        try:
-            layout = np.dtype([(f"f{i}", order + t, n) for i, (_, t, n) in enumerate(columns)])
-        except (TypeError, ValueError) as error:
-            raise damaged(path, kind, f"describes its fields wrongly ({error})") from error
-        if len(body) < number * layout.itemsize:
-            fact = f"is cut short: {len(body) // layout.itemsize:,} of {number:,} points"
-            raise damaged(path, kind, fact)
-        rows = np.frombuffer(body, layout, count=number)
-        values = [rows[f"f{index}"] for index in wanted]
-    return _first_columns(np.column_stack(values))
-
-
-def _table(path: Path, kind: str, number: int, body: bytes, width: int) -> NDArray[np.float64]:
-    """The numbers (N, width) of the first lines of text; a PLY may continue with faces."""
     if not number:
-        return np.empty((0, width))
-    most = min(number, len(body) // (2 * width) + 1)  # for which memory is taken
+        return np.empty((0, 3), np.float32)
+    if number * sum(counts) > len(body):  # each number has a byte at least
+        raise damaged(path, kind, f"claims {number:,} points in {len(body):,} bytes")
+    fields = [(f"f{i}", order + t if order else "f8", (n,)) for i, (_, t, n) in enumerate(columns)]
     try:
-        table = np.loadtxt(io.BytesIO(body), comments=None, ndmin=2, max_rows=most)
-    except ValueError as error:
-        raise damaged(path, kind, f"has a line that is not made of numbers ({error})") from error
-    if table.shape != (number, width):
-        rows, columns = table.shape
-        fact = f"has {rows:,} lines of {columns} numbers instead of {number:,} of {width}"
-        raise damaged(path, kind, fact)
-    return table
+        layout = np.dtype(fields)
+        if order is None:  # a PLY may continue with faces
+            rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=number)
+        else:
+            rows = np.frombuffer(body, layout, min(number, len(body) // layout.itemsize))
+    except (TypeError, ValueError) as error:
+        raise damaged(path, kind, f"cannot be read ({error})") from error
+    if len(rows) < number:
+        raise damaged(path, kind, f"is cut short: {len(rows):,} of {number:,} points")
+    return _first_columns(np.hstack([rows[f"f{names.index(name)}"] for name in "xyz"]))
 
 
 def _whole(path: Path, text: str) -> int:
@@ -305,12 +276,12 @@ _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".txt": _parse_text,
 }
 
-_PROPERTIES = {
-    "points": ("<f4", ["float x", "float y", "float z"]),
-    "normals": ("<f4", ["float nx", "float ny", "float nz"]),
-    "colours": ("|u1", ["uchar red", "uchar green", "uchar blue"]),
-}
-"""NumPy type and properties of what a PLY has of each point."""
+_PROPERTIES = (
+    ("<f4", ["float x", "float y", "float z"]),
+    ("<f4", ["float nx", "float ny", "float nz"]),
+    ("|u1", ["uchar red", "uchar green", "uchar blue"]),
+)
+"""NumPy type and properties of each value of a `Part`."""
 
 Part = tuple[Points, Points | None, NDArray[np.uint8] | None]
 """(N, 3) points; (N, 3) unit normals, 0 where unknown, or None; (N, 3) colours 0…255, or None."""
@@ -329,20 +300,15 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
     Raises:
         OutputError: The file cannot be written.
     """
-    count, properties = 0, _PROPERTIES["points"][1]
+    count, properties = 0, _PROPERTIES[0][1]
     with atomic_path(path) as temporary, TemporaryFile(dir=temporary.parent) as body:
         for part in parts:
-            columns = {
-                name: values
-                for name, values in zip(_PROPERTIES, part, strict=True)
-                if values is not None
-            }
-            rows = np.empty(len(part[0]), [(name, _PROPERTIES[name][0], 3) for name in columns])
-            for name, values in columns.items():
-                rows[name] = values
-            body.write(rows.tobytes())
-            count += len(rows)
-            properties = [each for name in columns for each in _PROPERTIES[name][1]]
+            zipped = zip(part, _PROPERTIES, strict=True)
+            columns = [(values, *kind) for values, kind in zipped if values is not None]
+            rows = [np.ascontiguousarray(v, kind).view(np.uint8) for v, kind, _ in columns]
+            body.write(np.hstack(rows).tobytes())
+            count += len(part[0])
+            properties = [each for _, _, names in columns for each in names]
         # The header has the number of points, which is known last.
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
         header += [*(f"property {each}" for each in properties), "end_header\n"]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,7 +15,9 @@ from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
 
 Pixels = NDArray[np.uint8]
-_Number = TypeVar("_Number", np.uint8, np.float32)
+Depth = NDArray[np.float32]
+Panel = tuple[str, str, Pixels]
+"""Title, a fainter remark beside it, and an image (H, W, 3)."""
 
 UNKNOWN = 70
 """The grey of a pixel without depth: turbo has no such colour."""
@@ -42,6 +43,9 @@ _FONT_SIZE, _SMALL_FONT_SIZE = 19, 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LABELS = 9  # of the bar
+# Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
+_WIDE = 2.0
+_STRONGEST_PERCENTILE = 95.0
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 
 
@@ -57,19 +61,17 @@ class DepthScale:
         """True if the colours follow log depth."""
         return self.high_m / self.low_m > LOGARITHMIC_FROM
 
-    def position(self, depth: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Returns 0 at the near end to 1 at the far end, clipped, for depths of any shape."""
-        bounded = np.clip(np.asarray(depth, dtype=np.float64), self.low_m, self.high_m)
-        if self.logarithmic:
-            return np.log(bounded / self.low_m) / math.log(self.high_m / self.low_m)
-        return (bounded - self.low_m) / (self.high_m - self.low_m)
-
     def paint(self, depth: NDArray[np.floating]) -> Pixels:
         """Returns (..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
         known = np.isfinite(depth) & (depth > 0)
-        pixels = _turbo(1 - self.position(np.where(known, depth, self.low_m)))
-        pixels[~known] = UNKNOWN
-        return pixels
+        depths = np.clip(np.where(known, depth, self.low_m), self.low_m, self.high_m, dtype=float)
+        position = (depths - self.low_m) / (self.high_m - self.low_m)
+        if self.logarithmic:
+            position = np.log(depths / self.low_m) / math.log(self.high_m / self.low_m)
+        # The last tenths of turbo are so dark at both ends that near and far look alike.
+        levels = np.rint(12 + 231 * (1 - position)).astype(np.intp)
+        table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
+        return np.where(known[..., None], table[:, 0, ::-1][levels], np.uint8(UNKNOWN))
 
     def spaced(self, count: int) -> NDArray[np.float64]:
         """Returns so many depths from near to far, whose positions are equally far apart."""
@@ -89,24 +91,24 @@ def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
     return DepthScale(low_m=low, high_m=high)
 
 
-def grey_of(rgb: NDArray[np.float32] | None, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Returns (H, W) luma in 0..1 of an (H, W, 3) image in 0..1; without one, a uniform grey."""
+def _grey_of(rgb: NDArray[np.float32] | None, size: tuple[int, ...]) -> NDArray[np.float32]:
+    """(H, W) luma in 0..1 of an (H, W, 3) image in 0..1; without one, a uniform grey."""
     if rgb is None:
         return np.full(size, 0.3, np.float32)
     weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
     return np.asarray(np.clip(np.nan_to_num(rgb), 0, 1) @ weights, dtype=np.float32)
 
 
-def dim(grey: NDArray[np.float32]) -> Pixels:
-    """Returns an (H, W, 3) dark grey image, on which coloured points stand out."""
+def _dim(grey: NDArray[np.float32]) -> Pixels:
+    """An (H, W, 3) dark grey image, on which coloured points stand out."""
     levels = np.rint(20 + 115 * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
-def paint_signed(
+def _paint_signed(
     strength: NDArray[np.floating], light: NDArray[np.floating], colors: str
 ) -> Pixels:
-    """Returns (..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
+    """(..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
     above, below = _SIGNED[colors]
     signed = np.asarray(strength, dtype=np.float32)[..., None]
     amount = np.clip(np.abs(signed), 0, 1)
@@ -116,8 +118,8 @@ def paint_signed(
 
 
 def signed_bar(colors: str, length: int) -> Pixels:
-    """Returns (length, 3) colours of a legend of `paint_signed`."""
-    return paint_signed(np.linspace(-1, 1, length), np.full(length, 0.88), colors)
+    """Returns (length, 3) colours of a legend of a signed map."""
+    return _paint_signed(np.linspace(-1, 1, length), np.full(length, 0.88), colors)
 
 
 def hex_colours(colours: Pixels) -> list[str]:
@@ -125,37 +127,16 @@ def hex_colours(colours: Pixels) -> list[str]:
     return [f"#{bytes(colour).hex()}" for colour in colours]
 
 
-def _turbo(position: NDArray[np.float64]) -> Pixels:
-    levels = np.arange(256, dtype=np.uint8)[:, None]
-    table = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[:, 0, ::-1]
-    # The last tenths of turbo are so dark at both ends that near and far look alike.
-    index = np.rint(12 + 231 * np.clip(position, 0, 1)).astype(np.intp)
-    return np.array(table[index], dtype=np.uint8)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Panel:
-    """An image with a title and a fainter remark above it."""
-
-    title: str
-    pixels: Pixels
-    """(H, W, 3)."""
-    remark: str = ""
-
-
-def magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
-    """Returns the factor by which an image fits its column, a whole number if it enlarges.
-
-    The image is (H, W, ...).
-    """
+def _magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
+    """The factor by which an image (H, W, ...) fits its column, a whole number if it enlarges."""
     height, width = shape[:2]
     room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - _LEGEND_WIDTH
     fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
     return math.floor(fit) if fit >= 1 else fit
 
 
-def resized(pixels: NDArray[_Number], factor: float, *, smooth: bool = False) -> NDArray[_Number]:
-    """Returns the image at `factor` times its size; enlarged pixels stay square unless `smooth`."""
+def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
+    """The image at `factor` times its size; enlarged pixels stay square unless `smooth`."""
     height, width = pixels.shape[:2]
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     enlarging = cv2.INTER_CUBIC if smooth else cv2.INTER_NEAREST
@@ -163,54 +144,45 @@ def resized(pixels: NDArray[_Number], factor: float, *, smooth: bool = False) ->
     return np.asarray(cv2.resize(pixels, size, interpolation=method))
 
 
-def draw_discs(
+def _points_panel(
     grey: NDArray[np.float32],
-    xy: NDArray[np.floating],
-    colours: Pixels,
+    xy: NDArray[np.float32],
+    depth: Depth,
+    scale: DepthScale,
     factor: float,
-    order: NDArray[np.intp],
-) -> Pixels:
-    """Returns the dark grey image (H, W), enlarged by `factor`, with a disc at each of N points.
-
-    Pixel coordinates (N, 2) are those of the image; `order` has the topmost point last.
-    """
-    canvas = np.ascontiguousarray(resized(dim(grey), factor, smooth=True))
+) -> Panel:
+    """The points in the colours of their depth on the dark grey image, nearest on top."""
+    canvas = np.ascontiguousarray(_resize(_dim(grey), factor, smooth=True))
     spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
     # OpenCV takes coordinates in sixteenths of a pixel.
     radius = round(16 * min(max(0.24 * spacing, 1.4), 6.0))
-    centres = np.rint(16 * ((np.asarray(xy, np.float64) + 0.5) * factor - 0.5)).astype(int)
-    for index in order:
-        ink = colours[index].tolist()
-        cv2.circle(canvas, centres[index].tolist(), radius, ink, -1, cv2.LINE_AA, 4)
-    return canvas
+    centres = np.rint(16 * ((xy.astype(np.float64) + 0.5) * factor - 0.5)).astype(int).tolist()
+    colours = scale.paint(depth).tolist()
+    for index in np.argsort(-depth, kind="stable"):
+        cv2.circle(canvas, centres[index], radius, colours[index], -1, cv2.LINE_AA, 4)
+    return "Sparse depth", f"{len(depth):,} point{'' if len(depth) == 1 else 's'}", canvas
 
 
-def save_depth_figure(
+def _save_depth_figure(
     path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
 ) -> FigureRecord:
-    """Writes a PNG of panels, `columns` to a row, beside a bar of depth colours."""
+    """Writes a PNG of panels beside a bar of depth colours."""
     labels = [f"{depth:.3g}" for depth in scale.spaced(_LABELS)]
     noun = "metres" if unit == "m" else unit
-    figure = save_figure(path, panels, scale.paint(scale.spaced(256)), labels, noun, columns)
+    figure = _save_figure(path, panels, scale.paint(scale.spaced(256)), labels, noun, columns)
     return replace(figure, scale_m=(scale.low_m, scale.high_m))
 
 
-def save_figure(
+def _save_figure(
     path: Path, panels: list[Panel], bar: Pixels, labels: Sequence[str], noun: str, columns: int = 1
 ) -> FigureRecord:
-    """Writes a PNG of panels, `columns` to a row, beside a bar of colours.
+    """Writes a PNG of panels of one size, `columns` to a row, beside a bar of colours (N, 3).
 
-    Args:
-        path: The PNG.
-        panels: Panels of one size.
-        bar: Colours (N, 3) of the bar, from its lower end.
-        labels: Texts beside the bar, equally far apart, from its lower end.
-        noun: Text above the bar.
-        columns: Number of panels in a row.
+    Bar and labels begin at the lower end; the noun is above.
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    height, width = panels[0].pixels.shape[:2]
+    height, width = panels[0][2].shape[:2]
     rows, row_height = -(-len(panels) // columns), _TITLE_HEIGHT + height
     width_px = 2 * MARGIN + columns * width + (columns - 1) * GAP + _LEGEND_WIDTH
     height_px = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2)
@@ -220,14 +192,14 @@ def save_figure(
     font, small = (ImageFont.load_default(size) for size in (_FONT_SIZE, _SMALL_FONT_SIZE))
     # The panels, and where they are.
     boxes = {}
-    for index, panel in enumerate(panels):
+    for index, (title, remark, pixels) in enumerate(panels):
         row, column = divmod(index, columns)
         x, y = MARGIN + column * (width + GAP), MARGIN + row * (row_height + GAP // 2)
-        draw.text((x, y + 4), panel.title, font=font, fill=_INK)
-        indent = draw.textlength(panel.title, font=font) + 14
-        draw.text((x + indent, y + 5), panel.remark, font=small, fill=_FAINT_INK)
-        figure.paste(Image.fromarray(np.ascontiguousarray(panel.pixels)), (x, y + _TITLE_HEIGHT))
-        boxes[panel.title] = (x, y + _TITLE_HEIGHT, width, height)
+        draw.text((x, y + 4), title, font=font, fill=_INK)
+        indent = draw.textlength(title, font=font) + 14
+        draw.text((x + indent, y + 5), remark, font=small, fill=_FAINT_INK)
+        figure.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y + _TITLE_HEIGHT))
+        boxes[title] = (x, y + _TITLE_HEIGHT, width, height)
     # The bar, far at the top, as on an axis.
     left, top = width_px - MARGIN - _LEGEND_WIDTH + GAP, MARGIN + _TITLE_HEIGHT
     length = height_px - MARGIN - top
@@ -241,13 +213,6 @@ def save_figure(
     with atomic_path(path) as temporary:
         figure.save(temporary, "PNG", compress_level=_FAST)
     return FigureRecord(size=figure.size, panels=boxes)
-
-
-Depth = NDArray[np.float32]
-
-# Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
-_WIDE = 2.0
-_STRONGEST_PERCENTILE = 95.0
 
 
 def preview(
@@ -279,22 +244,22 @@ def preview(
     """
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
-    factor = magnification(before.shape, columns=columns)
-    scale, grey = depth_scale(sparse_depth, before, after), grey_of(rgb, before.shape)
+    factor = _magnification(before.shape, columns=columns)
+    scale, grey = depth_scale(sparse_depth, before, after), _grey_of(rgb, before.shape)
+    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
+    change = (after[both] - before[both]).astype(np.float64)
+    pixels, strongest = _paint(change, both, grey, "change")
+    remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g} {unit}"
     panels = [
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
-        *(
-            Panel(title=title, pixels=resized(scale.paint(depth), factor), remark=remark)
-            for title, depth, remark in zip(
-                ("Depth before", "Depth after"), (before, after), made_by, strict=True
-            )
-        ),
-        _change_panel(before, after, grey, factor, unit),
+        ("Depth before", made_by[0], _resize(scale.paint(before), factor)),
+        ("Depth after", made_by[1], _resize(scale.paint(after), factor)),
+        ("Change", remark, _resize(pixels, factor)),
     ]
     if rgb is not None:
         image = np.rint(255 * np.clip(np.nan_to_num(rgb), 0, 1)).astype(np.uint8)
-        panels.insert(0, Panel(title="Image", pixels=resized(image, factor, smooth=True)))
-    return save_depth_figure(path, panels, scale, unit, columns=columns)
+        panels.insert(0, ("Image", "", _resize(image, factor, smooth=True)))
+    return _save_depth_figure(path, panels, scale, unit, columns=columns)
 
 
 def overlay(
@@ -304,9 +269,9 @@ def overlay(
 
     The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
     """
-    scale, grey = depth_scale(depth), grey_of(rgb, rgb.shape)
-    panel = _points_panel(grey, xy, depth, scale, magnification(rgb.shape))
-    save_depth_figure(path, [panel], scale)
+    scale, grey = depth_scale(depth), _grey_of(rgb, rgb.shape)
+    panel = _points_panel(grey, xy, depth, scale, _magnification(rgb.shape))
+    _save_depth_figure(path, [panel], scale)
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
@@ -321,35 +286,10 @@ def _paint(
     values: NDArray[np.float64], where: NDArray[np.bool_], grey: NDArray[np.float32], colors: str
 ) -> tuple[Pixels, float]:
     """A map of signed values in colours on the dark grey image, and the value of full colour."""
-    pixels, changed = dim(np.asarray(0.6 * grey, np.float32)), np.abs(values[values != 0])
+    pixels, changed = _dim(np.asarray(0.6 * grey, np.float32)), np.abs(values[values != 0])
     strongest = float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
-    pixels[where] = paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
+    pixels[where] = _paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
     return pixels, strongest
-
-
-def _points_panel(
-    grey: NDArray[np.float32],
-    xy: NDArray[np.float32],
-    depth: Depth,
-    scale: DepthScale,
-    factor: float,
-) -> Panel:
-    """The points in the colours of their depth on the grey image, nearest on top."""
-    far_first = np.argsort(-depth, kind="stable")
-    discs = draw_discs(grey, xy, scale.paint(depth), factor, far_first)
-    count = f"{len(depth):,} point{'' if len(depth) == 1 else 's'}"
-    return Panel(title="Sparse depth", pixels=discs, remark=count)
-
-
-def _change_panel(
-    before: Depth, after: Depth, grey: NDArray[np.float32], factor: float, unit: str
-) -> Panel:
-    """The signed change."""
-    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
-    change = (after[both] - before[both]).astype(np.float64)
-    pixels, strongest = _paint(change, both, grey, "change")
-    remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g} {unit}"
-    return Panel(title="Change", pixels=resized(pixels, factor), remark=remark)
 
 
 def improvement(
@@ -380,8 +320,8 @@ def improvement(
     gains = gain(before, after, truth)
     known = np.isfinite(gains)
     gains = gains[known]
-    pixels, strongest = _paint(gains, known, grey_of(rgb, truth.shape), "gain")
-    pixels = resized(pixels, magnification(truth.shape))
+    pixels, strongest = _paint(gains, known, _grey_of(rgb, truth.shape), "gain")
+    pixels = _resize(pixels, _magnification(truth.shape))
     # The figure, and its texts for a report.
     improved, worse = (100 * float(part.mean()) for part in (gains > 0, gains < 0))
     footer = f"{improved:.1f} % of {gains.size:,} pixels improved, {worse:.1f} % worse"
@@ -389,9 +329,9 @@ def improvement(
     if not known.all():
         unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
     remark = footer + (f"; dark: {unknown}" if unknown else "")
-    panel = Panel(title="Change of error", pixels=pixels, remark=remark)
     labels = [f"{share * strongest:+.3g}" for share in (-1, -0.5, 0, 0.5, 1)]
-    figure = save_figure(path, [panel], signed_bar("gain", 256), labels, f"gain, {unit}")
+    panel = "Change of error", remark, pixels
+    figure = _save_figure(path, [panel], signed_bar("gain", 256), labels, f"gain, {unit}")
     amount = f"by {strongest:.3g} {unit} or more"
     ends = f"worse {amount}", f"better {amount}"
     return replace(figure, ends=ends, unknown=unknown, footer=footer)

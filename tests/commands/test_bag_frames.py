@@ -67,7 +67,7 @@ def test_a_bag_becomes_frames_with_a_calibration(
     assert pixels.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(pixels[5, 5] * 255, [200, 41, 41], atol=4 if compressed else 0)
     assert frames[1].sparse is not None
-    assert len(read_scan(frames[1].sparse).points) == 150
+    assert len(read_scan(frames[1].sparse)[0]) == 150
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
     assert calibration.camera.size == (HEIGHT, WIDTH)
     np.testing.assert_allclose(

@@ -41,13 +41,13 @@ def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
     calib.write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
     request = CloudRequest(**({"depth": path, "output": output, "calib": calib} | values))
     what, notes = write_depth_cloud(request)
-    count = len(read_scan(output).points)
+    count = len(read_scan(output)[0])
     assert what.startswith(f"{count:,} points")
     return count, " ".join([what, *notes])
 
 
 def points_of(path: Path) -> np.ndarray:
-    return read_scan(path).points[:, :3]
+    return read_scan(path)[0][:, :3]
 
 
 def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:

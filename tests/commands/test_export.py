@@ -145,7 +145,7 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     expected = np.array([(u - 32) / 50 * DEPTH[v, u] - 0.1, (v - 22.5) / 52 * DEPTH[v, u]])
     expected = np.array([*expected, DEPTH[v, u]]) * (unit_scale or 1)
     assert world[:3] == pytest.approx(expected, rel=1e-3)
-    start = read_scan(scene / content["ply_file_path"]).points
+    start = read_scan(scene / content["ply_file_path"])[0]
     assert len(start) > 500
     median = np.median(DEPTH) * world[2] / DEPTH[v, u]
     assert np.median(start[:, 2]) == pytest.approx(median, rel=0.01)

@@ -76,7 +76,7 @@ def pixel_error(folder: Path, intrinsics: NDArray[np.float64]) -> float:
     scan = next((folder / "sparse").iterdir())
     options = ScanOptions(calib=folder / "calib.txt", keep_occluded=True)
     points = read_scan_points(scan, options, SIZE).points
-    xyz = read_scan(scan).points @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    xyz = read_scan(scan)[0] @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     at = (xyz + ABOVE) @ intrinsics.T
     expected = cKDTree(at[:, :2] / at[:, 2:])
     assert len(points.depth) > 1000
@@ -212,7 +212,7 @@ def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> 
 def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> None:
     folder = shared_data / "kitti_object"
     for path in sorted((folder / "calib").glob("*.txt")):
-        scan = read_scan(folder / "velodyne" / f"{path.stem}.bin").points
+        scan = read_scan(folder / "velodyne" / f"{path.stem}.bin")[0]
         calibration = read_calibration(path)
         camera, right = calibration.camera, calibration.scanner
         assert right is not None

@@ -91,7 +91,7 @@ def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
 
 def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:
     for image, scan, calib in scans(shared_data):
-        xyz = read_scan(scan).points
+        xyz = read_scan(scan)[0]
         whole = np.column_stack([xyz, np.ones((len(xyz), 3))]).astype("<f4")
         formats = {
             "a.npy": npy_bytes(xyz),

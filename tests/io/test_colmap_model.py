@@ -28,8 +28,8 @@ def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
     assert model.images["dir/2.png"].pose.translation.tolist() == [0.2, 0, 0]
     assert model.images["dir/2.png"].points.tolist() == [7]
     points = model.points
-    assert points.xyz.tolist() == [[0.5, -0.25, 4.0]]
-    assert (points.error.tolist(), points.track.tolist()) == ([0.75], [2])
+    assert points["xyz"].tolist() == [[0.5, -0.25, 4.0]]
+    assert (points["error"].tolist(), points["track"].tolist()) == ([0.75], [2])
 
 
 def test_a_model_is_found_in_the_folders_above_it(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_points_project_as_in_pycolmap_for_every_camera_model(name: str, tmp_pat
     write_text_model(tmp_path, camera=name)
     ours = read_model(tmp_path).images["a.png"].camera
     theirs = pycolmap.Reconstruction(str(tmp_path)).cameras[1]
-    assert (theirs.model.name, int(theirs.model)) == (name, MODELS[name].number)
+    assert (theirs.model.name, int(theirs.model)) == (name, MODELS[name][0])
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)]) * 3
     expected = theirs.img_from_cam(points) - 0.5  # pixel centres are at .5 in COLMAP
@@ -97,9 +97,9 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
         "# comment\n\n7 1 2 3 9 8 7 0.5 1 0 2 0\n8 4 5 6 9 8 7 1\n"
     )
     model = read_model(tmp_path)
-    assert model.points.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert model.points.error.tolist() == [0.5, 1]
-    assert model.points.track.tolist() == [2, 0]
+    assert model.points["xyz"].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert model.points["error"].tolist() == [0.5, 1]
+    assert model.points["track"].tolist() == [2, 0]
     assert model.images["b.png"].points.tolist() == [1, 2, 3]
     assert model.images["b.png"].pose.translation.tolist() == [0.1, 0, 0]
 

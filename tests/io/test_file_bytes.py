@@ -1,4 +1,4 @@
-"""JSON is read as it was written; CSV; and a file is known by its digest."""
+"""JSON is read as it was written, and a file is known by its digest."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def test_points_survive_every_format_and_what_is_no_number_is_left_to_the_gate(
     bad[5], bad[20, 0] = np.nan, np.inf
     for points in (1e-3 * POINTS, 1e4 * POINTS, bad):
         (tmp_path / name).write_bytes(FILES[name](points))
-        got = read_scan(tmp_path / name).points
+        got = read_scan(tmp_path / name)[0]
         assert got.dtype == np.float32
         np.testing.assert_array_equal(got, points.astype(np.float32))
 
@@ -148,9 +148,9 @@ def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_its_content(tmp_path: Path)
     points, path = np.resize(POINTS, (40, 3)), tmp_path / "scan.bin"
     for source, encoded in {"KITTI scan": bin_bytes, "nuScenes scan": nuscenes_bytes}.items():
         path.write_bytes(encoded(points))
-        scan = read_scan(path)
-        assert np.array_equal(scan.points, points)
-        assert scan.source == source
+        got, read_as = read_scan(path)
+        assert np.array_equal(got, points)
+        assert read_as == source
     path.write_bytes(bytes(80))  # of any number of fields
     with pytest.raises(FileFormatError):
         read_scan(path)
@@ -165,7 +165,7 @@ def test_the_parts_of_a_cloud_are_the_rows_of_a_ply(tmp_path: Path, coloured: bo
         for part in (slice(20), slice(20, None))
     ]
     assert write_cloud(tmp_path / "a.ply", parts) == len(POINTS)
-    assert np.array_equal(read_scan(tmp_path / "a.ply").points, POINTS)
+    assert np.array_equal(read_scan(tmp_path / "a.ply")[0], POINTS)
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
     assert names == ["x", "y", "z", "nx", "ny", "nz", *(["red", "green", "blue"] * coloured)]

@@ -197,6 +197,6 @@ def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: 
     folder = shared_data / "kitti_object"
     calibration = read_calibration(folder / "calib" / "000001.txt")
     assert calibration.scanner is not None
-    scan = read_scan(folder / "velodyne" / "000001.bin").points
+    scan = read_scan(folder / "velodyne" / "000001.bin")[0]
     filtered = project_velodyne(scan, calibration.camera, calibration.scanner, (375, 1242))
     assert occluded_in_map(points_of(as_depth_image(filtered))) is None

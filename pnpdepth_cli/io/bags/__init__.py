@@ -17,15 +17,20 @@ import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, TYPE_CHECKING, Any
 
 from pnpdepth_cli.budget import budget
 from pnpdepth_cli.errors import FileFormatError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, parse_yaml, read_bytes, size_of_regular_file
 
-BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.typesys.store import Typestore
+
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUDS = ("sensor_msgs/msg/PointCloud2",)
 CAMERAS = ("sensor_msgs/msg/CameraInfo",)
@@ -35,7 +40,6 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
 COMPRESSED = ("/compressed", "/compressedDepth")
 """Ends of the names of topics of compressed images."""
 
-
 Message = Any
 """A ROS message, whose type rosbags makes when it runs."""
 
@@ -44,34 +48,35 @@ def is_bag(path: Path) -> bool:
     """Returns whether this is a bag file, or a folder that ROS 2 recorded."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
-    return path.suffix.lower() in BAG_SUFFIXES
+    return path.suffix.lower() in (".bag", ".mcap", ".db3")
 
 
+@dataclass(frozen=True, kw_only=True)
 class Bag:
     """An open bag; made by `open_bag`."""
 
-    def __init__(self, path: Path, reader: Any, typestore: Any, *, ros1: bool) -> None:
-        self.path = path
-        self._reader = reader
-        self._decode = typestore.deserialize_ros1 if ros1 else typestore.deserialize_cdr
+    path: Path
+    reader: Reader1 | Reader2
+    decode: Callable[[bytes, str], Message]
+    """Function of a message's bytes and the name of its type."""
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
         """Returns the topics of these message types with their number of messages."""
         with _as_our_errors(self.path):
             return {
                 name: int(info.msgcount)
-                for name, info in sorted(self._reader.topics.items())
+                for name, info in sorted(self.reader.topics.items())
                 if info.msgtype in kinds
             }
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
-        wanted = [each for each in self._reader.connections if each.topic in topics]
+        wanted = [each for each in self.reader.connections if each.topic in topics]
         if not wanted:
             return
         with _as_our_errors(self.path):
-            for connection, time_ns, data in self._reader.messages(connections=wanted):
-                yield connection.topic, int(time_ns), self._decode(data, connection.msgtype)
+            for connection, time_ns, data in self.reader.messages(connections=wanted):
+                yield connection.topic, int(time_ns), self.decode(data, connection.msgtype)
 
 
 @contextmanager
@@ -92,15 +97,17 @@ def open_bag(path: Path) -> Iterator[Bag]:
     bound_decompression()
     with _as_our_errors(path):
         _check_bag(path)
-        reader: Any = Reader1(path) if ros1 else Reader2(path)
+        reader = Reader1(path) if ros1 else Reader2(path)
         reader.open()
     try:
-        yield Bag(path, reader, message_types(ros1=ros1), ros1=ros1)
+        types = message_types(ros1=ros1)
+        decode = types.deserialize_ros1 if ros1 else types.deserialize_cdr
+        yield Bag(path=path, reader=reader, decode=decode)
     finally:
         reader.close()
 
 
-def message_types(*, ros1: bool) -> Any:
+def message_types(*, ros1: bool) -> Typestore:
     """Returns rosbags' type store of ROS 1 Noetic or ROS 2 Humble."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -145,27 +152,23 @@ def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
 
 @contextmanager
 def _as_our_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except _errors_of_rosbags() as error:
-        raise FileFormatError(
-            f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
-            " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
-        ) from error
-
-
-def _errors_of_rosbags() -> tuple[type[Exception], ...]:
-    """What rosbags and its parts raise on damaged files."""
+    """Makes what rosbags and its parts raise on damaged files an error of ours."""
     from rosbags.rosbag1 import ReaderError as Reader1Error
     from rosbags.rosbag2 import ReaderError as Reader2Error
     from rosbags.serde import SerdeError
 
-    mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
-    database: Any = importlib.import_module("rosbags.rosbag2.storage_sqlite3")
-    own = (Reader1Error, Reader2Error, SerdeError)
+    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    database = importlib.import_module("rosbags.rosbag2.storage_sqlite3")
     libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
     content = (ValueError, LookupError, OverflowError, TypeError, AssertionError)
-    return (*own, *libraries, *content, OSError, EOFError, RuntimeError)
+    others = (*libraries, *content, OSError, EOFError, RuntimeError)
+    try:
+        yield
+    except (Reader1Error, Reader2Error, SerdeError, *others) as error:
+        raise FileFormatError(
+            f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
+            " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
+        ) from error
 
 
 _CHUNK_BYTES = 1 << 28
@@ -185,25 +188,18 @@ def _check_bag(path: Path) -> None:
     """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
     files = [path]
     if path.is_dir():
-        files = sorted(path.glob("*.db3"))
-        _check_metadata(path / "metadata.yaml")
+        files, metadata = sorted(path.glob("*.db3")), path / "metadata.yaml"
+        match parse_yaml(metadata, read_bytes(metadata).decode("utf-8", "replace")):
+            case {"rosbag2_bagfile_information": dict(information)}:
+                if str(information.get("compression_mode", "")).lower() not in ("", "none"):
+                    raise FileFormatError(f"{path}: the bag is compressed; `ros2 bag convert` it")
+            case _:
+                fact = "is no metadata of a bag; repair it: ros2 bag reindex"
+                raise FileFormatError(f"{metadata} {fact}")
     for file in files:
         size_of_regular_file(file)
         if file.suffix.lower() == ".db3":
             _check_database(file)
-
-
-def _check_metadata(path: Path) -> None:
-    match parse_yaml(path, read_bytes(path).decode("utf-8", "replace")):
-        case {"rosbag2_bagfile_information": {"compression_mode": mode}}:
-            if str(mode).lower() not in ("", "none"):
-                raise FileFormatError(
-                    f"{path}: the bag is compressed; `ros2 bag convert` it to MCAP"
-                )
-        case {"rosbag2_bagfile_information": {}}:
-            pass
-        case _:
-            raise FileFormatError(f"{path} is no metadata of a bag; repair it: ros2 bag reindex")
 
 
 def _check_database(path: Path) -> None:
@@ -222,20 +218,17 @@ def bound_decompression() -> None:
     """Makes rosbags decompress chunks within `budget()`, in the whole process."""
     import lz4.frame
 
-    rosbag1: Any = importlib.import_module("rosbags.rosbag1.reader")
-    mcap: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    rosbag1 = importlib.import_module("rosbags.rosbag1.reader")
+    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
     rosbag1.decompressors.update(bz2=_bound(bz2.open), lz4=_bound(lz4.frame.open))
     mcap.DECOMPRESSORS.update(lz4=_bound(lz4.frame.open), zstd=_bound(mcap.zstd.open))
 
 
-def _bound(open_stream: Callable[..., Any]) -> Callable[..., bytes]:
+def _bound(open_stream: Callable[[BytesIO], IO[bytes]]) -> Callable[..., bytes]:
     """Returns a function of compressed bytes and, for MCAP, the size that the chunk claims."""
 
-    def decompress(data: bytes, claimed: int | None = None) -> bytes:
-        limit = min(_CHUNK_BYTES, budget().max_file_bytes)
-        if claimed is not None:
-            limit = min(limit, claimed)
-        stream: BinaryIO
+    def decompress(data: bytes, claimed: int = _CHUNK_BYTES) -> bytes:
+        limit = min(_CHUNK_BYTES, budget().max_file_bytes, claimed)
         with open_stream(BytesIO(data)) as stream:
             content = stream.read(limit + 1)
         if len(content) > limit:

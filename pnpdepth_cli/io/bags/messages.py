@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from pnpdepth_cli.io.formats import format_of_content
 from pnpdepth_cli.io.formats.images import PNG
 from pnpdepth_cli.io.poses import Trajectory, pose_of_quaternion, trajectory_of
 
+_Kind = TypeVar("_Kind", bound=np.generic)
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Data types of sensor_msgs/PointField."""
 
@@ -64,34 +65,28 @@ def image_file(message: Message, topic: str) -> tuple[str, bytes]:
             kind = one_line(message.format)[:30]
             raise FileFormatError(f"{topic}: {kind!r} is no JPEG and no PNG; name another --topic")
         return suffix, data
-    done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if not done:
-        raise FileFormatError(f"{topic}: an image cannot be encoded as PNG")
-    return ".png", encoded.tobytes()
-
-
-def _pixels(message: Message, topic: str) -> NDArray[np.uint8]:
-    """(H, W) or (H, W, 3) blue, green, red."""
-    encoding = str(message.encoding)
-    if encoding not in _CHANNELS:
+    # The pixels, in blue, green and red.
+    if (encoding := str(message.encoding)) not in _CHANNELS:
         known = ", ".join(_CHANNELS)
         raise FileFormatError(f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {known}")
     channels = _CHANNELS[encoding]
-    rows = _rows(message, topic, channels)
-    pixels = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
-    conversion = _TO_BGR.get(encoding)
-    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
+    layout = np.dtype("u1" if channels == 1 else ("u1", channels))
+    pixels = np.ascontiguousarray(_grid(message, topic, layout, int(message.step)))
+    if not pixels.size:
+        raise FileFormatError(f"{topic}: an image without pixels; the bag is damaged")
+    if encoding in _TO_BGR:
+        pixels = cv2.cvtColor(pixels, _TO_BGR[encoding])
+    return ".png", cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
-def _rows(message: Message, topic: str, pixel_bytes: int) -> NDArray[np.uint8]:
-    """The bytes of an Image's pixels, (H, W * pixel_bytes)."""
-    height, width, step = int(message.height), int(message.width), int(message.step)
+def _grid(message: Message, topic: str, layout: np.dtype[_Kind], row_bytes: int) -> NDArray[_Kind]:
+    """The values (H, W) of an Image or a PointCloud2 whose rows have so many bytes."""
+    height, width = int(message.height), int(message.width)
     data = np.frombuffer(message.data, np.uint8)
-    if not 0 < width * pixel_bytes <= step or not 0 < height * step <= data.size:
-        image = f"an image of {width}×{height} pixels and {step} bytes a row"
-        raise FileFormatError(f"{topic}: {image} has {data.size:,} bytes; the bag is damaged")
-    rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
-    return np.ascontiguousarray(rows)
+    if width * layout.itemsize > row_bytes or height * row_bytes > data.size:
+        what = f"{width}×{height} values of {layout.itemsize} bytes, {row_bytes} a row,"
+        raise FileFormatError(f"{topic}: {what} have {data.size:,} bytes; the bag is damaged")
+    return np.ndarray((height, width), layout, data, 0, (row_bytes, layout.itemsize))
 
 
 def is_depth(message: Message, topic: str) -> bool:
@@ -115,10 +110,9 @@ def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
         FileFormatError: It is damaged, or compressed otherwise.
     """
     if hasattr(message, "encoding"):
-        number = np.dtype(_DEPTH[str(message.encoding)])
-        values = _rows(message, topic, number.itemsize).view(
-            number.newbyteorder(">" if message.is_bigendian else "<")
-        )
+        order = ">" if message.is_bigendian else "<"
+        number = np.dtype(order + _DEPTH[str(message.encoding)])
+        values = _grid(message, topic, number, int(message.step))
         return known_metres(values if number.kind == "f" else values / _MM_PER_M)
     data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or format_of_content(data[_DEPTH_HEADER:]) is not PNG:
@@ -138,28 +132,22 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
     Raises:
         FileFormatError: It has no x, y and z, or claims more than it holds.
     """
-    # The fields of x, y and z.
     fields = {str(field.name): field for field in message.fields}
     if any(name not in fields or int(fields[name].datatype) not in _NUMBERS for name in "xyz"):
         raise FileFormatError(f"{topic}: a cloud without numbers x y z; name another topic")
-    # Where they lie in a point.
-    order = ">" if message.is_bigendian else "<"
+    # Where x, y and z lie in a point.
+    order, step = ">" if message.is_bigendian else "<", int(message.point_step)
     formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]
     offsets = [int(fields[name].offset) for name in "xyz"]
-    end = max(o + np.dtype(f).itemsize for o, f in zip(offsets, formats, strict=True))
-    # How many points the message holds.
-    height, width, step = int(message.height), int(message.width), int(message.point_step)
-    row = int(message.row_step) if height > 1 else width * step
-    data = np.frombuffer(message.data, np.uint8)
-    if end > step or width * step > row or height * row > data.size:
-        cloud = f"a cloud of {width}×{height} points of {step} bytes"
-        raise FileFormatError(f"{topic}: {cloud} has {data.size:,} bytes; the bag is damaged")
-    # The coordinates, without the bytes between rows and fields.
-    layout = np.dtype(
-        {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}
-    )
-    rows = data[: height * row].reshape(height, row)[:, : width * step]
-    points = np.frombuffer(np.ascontiguousarray(rows).tobytes(), layout)
+    try:
+        layout = np.dtype(
+            {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}
+        )
+    except ValueError as error:
+        raise FileFormatError(f"{topic}: points of {step} bytes do not hold x y z") from error
+    # The row's length may be 0 in a cloud of one row.
+    row_bytes = int(message.row_step) if message.height > 1 else int(message.width) * step
+    points = _grid(message, topic, layout, row_bytes).ravel()
     with np.errstate(over="ignore", invalid="ignore"):
         return np.column_stack([points[name] for name in "xyz"]).astype(np.float32)
 
@@ -228,21 +216,18 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
 def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
     """Returns the camera of the first message of a camera_info topic, and its frame_id."""
     for _, _, message in bag.messages([topic]):
-        k, d, r, p = (
-            np.asarray(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
+        values = {
+            name: np.asarray(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
             for name in "kdrp"
-        )
-        if not k.any():
+        }
+        if not values["k"].any():
             return None  # an uncalibrated camera
-        content = {
-            "camera_matrix": k.tolist(),
-            "distortion_coefficients": d.tolist(),
-            "distortion_model": str(message.distortion_model) if d.size else "none",
+        content: dict[str, object] = {
+            "distortion_model": str(message.distortion_model) if values["d"].size else "none",
             "width": int(message.width),
             "height": int(message.height),
         }
-        if np.isfinite(p).all() and np.isfinite(r).all():
-            content |= {"projection_matrix": p.tolist(), "rectification_matrix": r.tolist()}
+        content |= {name: v.tolist() for name, v in values.items() if np.isfinite(v).all()}
         calibration = camera_in_yaml(bag.path, content, None)
         camera = replace(calibration.camera, source=topic)
         return replace(calibration, camera=camera), frame_of(message)
@@ -257,23 +242,21 @@ def frame_of(message: Message) -> str:
 def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
     """Returns the scanner's pose in the camera's coordinates, by /tf_static; None without one."""
     # The transforms, each in both directions.
-    links: dict[str, dict[str, Extrinsics]] = {}
+    links = list[tuple[str, str, Extrinsics]]()
     topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
     for _, _, message in bag.messages(topics):
         for each in message.transforms:
             parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
             pose = _pose_in(bag, each.transform.translation, each.transform.rotation)
-            links.setdefault(parent, {})[child] = pose
-            links.setdefault(child, {})[parent] = pose.inverse()
+            links += [(parent, child, pose), (child, parent, pose.inverse())]
     # The shortest chain of them.
-    poses, waiting = {camera: SAME_PLACE}, deque([camera])
-    while waiting and scanner not in poses:
-        frame = waiting.popleft()
-        for other, pose in links.get(frame, {}).items():
-            if other not in poses:
-                poses[other] = poses[frame] @ pose
-                waiting.append(other)
-    return poses.get(scanner)
+    poses = {camera: SAME_PLACE}
+    while scanner not in poses:
+        next_poses = {b: poses[a] @ pose for a, b, pose in links if a in poses and b not in poses}
+        if not next_poses:
+            return None
+        poses |= next_poses
+    return poses[scanner]
 
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:

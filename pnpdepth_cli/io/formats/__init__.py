@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
@@ -48,11 +47,6 @@ class DepthFile:
     reading: Reading
     """How the file was read; of stored values, the scale is the one that the file itself states."""
     is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """(H, W), true where depth is known."""
-        return self.values > 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +90,10 @@ def kind_of(data: bytes) -> str | None:
     return None if depth_format is None else depth_format.name
 
 
-def eight_bits(path: Path, kind: str) -> FileFormatError:
-    """Returns the error for an 8-bit image given as depth."""
+def no_depth(path: Path, what: str) -> FileFormatError:
+    """Returns the error for an image of pixels that hold no depth."""
     way_out = "give the 16-bit PNG, EXR or NPY that it is an image of"
-    return FileFormatError(f"{path} is an 8-bit {kind}, which cannot hold depth; {way_out}")
+    return FileFormatError(f"{path} is {what}, which cannot hold depth; {way_out}")
 
 
 def check_scale(scale: float | None) -> None:

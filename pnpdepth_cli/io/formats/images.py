@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,11 @@ from pnpdepth_cli.io.formats import (
     DepthFormat,
     Reading,
     check_scale,
-    eight_bits,
+    no_depth,
 )
 
 if TYPE_CHECKING:
+    import OpenEXR
     import PIL.Image
 
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
@@ -105,10 +106,8 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
             # Pillow decodes three channels into four bytes
             channels = 1 if len(image.getbands()) == 1 else 4
             value_bytes = 4 if image.mode in "IF" else 2 if ";16" in raw_mode(image) else 1
-            check_pixel_count(
-                path, *image.size, channels=channels, value_bytes=value_bytes,
-                file_bytes=len(data),
-            )  # fmt: skip
+            pixel_bytes = channels * value_bytes
+            check_pixel_count(path, *image.size, pixel_bytes=pixel_bytes, file_bytes=len(data))
             yield image
     except IMAGE_ERRORS as error:
         # Pillow names the in-memory buffer, which means nothing to a reader
@@ -141,25 +140,15 @@ def _read_png(path: Path, data: bytes) -> DepthFile:
     with open_image(path, data, "PNG") as image:
         mode = raw_mode(image)
         if not mode.startswith("I;16"):
-            raise _not_grey(path, "PNG") if ";16" in mode else eight_bits(path, "PNG")
+            raise no_depth(path, "a PNG of several channels" if ";16" in mode else "an 8-bit PNG")
         codes = np.asarray(image).astype(np.uint16, copy=False)
         stated = image.info.get(SCALE_KEY)
-    return DepthFile(values=codes, reading=Reading("16-bit PNG", _stated_scale(path, stated)))
-
-
-def _stated_scale(path: Path, text: str | None) -> float | None:
-    """The codes per metre that a file states. Raises FileFormatError for another text."""
-    if text is None:
-        return None
     try:
-        check_scale(scale := float(text))
+        scale = None if stated is None else float(stated)
+        check_scale(scale)
     except (ValueError, UsageError) as error:
-        raise damaged(path, f"{SCALE_KEY}={text[:40]}", "is no scale") from error
-    return scale
-
-
-def _not_grey(path: Path, kind: str) -> FileFormatError:
-    return FileFormatError(f"{path} is a {kind} of several channels; save depth as a grey one")
+        raise damaged(path, f"{SCALE_KEY}={str(stated)[:40]}", "is no scale") from error
+    return DepthFile(values=codes, reading=Reading("16-bit PNG", scale))
 
 
 def _write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
@@ -188,11 +177,7 @@ def _read_tiff(path: Path, data: bytes) -> DepthFile:
         if image.mode.startswith("I;16"):
             codes = np.asarray(image).astype(np.uint16)
             return DepthFile(values=codes, reading=Reading("16-bit TIFF"))
-        if len(image.getbands()) > 1:
-            raise _not_grey(path, "TIFF")
-        if image.mode != "I":
-            raise eight_bits(path, "TIFF")
-    raise FileFormatError(f"{path} is a TIFF of other integers; save depth as float32 or uint16")
+        raise no_depth(path, f"a TIFF of mode {image.mode}, not F or I;16")
 
 
 def _write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -233,7 +218,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
         raise FileFormatError(f"{path} lists tens of thousands of channels; export the depth alone")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            _check_exr(path, file.header(0), len(file.parts), len(data))
+            _check_exr(path, file, len(data))
         # It prints why it cannot decode a part, which it leaves out.
         with (
             _EXR_LOCK,
@@ -249,17 +234,15 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
     return decoded
 
 
-def _check_exr(path: Path, header: Mapping[str, Any], parts: int, file_bytes: int) -> None:
+def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
     """Raises FileFormatError for what is not one flat image of whole channels in the budget."""
-    channels = header["channels"]
-    (left, top), (right, bottom) = header["dataWindow"]
-    check_pixel_count(
-        path, int(right) - int(left) + 1, int(bottom) - int(top) + 1, channels=len(channels),
-        value_bytes=4, file_bytes=file_bytes,
-    )  # fmt: skip
+    header, channels = file.header(0), file.header(0)["channels"]
+    (left, top), (right, bottom) = np.array(header["dataWindow"]).tolist()
+    size, pixel_bytes = (right - left + 1, bottom - top + 1), 4 * len(channels)
+    check_pixel_count(path, *size, pixel_bytes=pixel_bytes, file_bytes=file_bytes)
     cropped = not np.array_equal(header["dataWindow"], header["displayWindow"])
     sampled = any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels)
-    if parts > 1 or "deep" in str(header.get("type", "")) or cropped or sampled:
+    if len(file.parts) > 1 or "deep" in str(header.get("type", "")) or cropped or sampled:
         fact = "has several parts, or is deep, cropped or subsampled"
         raise FileFormatError(f"{path} {fact}; export one flat image of its whole frame")
 
@@ -278,25 +261,19 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
 
 
 def _read_exr(path: Path, data: bytes) -> DepthFile:
-    channels = read_exr_channels(path, data)
-    name = _depth_channel(path, channels)
-    return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
-
-
-def _depth_channel(path: Path, channels: Mapping[str, NDArray[np.generic]]) -> str:
     """The only channel, or the only one named for depth, or R of a grey image in R, G, B."""
+    channels = read_exr_channels(path, data)
     names = [name for name in channels if name != "A"] or list(channels)
-    if len(names) == 1:
-        return names[0]
     named = [name for name in names if not _DEPTH_NAMES.isdisjoint(name.lower().split("."))]
-    if len(named) == 1:
-        return named[0]
     if sorted(names) == ["B", "G", "R"]:
-        red, green, blue = (channels[name] for name in "RGB")
-        if np.array_equal(red, green, equal_nan=True) and np.array_equal(red, blue, equal_nan=True):
-            return "R"
-    listing = ", ".join(channels)
-    raise FileFormatError(f"{path} has several channels ({listing}); export the depth alone")
+        named = ["R"] * all(
+            np.array_equal(channels["R"], channels[c], equal_nan=True) for c in "GB"
+        )
+    if len(names) > 1 and len(named) != 1:
+        listing = ", ".join(channels)
+        raise FileFormatError(f"{path} has several channels ({listing}); export the depth alone")
+    (name,) = names if len(names) == 1 else named
+    return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 
 
 EXR = DepthFormat(

@@ -190,7 +190,7 @@ def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path)
         """The depth of the farthest point of the cloud along z."""
         output = tmp_path / "cloud.ply"
         write_depth_cloud(CloudRequest(depth=root / "out", output=output, overwrite=True))
-        return float(read_scan(output).points[:, 2].max())
+        return float(read_scan(output)[0][:, 2].max())
 
     # Poses of the folder; then of a file, with which the frames that moved are done again.
     batch(root, refine={"iterations": 0})
