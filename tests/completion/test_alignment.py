@@ -36,16 +36,6 @@ def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_an_affine_output_is_read_exactly_in_every_space(space: str) -> None:
-    d = scene(50)
-    x = output_for(d, space, 0.3, 0.05)
-    alignment = align(x, points_of(d), (space,), "affine")
-    assert (alignment.scale, alignment.shift) == pytest.approx((0.3, 0.05), rel=1e-4)
-    assert alignment.outliers == 0
-    assert torch.allclose(alignment.depth(x), d, rtol=1e-4)
-
-
-@pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
 @pytest.mark.parametrize(("count", "seed"), [(30, 0), (30, 1), (2000, 2)])
 def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
@@ -99,20 +89,6 @@ def test_the_fit_is_its_own_biweight_least_squares_and_its_errors_are_those_of_i
     assert fit.outliers == np.mean(error > max(3 * 1.4826 * np.median(error), 0.05))
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("seed", range(3))
-def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers(
-    sign: int, seed: int
-) -> None:
-    d = scene(4000, seed)
-    x = sign * (37.5 / d + 4.0)
-    alignment = align(x[:30], points_of(spoiled(d[:30])), ("depth", "inverse"), "auto")
-    assert (alignment.space, alignment.kind) == ("inverse", "affine")
-    assert alignment.falling == (sign > 0)
-    assert float((alignment.depth(x) / d - 1).abs().max()) < 0.005
-    assert alignment.outliers == pytest.approx(0.2, abs=0.04)
-
-
 @pytest.mark.parametrize(
     ("output", "wanted"),
     [
@@ -123,6 +99,7 @@ def test_auto_aligns_a_disparity_network_from_30_points_with_20_percent_outliers
         (lambda d: 1 / d, ("inverse", "none")),
         (lambda d: 9 / d, ("inverse", "scale")),
         (lambda d: -9 / d, ("inverse", "scale")),
+        (lambda d: 37.5 / d + 4, ("inverse", "affine")),
     ],
 )
 def test_auto_takes_the_simplest_reading_that_explains_the_points(
@@ -134,6 +111,7 @@ def test_auto_takes_the_simplest_reading_that_explains_the_points(
         noisy = output(d * (1 + 0.02 * noise))
         alignment = align(noisy, points_of(d), ("depth", "inverse"), "auto")
         assert (alignment.space, alignment.kind) == wanted
+        assert alignment.falling == bool(output(d.min()) > output(d.max()))
 
 
 def test_auto_pays_twice_the_price_of_a_parameter_in_bic() -> None:

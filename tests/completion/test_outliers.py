@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.completion.gaussian_process import ResidualField, leave_one_out
 from pnpdepth_cli.completion.outliers import FAR, far_points, inlier_mask, inlier_weights, outliers
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import random_points, scene
@@ -39,6 +40,48 @@ def test_points_far_from_the_prediction_are_inliers_where_they_agree(count: int,
     deep = torch.where(corridor, 2.0 + x / 30, 0.0).double()
     kept = inlier_mask(replace(residuals, residual=residuals.residual + deep))
     assert int((~kept).sum()) <= int(corridor.sum()) // 10
+
+
+def inliers_in_numpy(residuals: ResidualField) -> np.ndarray:
+    """The inliers among up to 256 points, from their description; one of few that are exact."""
+    xy, count = residuals.points.xy.double().numpy(), len(residuals.points)
+    everyone = torch.arange(count)[None]
+    weight = inlier_weights(residuals.points, residuals.residual).numpy()
+    for cutoff in (4, 4, 5, 6, 8):
+        error, variance = leave_one_out(residuals, everyone, torch.from_numpy(weight))
+        ratio = (error.abs() / variance.sqrt()).numpy()[0]
+        typical = 1.4826 * np.sort(ratio)[(count - 1) // 2]
+        weight = np.clip(1 - (ratio / (cutoff * typical)) ** 2, 0, None) ** 2
+    suspected = weight <= 0.05
+    around = np.hypot(*(xy[:, None] - xy).transpose(2, 0, 1)).argsort(axis=1)[:, 1:7]
+    together = suspected & (suspected[around].sum(axis=1) >= 4)
+    for _ in range(count):  # those beside them, too
+        together |= suspected & (together[around].sum(axis=1) >= 3)
+    inlier = ~suspected | together
+    weight = np.where(inlier, np.maximum(weight, 0.05), weight)
+    alone, beside = (
+        np.abs(leave_one_out(residuals, everyone, each)[0].numpy()[0]) @ weight
+        for each in (None, torch.from_numpy(weight))
+    )
+    return inlier if beside < 0.5 * alone and inlier.any() else np.ones(count, bool)
+
+
+def test_inliers_are_those_of_the_description() -> None:
+    shares = []
+    for seed in range(12):
+        rng, residuals = np.random.default_rng(seed), field(90, size=(60, 80), seed=seed)
+        xy = residuals.points.xy.numpy() + rng.uniform(-0.4, 0.4, (90, 2)).astype(np.float32)
+        corridor = np.hypot(*(xy - rng.uniform(10, 50, 2)).T) < rng.uniform(5, 14)
+        lone = rng.uniform(size=90) < rng.choice([0.0, 0.05, 0.2])
+        off = 2.0 * corridor + rng.uniform(0.2, 1.5, 90) * lone
+        points = replace(residuals.points, xy=torch.from_numpy(xy))  # no two at one distance
+        residual = residuals.residual + torch.from_numpy(off)
+        spoiled = replace(residuals, points=points, residual=residual)
+        found = inlier_mask(spoiled).numpy()
+        assert np.array_equal(found, inliers_in_numpy(spoiled)), seed
+        shares += [found.mean(), (found & (corridor | lone)).mean()]
+    assert min(shares[::2]) < 0.9 < max(shares[::2]) == 1
+    assert max(shares[1::2]) > 0.05
 
 
 def test_outliers_are_marked_in_the_order_of_the_points() -> None:

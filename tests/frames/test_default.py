@@ -11,8 +11,6 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
 from pnpdepth_cli.frames.frame import Frame, Prediction, Refined
@@ -285,18 +283,6 @@ def test_a_completion_network_of_the_scanner_has_most_of_the_result(
     assert sum(result.weights.values()) == pytest.approx(1)
 
 
-def test_a_further_network_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = member(Noise)
-
-    def fail(*_: object, **__: object) -> Tensor:
-        raise ModelError("no depth")
-
-    monkeypatch.setattr(other.network.module, "forward", fail)
-    for networks in ((member(Brightness), other), (other, member(Brightness))):
-        with pytest.raises(ModelError):
-            refined(frame_in_memory(60), *networks)
-
-
 def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> None:
     result = refined(frame_in_memory(4), member(Brightness), member(Nearest))
     assert result.weights == {"brightness": 0.5, "nearest": 0.5}
@@ -360,22 +346,6 @@ def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> No
         first, _, again = (refine_default(networks, frames[n]) for n in (0, 1, 0))
     assert np.array_equal(first.after, again.after)
     assert np.array_equal(first.after, refined(frames[0], *networks).after)
-
-
-def test_the_front_runs_once_for_all_sets_of_points_of_an_image(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frame, fronts, front = frame_in_memory(60), [], Split.front
-    monkeypatch.setattr(Split, "front", lambda *args: fronts.append(args) or front(*args))
-    fewer = frame.with_points(frame.points.select(torch.arange(60) < 40))
-    with opened(member(Brightness, settings=UPDATES)) as networks:
-        (one,) = networks
-        together = [one.refine(each).after for each in (frame, fewer)]
-        assert len(fronts) == 1
-        one.next_image()
-        again = one.refine(fewer).after
-        assert len(fronts) == 2
-    assert np.array_equal(together[1], again)
 
 
 def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stays() -> None:

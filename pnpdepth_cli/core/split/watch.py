@@ -150,18 +150,18 @@ class Watch(TorchDispatchMode):
         writes, escapes = _facts(func)
         escapes = escapes and self._notes_escapes
         self._operations += 1
-        inputs = [t for value in (*args, *kwargs.values()) for t in _tensors(value)]
+        inputs = [tensor for _, tensor in tensors_in((*args, *kwargs.values()))]
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
         written = [
             tensor
             for index, name in writes
-            for tensor in _tensors(args[index] if index < len(args) else kwargs.get(name))
+            for _, tensor in tensors_in(args[index] if index < len(args) else kwargs.get(name))
         ]
         for tensor in written:
             self._before_write(tensor)
         marked = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
-        results = {_storage(tensor) for tensor in _tensors(result)}
+        results = {_storage(tensor) for _, tensor in tensors_in(result)}
         created = results - {_storage(tensor) for tensor in inputs} - {_NO_STORAGE}
         self._created.update(dict.fromkeys(created, self._operations))
         # An address seen before may have been freed and reused.
@@ -232,11 +232,3 @@ def _facts(func: OpOverload) -> tuple[list[tuple[int, str]], bool]:
     writes = [(i, a.name) for i, a in arguments if a.alias_info and a.alias_info.is_write]
     tags = torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape
     return writes, any(tag in func.tags for tag in tags)
-
-
-def _tensors(value: object) -> list[Tensor]:
-    if isinstance(value, Tensor):
-        return [value]
-    if isinstance(value, list | tuple):
-        return [tensor for item in value for tensor in _tensors(item)]
-    return []
