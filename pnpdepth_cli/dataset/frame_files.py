@@ -131,8 +131,7 @@ class Unmatched:
 def _check_path(path: Path) -> None:
     """FileFormatError for a path that no file can have: an index file may hold any text."""
     if not _can_be_named(str(path)):
-        name = str(path).encode("unicode_escape").decode()
-        raise FileFormatError(f"{name}: no file can have this name; correct the list of files")
+        raise FileFormatError(f"{str(path)!r}: no file can have this name; correct the list")
 
 
 def _can_be_named(text: str) -> bool:

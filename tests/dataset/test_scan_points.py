@@ -21,7 +21,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.scans import read_scan
 from tests.bags import View, write_bag
-from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, ScanOnDisk, scan_on_disk
+from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, scan_on_disk
 from tests.commands.test_bag_frames import written
 
 SIZE = (240, 320)
@@ -29,6 +29,7 @@ K = np.array([[290.0, 0, 170], [0, 290, 112], [0, 0, 1]])
 D = np.array([-0.3, 0.09, 0.0, 0.0, 0.0])
 RECTIFIED = np.array([[240.0, 0, 160], [0, 240, 120], [0, 0, 1]])
 ABOVE = np.array([0, -0.2, 0])  # of the LiDAR, in the camera's frame
+TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from the LiDAR's axes to the camera's
 
 
 def depth_along(rays: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,10 +112,9 @@ def test_the_edges_say_whether_the_transforms_lead_to_the_rectified_camera(
     turn = Rotation.from_euler("xyz", [3, 4, 0], degrees=True).as_matrix()
     seen = view(rectified=True, topic="/front/image_rect", turn=None if to_rectified else turn)
     written(write_bag(tmp_path / "a.mcap", view=replace(seen, r=turn)), tmp_path / "frames")
-    calibration = read_calibration(tmp_path / "frames" / "calib.txt")
-    to_camera = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    expected = to_camera if to_rectified else turn @ to_camera
-    np.testing.assert_allclose(calibration.scanner.rotation, expected, atol=1e-9)
+    scanner = read_calibration(tmp_path / "frames" / "calib.txt").scanner
+    expected = TURN if to_rectified else turn @ TURN
+    np.testing.assert_allclose(scanner.rotation, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("rectified", [True, False])
@@ -124,7 +124,7 @@ def test_a_camera_info_file_is_used_for_the_image_that_is_projected_onto(
     seen = view(rectified=rectified, topic="/front/image_raw")
     written(write_bag(tmp_path / "a.mcap", view=seen), tmp_path / "frames")
     scan, image = (min((tmp_path / "frames" / n).iterdir()) for n in ("sparse", "rgb"))
-    pose = np.column_stack([[[0, -1, 0], [0, 0, -1], [1, 0, 0]], ABOVE])
+    pose = np.column_stack([TURN, ABOVE])
     info = {"distortion_model": "plumb_bob", "d": D.tolist(), "k": K.ravel().tolist()}
     info |= {"p": seen.p.ravel().tolist(), "r": [0.0] * 9, "T_camera_lidar": pose.ravel().tolist()}
     calib = tmp_path / "camera_info.yaml"
@@ -176,34 +176,19 @@ def test_the_direction_is_judged_by_the_points_in_the_image_and_what_is_upright(
         assert len(check_direction(scan, camera, pose, SIZE)) == notes
 
 
-TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-SHIFT = np.array([0.1, -0.05, -0.2])
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> ScanOnDisk:
-    """A scan whose calibration lacks the pose, and the pose in a file of its own."""
-    scene = scan_on_disk(tmp_path)
+def test_extrinsics_complete_a_calibration_and_their_wrong_direction_is_recognised(
+    tmp_path: Path,
+) -> None:
+    scene, shift = scan_on_disk(tmp_path), np.array([0.1, -0.05, -0.2])
     scene.calib.write_text(CALIBRATION.splitlines()[0])
-    np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, SHIFT]))
-    np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ SHIFT]))
-    return scene
-
-
-def test_extrinsics_of_a_file_complete_a_calibration(scene: ScanOnDisk) -> None:
-    options = ScanOptions(calib=scene.calib)
-    with pytest.raises(UsageError, match=r"has no pose of the scanner; .* or give --ext"):
-        read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
-    options = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "pose.txt")
-    read = read_scan_points(scene.scan, options, (HEIGHT, WIDTH))
-    assert cKDTree(scene.xy).query(read.points.xy)[0].max() < 2e-3
-
-
-def test_extrinsics_of_the_wrong_direction_are_recognised(scene: ScanOnDisk) -> None:
-    wrong = ScanOptions(calib=scene.calib, extrinsics=scene.folder / "inverse.txt")
-    with pytest.raises(UsageError, match=r"put 0 of 150 scan .* give their inverse"):
+    np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, shift]))
+    np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ shift]))
+    alone = ScanOptions(calib=scene.calib)
+    with pytest.raises(UsageError, match="--extrinsics"):
+        read_scan_points(scene.scan, alone, (HEIGHT, WIDTH))
+    wrong, right = (replace(alone, extrinsics=tmp_path / f"{n}.txt") for n in ("inverse", "pose"))
+    with pytest.raises(UsageError, match="put 0 of 150 scan"):
         read_scan_points(scene.scan, wrong, (HEIGHT, WIDTH))
-    right = replace(wrong, extrinsics=scene.folder / "pose.txt")
     read = read_scan_points(scene.scan, right, (HEIGHT, WIDTH))
     assert cKDTree(scene.xy).query(read.points.xy)[0].max() < 2e-3
     assert not [note for note in read.notes if "extrinsics" in note]

@@ -93,15 +93,15 @@ _SELECTION = row(
 )
 
 
-def _is_depth(root: Path) -> bool:
-    return bool(_SELECTION.matches(root) or _scans_of_tree(root))
+def _folders(root: Path, starts: tuple[str, ...], inside: str) -> list[Path]:
+    """The folders of cameras at one of these places."""
+    found = (path for start in starts for path in root.glob(start + inside))
+    return sorted(path for path in found if path.is_dir())
 
 
 def _scans_of_tree(root: Path) -> list[Path]:
-    """The folders of scans, one for each camera of a drive."""
     starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
-    found = (p for s in starts for p in root.glob(f"{s}proj_depth/velodyne_raw/{_CAMERAS}"))
-    return sorted(path for path in found if path.is_dir())
+    return _folders(root, starts, f"proj_depth/velodyne_raw/{_CAMERAS}")
 
 
 def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
@@ -121,13 +121,15 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
         yield from _frames_of_camera(drive, camera, parts, shared)
 
 
-DEPTH = Layout(matches=_is_depth, frames=_frames_of_depth)
+DEPTH = Layout(
+    matches=lambda root: _SELECTION.matches(root) or _scans_of_tree(root), frames=_frames_of_depth
+)
 
 
 def _raw_cameras(root: Path) -> list[Path]:
     """The cameras of drives with scans."""
-    found = (p for start in ("", "*/", "*/*/") for p in root.glob(f"{start}{_CAMERAS}/data"))
-    return sorted(p.parent for p in found if p.is_dir() and (p.parents[1] / _SCANS).is_dir())
+    images = _folders(root, ("", "*/", "*/*/"), f"{_CAMERAS}/data")
+    return [path.parent for path in images if (path.parents[1] / _SCANS).is_dir()]
 
 
 def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:

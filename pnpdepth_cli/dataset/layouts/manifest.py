@@ -75,8 +75,7 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
     """The frame of a line; ValueError and our errors say what is wrong with it."""
     if unknown := sorted(row.keys() - {*_COLUMNS}):
-        commas = "; columns are parted by commas" if ";" in unknown[0] else ""
-        raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(_COLUMNS)}{commas}")
+        raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(_COLUMNS)}")
     if "image" not in row and "sparse" not in row:
         raise ValueError("has neither image nor sparse; give one")
     if (flag := row.get("gt_size_ok", "no")).lower() not in _FLAGS:
