@@ -54,7 +54,6 @@ def read_neighbours(
 
     Raises:
         InputError: The camera is unknown, a file cannot be read, or no motion is known.
-        UsageError: A library that estimates motion is missing.
     """
     if not files.neighbours:
         return used, [], []

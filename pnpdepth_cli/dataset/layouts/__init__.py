@@ -4,23 +4,7 @@
     layout, frames, unmatched = list_frames(Path("frames"), "pairs")  # layout named
 
 A new layout is a row of `TABLE`, or another `Layout` in it, with its name in `choices.LAYOUTS`; or
-an entry point of the group `pnpdepth.layouts`. The rows are:
-
-`7scenes`: frame-000000.color.png and frame-000000.depth.png, in the folder or in its seq-*/.
-`arkitscenes`: the upsampling set, <video>/ with wide/ (color/, lowres_wide/), the phone's
-lowres_depth/ with confidence/, and the laser scanner's highres_depth/, in millimetres.
-`diode`: NAME.png, NAME_depth.npy in metres and NAME_depth_mask.npy in <scene>/<scan>/.
-`ibims`: iBims-1 as images: rgb/ depth/ mask_invalid/ mask_transp/; a depth of 65535 is 50 m.
-`image-depth`: image/ (or images/) and depth/, ground truth; a calib.txt beside them is of all.
-`kitti-object`: image_2/ velodyne/ calib/, in training/ or testing/.
-`pairs`: rgb/ and sparse/, and optionally gt/ and calib/, with files of the same stems. Folders in
-them are searched too: rgb/drive_1/000.png belongs to sparse/drive_1/000.png. calib/ has one file
-per frame; a calib.txt beside the folders applies to all.
-`scannet`: exported scans, color/ depth/ intrinsic/ in one or more scene*/; depth in millimetres,
-smaller than the images.
-`void`: <sequence>/ with image/ sparse_depth/ validity_map/ ground_truth/ and K.txt, below a
-sequence, data/, a density or the release; where test_image.txt lists the test split, only its
-frames.
+an entry point of the group `pnpdepth.layouts`. docs/guides/many-frames.md shows the folders of all.
 """
 
 from __future__ import annotations

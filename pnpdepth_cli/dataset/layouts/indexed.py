@@ -1,23 +1,17 @@
 """Sets whose index names the images and has their poses.
 
-`tum`: TUM RGB-D, rgb.txt and depth.txt with a time and a path per line, paired by time. An
-associations.txt (of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path twice
-per line. Poses are those of groundtruth.txt beside them, at the times of the images.
+`tum`: rgb.txt and depth.txt with a time and a path per line, paired by time. An associations.txt
+(of TUM's associate.py, or of ICL-NUIM) pairs them itself: a time and a path twice per line. Poses
+are those of groundtruth.txt beside them, at the times of the images.
 
-`colmap`: a COLMAP project, images/ and sparse/0/, or sparse/, or a model beside images/, as that of
-ETH3D's undistorted images in dslr_calibration_undistorted/, or Nerfstudio's colmap/sparse/0/. The
-images of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and
-dense/sparse/. Of several models, sparse/0 to sparse/N, the one with the most images is used. The
+`colmap`: of several models, sparse/0 to sparse/N, the one with the most images is used. The images
+of dense/, which COLMAP undistorts, are a project of their own: dense/images/ and dense/sparse/. The
 folder of a model in a project is read, too.
 
-`stray-scanner`, of phones with a LiDAR, whose depth is of the image's view but smaller: the folder
-of the app Stray Scanner: rgb.mp4, depth/ in millimetres, confidence/ (0 to 2), camera_matrix.csv,
-and odometry.csv with a row of time, frame, position and quaternion for each frame, in axes x right,
-y down, z forward.
-
-`record3d`, of phones, too: the folder EXR_RGBD of Record3D's export "EXR + RGB": rgb/, depth/ in
-metres, and metadata.json with K and w, h of the images and a row of quaternion and position for
-each frame, in ARKit's axes x right, y up, z backwards.
+Of phones with a LiDAR, whose depth is of the image's view but smaller: `stray-scanner`, with a row
+of time, frame, position and quaternion for each frame in odometry.csv, in axes x right, y down, z
+forward; and `record3d`, with K and w, h of the images and a row of quaternion and position for each
+frame in metadata.json, in ARKit's axes x right, y up, z backwards.
 """
 
 from __future__ import annotations

@@ -1,18 +1,15 @@
 """KITTI: odometry, depth completion and raw drives, whose parts lie in trees of their own.
 
-`kitti-odometry`: sequences/NN/ with image_2/, velodyne/ and calib.txt, or one such sequence. The
-training sequences, 00 to 10, have the poses of camera 0 in poses/NN.txt beside sequences/, a row of
-12 numbers per frame. The scan is the ground truth of the paper's experiments: `batch --sample 500`.
+`kitti-odometry`: sequences/NN/, or one such sequence. The training sequences, 00 to 10, have the
+poses of camera 0 in poses/NN.txt beside sequences/, a row of 12 numbers per frame. The scan is the
+ground truth of the paper's experiments: `batch --sample 500`.
 
-`kitti-depth`: the benchmark's selection, image/ velodyne_raw/ [groundtruth_depth/] [intrinsics/],
-or the tree <drive>/proj_depth/{velodyne_raw,groundtruth}/image_0{2,3}/. Images of the tree are the
-raw data's, <drive>/image_0{2,3}/data/ in the same drive's folder, in <date>/, raw/<date>/ or
-kitti_raw/<date>/. As downloaded, scans and ground truth lie apart in
-data_depth_velodyne/{train,val}/ and data_depth_annotated/{train,val}/.
+`kitti-depth`: the benchmark's selection, or the tree. Images of the tree are the raw data's, in the
+same drive's folder, in <date>/, raw/<date>/ or kitti_raw/<date>/. As downloaded, scans and ground
+truth lie apart in data_depth_velodyne/{train,val}/ and data_depth_annotated/{train,val}/.
 
-`kitti-raw`: <date>/<drive>/ with image_0{2,3}/data/ and velodyne_points/data/; the folder may be a
-drive, a date, or what the dates are in. Ground truth is the annotated depth, where the drive or a
-folder data_depth_annotated/{train,val}/ beside the dates has it.
+`kitti-raw`: a drive, a date, or what the dates are in. Ground truth is the annotated depth, where
+the drive or a folder data_depth_annotated/{train,val}/ beside the dates has it.
 """
 
 from __future__ import annotations

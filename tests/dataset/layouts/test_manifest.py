@@ -14,11 +14,16 @@ from tests.data_sets import read_frames
 from tests.empty_files import touch
 
 
+def manifest(folder: Path, text: str) -> Path:
+    """A list beside the image i.png."""
+    touch(folder / "i.png")
+    (folder / "m.csv").write_text(text, encoding="utf-8")
+    return folder / "m.csv"
+
+
 def frames_named(folder: Path, *names: str) -> list[FrameFiles]:
-    (folder / "i.png").touch()
-    path = folder / "m.csv"
-    path.write_text("".join(["image,name\n", *(f"i.png,{name}\n" for name in names)]))
-    return read_frames(path)
+    rows = "".join(f"i.png,{name}\n" for name in names)
+    return read_frames(manifest(folder, f"image,name\n{rows}"))
 
 
 def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
@@ -29,21 +34,20 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
         "mask": "m.png", "gt_size_ok": "yes", "group": "room",
     }  # fmt: skip
     (tmp_path / "m.csv").write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
-    assert read_frames(tmp_path / "m.csv") == [
-        FrameFiles(
-            name="first",
-            image=tmp_path / "i.png",
-            sparse=tmp_path / "s.bin",
-            gt=tmp_path / "deep/g.png",
-            calib=tmp_path / "c.txt",
-            camera=3,
-            gt_scale=1000,
-            part=ODOMETRY_PART,
-            masks=(tmp_path / "m.png",),
-            gt_other_size=True,
-            group="room",
-        )
-    ]
+    (frame,) = read_frames(tmp_path / "m.csv")
+    assert frame == FrameFiles(
+        name="first",
+        image=tmp_path / "i.png",
+        sparse=tmp_path / "s.bin",
+        gt=tmp_path / "deep/g.png",
+        calib=tmp_path / "c.txt",
+        camera=3,
+        gt_scale=1000,
+        part=ODOMETRY_PART,
+        masks=(tmp_path / "m.png",),
+        gt_other_size=True,
+        group="room",
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,33 +66,29 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
 def test_a_line_of_a_manifest_that_means_nothing_is_named(
     tmp_path: Path, text: str, message: str
 ) -> None:
-    touch(tmp_path / "i.png")
-    (tmp_path / "m.csv").write_text(text)
     with pytest.raises(InputError) as error:
-        read_frames(tmp_path / "m.csv")
+        read_frames(manifest(tmp_path, text))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_file_of_a_manifest_is_named_with_its_line(tmp_path: Path) -> None:
-    (tmp_path / "m.csv").write_text("image\n\nlost.png\n")
-    _, _, (lost,) = list_frames(tmp_path / "m.csv")
+    _, _, (lost,) = list_frames(manifest(tmp_path, "image\n\nlost.png\n"))
     assert lost.path == tmp_path / "lost.png"
     assert "line 3" in str(lost)
 
 
 def test_frames_of_one_stem_are_named_by_their_folders(tmp_path: Path) -> None:
     touch(*(tmp_path / "data" / name for name in ("one/x.png", "two/x.png", "y.png")))
-    (tmp_path / "m.csv").write_text(
-        "image,name\ndata/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
-    )
-    assert [f.name for f in read_frames(tmp_path / "m.csv")] == ["one/x", "two/x", "mine"]
+    rows = "data/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
+    frames = read_frames(manifest(tmp_path, f"image,name\n{rows}"))
+    assert [frame.name for frame in frames] == ["one/x", "two/x", "mine"]
 
 
 def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
     touch(tmp_path / "a\nb.png", tmp_path / "c\u2028d.png")
-    (tmp_path / "m.csv").write_text('image\n"a\nb.png"\nc\u2028d.png\n', encoding="utf-8")
-    assert [f.name for f in read_frames(tmp_path / "m.csv")] == ["a\nb", "c\u2028d"]
+    frames = read_frames(manifest(tmp_path, 'image\n"a\nb.png"\nc\u2028d.png\n'))
+    assert [frame.name for frame in frames] == ["a\nb", "c\u2028d"]
 
 
 @pytest.mark.parametrize(
