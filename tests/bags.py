@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +11,8 @@ import numpy as np
 
 from pnpdepth_cli.io.bags import message_types
 
-HEIGHT, WIDTH, FOCAL_PX = 48, 64, 60.0
+HEIGHT, WIDTH, FOCAL_PX, RECTIFIED_PX = 48, 64, 60.0, 70.0
 IMAGES, POINTS = "/front/image_raw", "/lidar/points"
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """What camera and LiDAR see, the same in every frame, and the camera's camera_info."""
-
-    pixels: np.ndarray
-    """(H, W, 3) uint8."""
-    points: np.ndarray
-    """(N, 3) metres in the LiDAR's frame."""
-    k: np.ndarray
-    d: np.ndarray
-    r: np.ndarray
-    p: np.ndarray
-    topic: str = IMAGES
 
 
 Make = Callable[..., Any]
@@ -44,7 +28,8 @@ def write_bag(
     info: bool = True,
     poses: str = "",
     compression: Any = None,
-    view: View | None = None,
+    topic: str = IMAGES,
+    rectified: bool = False,
     clock_s: float = 0.0,
     depth: str = "",
     depth_frame: str = "camera",
@@ -54,9 +39,10 @@ def write_bag(
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
     With `poses`, base moves 0.3 m along x from one image to the next: "odometry", or the camera
-    does: "pose". `compression` is rosbags' of the chunks. `view` replaces image, scan and
-    camera_info. `clock_s` is added to the stamps of the scans. With `depth`, an encoding such as
-    "16UC1" or "32FC1; compressedDepth", `depth_m` is there instead of scans.
+    does: "pose". `compression` is rosbags' of the chunks. With `rectified`, camera_info has a
+    camera of rectified images, of `RECTIFIED_PX`. `clock_s` is added to the stamps of the scans.
+    With `depth`, an encoding such as "16UC1" or "32FC1; compressedDepth", `depth_m` is there
+    instead of scans.
     """
     ros1 = path.suffix == ".bag"
     store = message_types(ros1=ros1)
@@ -82,10 +68,9 @@ def write_bag(
                 return
             stamp = header(time_ns, "camera")
             if info:
-                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, view)
+                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, rectified)
             pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
             pixels[:, : WIDTH // 2, 0] = 200
-            pixels, topic = (pixels, IMAGES) if view is None else (view.pixels, view.topic)
             if compressed:
                 jpeg = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
                 yield f"{topic}/compressed", time_ns, _compressed(make, stamp, "jpeg", jpeg)
@@ -94,25 +79,25 @@ def write_bag(
             later_ns = time_ns + 5_000_000
             if depth:
                 stamp = header(time_ns + 4_000_000, depth_frame)
-                of_depth = _camera_info(make, stamp, ros1, view, depth_focal)
+                of_depth = _camera_info(make, stamp, ros1, False, depth_focal)
                 yield "/depth/camera_info", later_ns, of_depth
-                topic, message = _depth(make, stamp, depth)
-                yield topic, later_ns, message
+                name, message = _depth(make, stamp, depth)
+                yield name, later_ns, message
             else:
                 stamp = header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar")
-                yield POINTS, later_ns, _cloud(make, stamp, view)
+                yield POINTS, later_ns, _cloud(make, stamp)
 
     opened = _writer(path)
     if compression is not None:
         opened.set_compression(compression)
     with opened as writer:
         connections: dict[str, Any] = {}
-        for topic, time_ns, message in messages():
+        for name, time_ns, message in messages():
             kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            if name not in connections:
+                connections[name] = writer.add_connection(name, kind, typestore=store)
             encode = store.serialize_ros1 if ros1 else store.serialize_cdr
-            writer.write(connections[topic], time_ns, encode(message, kind))
+            writer.write(connections[name], time_ns, encode(message, kind))
     if path.suffix == ".mcap":
         (inner,) = path.with_suffix(".folder").glob("*.mcap")
         inner.rename(path)
@@ -176,16 +161,15 @@ def _transforms(make: Make, header: Make) -> Any:
 
 
 def _camera_info(
-    make: Make, header: Any, ros1: bool, view: View | None, focal: float = FOCAL_PX
+    make: Make, header: Any, ros1: bool, rectified: bool, focal: float = FOCAL_PX
 ) -> Any:
     matrix = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1.0])
     values = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": np.zeros(12)}
-    if view is not None:
-        values = {name: getattr(view, name).ravel().astype(float) for name in "dkrp"}
-    height, width = (HEIGHT, WIDTH) if view is None else view.pixels.shape[:2]
+    if rectified:
+        values["p"] = np.array([RECTIFIED_PX, 0, 31.5, 0, 0, RECTIFIED_PX, 23.5, 0, 0, 0, 1.0, 0])
     whole = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     matrices = {name.upper() if ros1 else name: value for name, value in values.items()}
-    sizes = {"height": height, "width": width, "binning_x": 0, "binning_y": 0}
+    sizes = {"height": HEIGHT, "width": WIDTH, "binning_x": 0, "binning_y": 0}
     sizes["roi"] = make("sensor_msgs/RegionOfInterest", **whole)
     matrices["distortion_model"] = "plumb_bob"
     return make("sensor_msgs/CameraInfo", header=header, **sizes, **matrices)
@@ -227,7 +211,7 @@ def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
     return "/depth/image_raw/compressedDepth", _compressed(make, header, kind, data)
 
 
-def _cloud(make: Make, header: Any, view: View | None) -> Any:
+def _cloud(make: Make, header: Any) -> Any:
     """Fields that are not x y z, and not in this order; one point without return."""
     names, formats, offsets = ["ring", "z", "y", "x"], ["<u2", "<f4", "<f4", "<f8"], [0, 4, 8, 16]
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": 28})
@@ -235,9 +219,6 @@ def _cloud(make: Make, header: Any, view: View | None) -> Any:
     points = np.zeros(151, layout)
     points["x"], points["y"][:150], points["z"][:150] = 5.0, y.ravel(), z.ravel()
     points["x"][150] = np.nan
-    if view is not None:
-        points = np.zeros(len(view.points), layout)
-        points["x"], points["y"], points["z"] = view.points.T
     fields = [
         make("sensor_msgs/PointField", name=name, offset=offset, datatype=kind, count=1)
         for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)

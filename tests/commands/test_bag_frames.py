@@ -29,7 +29,16 @@ from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.pixels import Points
-from tests.bags import HEIGHT, IMAGES, POINTS, WIDTH, depth_m, write_bag
+from tests.bags import (
+    FOCAL_PX,
+    HEIGHT,
+    IMAGES,
+    POINTS,
+    RECTIFIED_PX,
+    WIDTH,
+    depth_m,
+    write_bag,
+)
 from tests.commands.frames import frame_on_disk
 from tests.data_sets import read_frames
 
@@ -154,6 +163,18 @@ def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> 
     assert read_calibration(tmp_path / "a" / "calib.txt").scanner is None
     messages = written(write_bag(tmp_path / "b.mcap", info=False), tmp_path / "b")
     assert "has no camera_info of /front/image_raw; refine with --calib" in messages[-1]
+
+
+@pytest.mark.parametrize(
+    ("topic", "focal_px"), [("/front/image_rect_color", RECTIFIED_PX), (IMAGES, FOCAL_PX)]
+)
+def test_images_of_a_bag_are_rectified_by_their_topic(
+    topic: str, focal_px: float, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / "a.mcap", topic=topic, rectified=True)
+    assert any(text.startswith("camera: ") for text in written(bag, tmp_path / "frames"))
+    camera = read_calibration(tmp_path / "frames" / "calib.txt").camera
+    assert camera.intrinsics[0, 0] == focal_px
 
 
 def test_frames_of_a_bag_are_replaced_and_other_folders_left_alone(tmp_path: Path) -> None:

@@ -164,8 +164,9 @@ def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refuse
 def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
     cameras = project / "sparse" / "0" / "cameras.txt"
     cameras.write_text(f"{cameras.read_text()}2 SIMPLE_PINHOLE 32 24 25 16.25 11.5\n")
-    change(project, "images.txt", "2 1 0 0 0 0.1 0 0 1 b.png", "2 1 0 0 0 0.1 0 0 2 b.png")
+    change(project, "images.txt", "2 1 0 0 0 0.1 0 0 1 b.png", "2 1 0 0 0 0.1 0 1 2 b.png")
     small = read(project, "b.png")
+    np.testing.assert_allclose(small.pose, [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, -1]])
     assert small.points.size == read(project).points.size
     assert any("32×24" in note and "64×48" in note for note in small.notes)
 
