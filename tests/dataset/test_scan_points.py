@@ -60,7 +60,7 @@ def test_edges_say_whether_transforms_lead_to_the_rectified_camera(to_rectified:
     scanner = right.scanner if to_rectified else turn.inverse() @ right.scanner
     cameras = {"P and R": (right.camera, turn), "P": (right.camera, SAME_PLACE)}
     raw = Calibration(camera=Camera(intrinsics=K), scanner=scanner, rectified=cameras)
-    frames = [(read_rgb(STREET / "rgb.png").values, read_scan(STREET / "000000.bin").points)]
+    frames = [(read_rgb(STREET / "rgb.png").values, read_scan(STREET / "000000.bin")[0])]
     chosen, _ = choose_camera(raw, frames, "/front/image_rect")
     assert chosen.scanner is not None
     np.testing.assert_allclose(chosen.scanner.rotation, right.scanner.rotation, atol=1e-9)
