@@ -40,7 +40,7 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.models.registry import names
+from pnpdepth_cli.models.registry import all_definitions
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 
 KINDS = {"rgb": "rgb", "sparse": "sd", "rgb+sparse": "rgb + sd"}  # as the paper writes them
@@ -194,7 +194,7 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
 
 def entries_of(only: Sequence[str]) -> tuple[list[Entry], list[str]]:
     """The tiny editions, row by row, and notes on what there is none of."""
-    tiny = [name for name in names() if "-tiny" in name]
+    tiny = [name for name in all_definitions() if "-tiny" in name]
     if unknown := set(only) - set(tiny):
         raise UsageError(f"--only: no {', '.join(sorted(unknown))}; there are {', '.join(tiny)}")
     entries, notes = [], []

@@ -23,17 +23,14 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.models.registry import families
+from pnpdepth_cli.models.registry import all_definitions
 
 DEFAULT_SIZE = (240, 320)  # rows and columns of the synthetic frame
 
 
 def list_models() -> list[dict[str, object]]:
     """Returns every network that can be named: values of `ModelDefinition`, and parameters."""
-    by_name = dict[str, ModelDefinition]()
-    for definitions in families().values():
-        for definition in definitions.values():
-            by_name.setdefault(definition.name, definition)
+    by_name = {definition.name: definition for definition in all_definitions().values()}
     return [_describe(definition) for definition in by_name.values()]
 
 

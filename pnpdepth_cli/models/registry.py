@@ -28,22 +28,16 @@ from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, as
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
 
 
-def names() -> list[str]:
-    """Returns the names of all networks that can be named, each once, in the order of the families.
+def all_definitions() -> dict[str, ModelDefinition]:
+    """Returns the definitions of all networks that can be named, in the order of the families.
 
     A family of another package that cannot be loaded is left out; `find_definition` says why.
     """
-    definitions = (one for some in families().values() for one in some.values())
-    return list(dict.fromkeys(definition.name for definition in definitions))
-
-
-def families() -> dict[str, Mapping[str, ModelDefinition]]:
-    """Returns the definitions of all families that can be loaded, by the names they go by."""
-    loadable = {}
+    by_name = dict[str, ModelDefinition]()
     for family in choices.NETWORKS:
         with suppress(ModelError):
-            loadable[family] = _definitions_of(family)
-    return loadable
+            by_name |= {n: d for n, d in _definitions_of(family).items() if n not in by_name}
+    return by_name
 
 
 def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
@@ -83,10 +77,10 @@ def find_definition(spec: str) -> ModelDefinition:
     from_file = _from_file(spec)
     if from_file is not None:
         return from_file
-    for definitions in families().values():
-        if spec in definitions:
-            return definitions[spec]
-    near = difflib.get_close_matches(spec, names(), n=1)
+    known = all_definitions()
+    if spec in known:
+        return known[spec]
+    near = difflib.get_close_matches(spec, known, n=1)
     way_out = f"did you mean {near[0]!r}?" if near else "`pnpdepth models` lists all names"
     raise ModelError(
         f"model {spec!r} is neither a known name nor a file or folder of a network; {way_out}"

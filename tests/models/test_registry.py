@@ -12,12 +12,11 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.commands import networks
 from pnpdepth_cli.commands.networks import list_models
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.registry import families, find_definition, names
+from pnpdepth_cli.models.registry import all_definitions, find_definition
 
 
 def test_every_known_name_has_a_definition_of_that_name() -> None:
-    assert len(names()) == len(set(names()))
-    for name in names():
+    for name in all_definitions():
         assert find_definition(name).name == name
 
 
@@ -59,10 +58,10 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(
     stem = f"my_net{len(text)}"
     name = stem.replace("_", "-")
     (open_list / f"{stem}.py").write_text(text.replace("NAME", name))
-    assert names()[-1] == name
+    assert list(all_definitions())[-1] == name
     assert find_definition(name).build().out_channels == 1
-    mine = {name: families()[name]}
-    monkeypatch.setattr(networks, "families", lambda: mine)  # the others take long
+    mine = {name: all_definitions()[name]}
+    monkeypatch.setattr(networks, "all_definitions", lambda: mine)  # the others take long
     assert [one["name"] for one in list_models()] == [name]
 
 
@@ -75,9 +74,7 @@ def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> Non
         "an-object = other_nets:definition\na-module = other_nets\na-dict = other_nets:definitions",
     )
     for name in ("theirs-object", "theirs-in-a-module"):
-        assert name in names()
-        assert find_definition(name).name == name
-    assert list(families()["an-object"]) == ["theirs-object"]
+        assert all_definitions()[name] == find_definition(name)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +89,7 @@ def test_a_package_that_cannot_be_loaded_is_reported_only_when_it_is_named(
     entry_point: str, reason: str, open_list: Path
 ) -> None:
     install(open_list, entry_point)
-    assert "compact" in names()
-    assert "theirs" not in names()
+    assert "compact" in all_definitions()
     with pytest.raises(ModelError):
         find_definition("theirs")
     with pytest.raises(ModelError):
