@@ -56,7 +56,8 @@ def write_depth_cloud(
         )
     # The cloud, part by part.
     coloured = all(request.image or frame.image for frame in frames)
-    parts = _some_points(request, _parts(request, frames, poses, coloured, notes, show))
+    placed = [np.eye(3, 4) if pose is None else pose for pose in poses]
+    parts = _some_points(request, _parts(request, frames, placed, coloured, notes, show))
     make_folder(request.output.parent)
     merged = parts if request.voxel is None else [merge_in_voxels(parts, request.voxel)]
     points = write_cloud(request.output, merged)
@@ -89,33 +90,31 @@ def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -
 def _parts(
     request: CloudRequest,
     frames: list[ResultFrame],
-    poses: list[Pose | None],
+    poses: list[Pose],
     coloured: bool,
     notes: list[str],
     show: Callable[[int, int], None],
 ) -> Iterator[PointCloud]:
-    """Yields the clouds of all depth maps, in the world's coordinates if there are poses."""
+    """Yields the clouds of all depth maps, in the world's coordinates."""
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> View:
         depth = _depth(request, frames[index], notes)
         camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
-        pose = poses[index]
         notes.extend(note for note in found if note not in notes)
-        return View(depth=depth, camera=camera, pose=np.eye(4)[:3] if pose is None else pose)
+        return View(depth=depth, camera=camera, pose=poses[index])
 
-    for index, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+    for index, frame in enumerate(frames):
         show(index, len(frames))
         here = view(index)
         depth = here.depth
         if request.min_views > 1:
-            known = np.stack([each for each in poses if each is not None])
-            others = (view(other) for other in neighbouring_views(known, index))
+            others = (view(other) for other in neighbouring_views(np.stack(poses), index))
             depth = consistent_depth(here, others, request.min_views)
         image = request.image or frame.image
         rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
         for part in cloud_from_depth(depth, here.camera, rgb=rgb):
-            yield part if pose is None else part.transform(pose)
+            yield part.transform(poses[index])
 
 
 def _some_points(request: CloudRequest, parts: Iterator[PointCloud]) -> Iterator[PointCloud]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,8 +13,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
-from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
+from pnpdepth_cli.commands.batch.batch_request import Listener
+from pnpdepth_cli.commands.batch.find_frames import input_files, request_of, sequences_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
@@ -30,48 +30,57 @@ MOST_FRAMES = 64
 
 
 def with_adapted_weights(
-    records: Records,
-    sequence: str,
-    frames: Sequence[FrameFiles],
-    listener: Listener,
-) -> BatchRequest:
-    """Returns the request for the frames of a sequence, with adapted weights where they help.
+    own: Records, frames: Sequence[FrameFiles], listener: Listener
+) -> dict[str, Records]:
+    """Returns the records of each frame by its name, with adapted weights where they help.
 
-    The weights lie in OUTPUT/adapted with a record. They are used again while settings and files
-    of the frames that they learnt from are the same.
+    The weights of a sequence lie in OUTPUT/adapted with a record. They are used again while
+    settings and files of the frames that they learnt from are the same.
 
     Args:
-        records: The results of the batch.
-        sequence: Name of the sequence.
-        frames: Frames of the sequence.
-        listener: Receives what was decided; if it stops the batch, KeyboardInterrupt is raised.
+        own: The records of the batch, with the network's own weights.
+        frames: All frames of the batch.
+        listener: Receives what was decided.
 
     Raises:
         UsageError: The network takes no points.
+        KeyboardInterrupt: The listener stops the batch.
     """
-    request = records.request
-    name = quote(sequence, safe="") or "frames"
-    spread = np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int)
-    lessons = [request_of(request, frames[index]) for index in spread]
-    named = f"{sequence}: " if sequence else ""
-    folder = request.output / "adapted"
-    weights, file = folder / f"{name}.safetensors", folder / f"{name}.json"
-    try:
-        # What was learnt before, or is now.
-        digest = _digest(records.settings, lessons)
-        record = read_json(file) if file.exists() else {}
-        if record.get("digest") != digest or not (record.get("why") or weights.exists()):
-            why = _learn(lessons, weights, listener)
-            record = {"digest": digest, "why": why}
-            make_folder(folder)
-            write_json(file, record)
-    except (InputError, DivergedError) as error:
-        record = {"why": str(error)}
-    if record["why"]:
-        listener.say(f"adapt: {named}the network's own weights are used: {record['why']}")
-        return request
-    listener.say(f"adapt: {named}{len(frames):,} frames are refined with {weights}")
-    return replace(request, refine=request.refine.with_fields(checkpoint=weights))
+    request, result = own.request, dict[str, Records]()
+    for sequence, indices in sequences_of(frames).items():
+        weights = request.output / "adapted" / f"{quote(sequence, safe='') or 'frames'}.safetensors"
+        named = f"{sequence}: " if sequence else ""
+        spread = np.linspace(0, len(indices) - 1, min(len(indices), MOST_FRAMES)).round()
+        lessons = [request_of(request, frames[indices[int(number)]]) for number in spread]
+        try:
+            why = _learn_once(own, lessons, weights, listener)
+        except (InputError, DivergedError) as error:
+            why = str(error)
+        records = own
+        if why:
+            listener.say(f"adapt: {named}the network's own weights are used: {why}")
+        else:
+            listener.say(f"adapt: {named}{len(indices):,} frames are refined with {weights}")
+            refine = request.refine.with_fields(checkpoint=weights)
+            records = Records(replace(request, refine=refine))
+        result |= dict.fromkeys([frames[index].name for index in indices], records)
+    return result
+
+
+def _learn_once(
+    own: Records, lessons: Sequence[RefineRequest], weights: Path, listener: Listener
+) -> str | None:
+    """Writes adapted weights unless these are there; returns why they are not used."""
+    files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
+    text = json.dumps([own.settings, files], sort_keys=True)
+    digest, file = hashlib.sha256(text.encode()).hexdigest(), weights.with_suffix(".json")
+    record = read_json(file) if file.exists() else {}
+    if record.get("digest") != digest or not (record.get("why") or weights.exists()):
+        record = {"digest": digest, "why": _learn(lessons, weights, listener)}
+        make_folder(file.parent)
+        write_json(file, record)
+    why: str | None = record["why"]
+    return why
 
 
 def _learn(
@@ -122,10 +131,3 @@ def _learn(
     with atomic_path(path) as file:
         save_file(copies, file)
     return None
-
-
-def _digest(settings: Mapping[str, object], lessons: Sequence[RefineRequest]) -> str:
-    """The SHA-256 of the settings and files that the weights are learnt from."""
-    files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
-    text = json.dumps([settings, files], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -140,7 +140,7 @@ def _with_poses(
         frames = [replace(f, pose=as_pose(row)) for f, row in zip(frames, rows, strict=True)]
         source = f"{path}, {how}"
     if request.accumulate:
-        frames = with_neighbours(frames, request.accumulate, source)
+        frames = _with_neighbours(frames, request.accumulate, source)
     # Poses of some frames, all, or none.
     count = sum(frame.pose is not None for frame in frames)
     if not count:
@@ -162,21 +162,9 @@ def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
     }
 
 
-def with_neighbours(
-    frames: Sequence[FrameFiles], reach: int, source: str = "the layout's"
-) -> list[FrameFiles]:
-    """Returns the frames, each with those at most `reach` before and after it in its sequence.
-
-    Args:
-        frames: All frames of the data set. The motion of those without pose is to be estimated.
-        reach: Number of frames to each side.
-        source: Where the poses are from, for a person.
-
-    Raises:
-        UsageError: A frame has no points, or its points are those of all images already;
-            or neither its pose nor its image is known.
-    """
-    result = list(frames)
+def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[FrameFiles]:
+    """The frames, each with those at most `reach` before and after it in its sequence."""
+    result = [*frames]
     for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
@@ -190,22 +178,22 @@ def with_neighbours(
 
 
 def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) -> Neighbour:
+    """The other frame as a neighbour, with the motion that poses from the source give."""
     if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
         raise UsageError(
             f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
             f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
         )
-    if frame.pose is None or other.pose is None:
-        if other.image is None:
-            raise UsageError(
-                f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
-            )
-        return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
-    pose, other_pose = np.array(frame.pose), np.array(other.pose)
-    turn = pose[:, :3].T @ other_pose[:, :3]
-    shift = pose[:, :3].T @ (other_pose[:, 3] - pose[:, 3])
-    motion = as_pose(np.column_stack([turn, shift]))
-    return Neighbour(files=other, motion=motion, poses=source, apart=apart)
+    if frame.pose is not None and other.pose is not None:
+        pose, other_pose = np.array(frame.pose), np.array(other.pose)
+        other_pose[:, 3] -= pose[:, 3]
+        motion = as_pose(pose[:, :3].T @ other_pose)
+        return Neighbour(files=other, motion=motion, poses=source, apart=apart)
+    if other.image is None:
+        raise UsageError(
+            f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
+        )
+    return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
@@ -264,22 +252,19 @@ def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
     """Raises InputError for a frame whose results have no files of their own."""
     endings = [path.name for path in refine.outputs_in(Path(), "", with_gt=True).values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
-    # names that differ in Unicode normalisation only are one file on macOS
-    names = {frame.name: unicodedata.normalize("NFC", frame.name) for frame in frames}
-    for own, name in names.items():
+    for frame in frames:
+        # Names that differ in Unicode normalisation only are one file on macOS.
+        name, shown = unicodedata.normalize("NFC", frame.name), one_line(repr(frame.name))
         files = [name + ending for ending in endings]
-        problem = name_problem(name)
+        problem = name_problem(frame.name)
         if name.startswith(".batch"):
             problem = "is one of the batch's own"
-        elif owner := next((owners[file] for file in files if file in owners), None):
-            problem = f"needs a file of {owner}"
+        for path in (*files, *map(str, PurePosixPath(name).parents)):
+            if path in owners:
+                problem = f"needs a file of {owners[path]}"
         if problem is not None:
-            raise InputError(f"the name of frame {one_line(repr(own))} {problem}; rename it")
-        owners |= dict.fromkeys(files, f"frame {one_line(repr(own))}")
-    for own, name in names.items():
-        for folder in PurePosixPath(name).parents:
-            if owner := owners.get(str(folder)):
-                raise InputError(f"frame {one_line(repr(own))} needs a file of {owner}; rename it")
+            raise InputError(f"the name of frame {shown} {problem}; rename it")
+        owners |= dict.fromkeys(files, f"frame {shown}")
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

@@ -13,8 +13,8 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from fnmatch import fnmatch
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +33,14 @@ from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table, write_text
 from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_by_name
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
-from pnpdepth_cli.errors import FileFormatError, OutputError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import LOCKS, cannot_write, make_folder, remove_leftovers
 from pnpdepth_cli.io.file_bytes import (
     Fingerprint,
     is_unchanged,
-    parse_json,
     plain,
+    read_bytes,
     sha256_of,
     write_json,
 )
@@ -85,9 +85,10 @@ class Records:
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
         output = self.request.output
-        names = [path.name for path in output.iterdir()] if output.exists() else []
-        own = JSON in names and (_content(output / JSON) or b"").startswith(_OWN_SUMMARY)
-        if own or not names or any(fnmatch(name, LOCKS) for name in names):
+        with suppress(InputError):
+            if read_bytes(output / JSON).startswith(_OWN_SUMMARY):
+                return
+        if any(output.glob(LOCKS)):
             return
         results = (path for frame in frames for path in self.outputs_of(frame).values())
         for path in (output / CSV, output / JSON, *results):
@@ -176,30 +177,24 @@ def _settings_of(request: RefineRequest) -> dict[str, object]:
 
 
 def _code_of(request: RefineRequest) -> dict[str, object]:
-    """The program's version, and the digests of the network's files and of the user's code."""
-    network, method = request.network, request.method
-    identity = {"version": __version__, **_identity(network.model), "checkpoint": None}
-    if network.checkpoint is not None:
-        file, key = file_and_part(network.checkpoint)
-        identity |= {"checkpoint": sha256_of(file)} | ({"state_dict": key} if key else {})
-    if more := [_identity(spec) for spec in network.more_models]:
-        identity["more_models"] = more
-    # Python files among the settings, such as of --loss.
-    values = (getattr(method, field.name) for field in fields(method))
-    files = {value for value in values if isinstance(value, str) and value.endswith(".py")}
-    if files:
-        identity["code"] = {file: sha256_of(Path(file)) for file in sorted(files)}
-    return identity
-
-
-def _identity(spec: str) -> dict[str, object]:
-    """A network's name with its :ATTRIBUTE, :OUTPUT or :KEY, without the folder of a file."""
-    path, part = file_and_part(Path(spec))
-    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
+    """The program's version, and names and digests of the networks' and the user's own files."""
+    network, method = request.network, vars(request.method).values()
+    code = [value for value in method if isinstance(value, str) and value.endswith(".py")]
+    files = [_identity(spec) for spec in (network.model, *network.more_models, *code)]
     return {
-        "model": f"{path.name}:{part}".rstrip(":") if files else spec,
-        "model_files": {p.name: sha256_of(p) for p in files},
+        "version": __version__,
+        "model": files[0][0],
+        "files": files,
+        "checkpoint": network.checkpoint and _identity(str(network.checkpoint)),
     }
+
+
+def _identity(spec: str) -> tuple[str, str | None]:
+    """A file's name with its :PART but without its folder, and its digest; or another name."""
+    path, part = file_and_part(Path(spec))
+    if not path.exists():
+        return spec, None
+    return f"{path.name}:{part}".rstrip(":"), sha256_of(path)
 
 
 def remove_all_leftovers(output: Path) -> int:
@@ -213,15 +208,8 @@ def remove_all_leftovers(output: Path) -> int:
 def _read(path: Path) -> FrameRecord | None:
     """The record in a file; None if there is none, or it is damaged."""
     try:
-        return FrameRecord.from_json(parse_json(_content(path) or b""), path)
-    except (ValueError, RecursionError, FileFormatError):
-        return None
-
-
-def _content(path: Path) -> bytes | None:
-    try:
-        return path.read_bytes() if path.is_file() else None  # no pipe, which never ends
-    except OSError:
+        return FrameRecord.read(path)
+    except InputError:
         return None
 
 

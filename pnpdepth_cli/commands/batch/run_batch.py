@@ -7,17 +7,17 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 
+from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
-from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames, sequences_of
+from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames
 from pnpdepth_cli.commands.batch.records import (
     BatchSummary,
     Records,
     remove_all_leftovers,
     write_summary,
 )
-from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.pipeline import in_order
 from pnpdepth_cli.commands.tables import count_of, names_of_depths
-from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder
 from pnpdepth_cli.protocols import WHOLE, find_protocol
@@ -59,11 +59,13 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         if request.shard is None and (leftovers := remove_all_leftovers(request.output)):
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
         # Those that are not done are refined; the frames of a sequence may have adapted weights.
-        of_frame = _records_of_frames(own, found.frames, listener)
-        reasons = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
-        why = {frame.name: reason for frame, reason in zip(found.chosen, reasons, strict=True)}
-        to_do = [frame for frame in found.chosen if why[frame.name]]
-        listener.say(_plan([*why.values()]))
+        of_frame = dict.fromkeys([frame.name for frame in found.frames], own)
+        if request.adapt:
+            of_frame = with_adapted_weights(own, found.frames, listener)
+        told = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
+        reasons = [*told]
+        to_do = [frame for frame, why in zip(found.chosen, reasons, strict=True) if why]
+        listener.say(_plan(reasons))
         if to_do:
             from pnpdepth_cli.commands.batch.running import refine_all  # imports torch
 
@@ -76,23 +78,6 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         known = in_order(lambda f: of_frame[f.name].record_of(f), found.frames, _READERS)
         with in_turn(request.output):
             return write_summary(request, found, own.settings, [*filter(None, known)])
-
-
-def _records_of_frames(
-    own: Records, frames: Sequence[FrameFiles], listener: Listener
-) -> dict[str, Records]:
-    """The records that each frame belongs to, by its name: of the batch, or of adapted weights."""
-    from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
-
-    records = dict.fromkeys([frame.name for frame in frames], own)
-    if not own.request.adapt:
-        return records
-    for name, indices in sequences_of(frames).items():
-        sequence = [frames[index] for index in indices]
-        request = with_adapted_weights(own, name, sequence, listener)
-        if request is not own.request:
-            records |= dict.fromkeys([frame.name for frame in sequence], Records(request))
-    return records
 
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:

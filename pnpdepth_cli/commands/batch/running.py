@@ -26,10 +26,9 @@ from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
 from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, Listener
 from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
 from pnpdepth_cli.commands.batch.records import Records
-from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
+from pnpdepth_cli.commands.pipeline import THREADS, in_order, timed
 from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.commands.stopwatch import timed
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import (
@@ -71,6 +70,12 @@ def refine_all(
         of_frame: The records that each frame belongs to, by its name.
         worked: Whether a frame was refined with these settings before.
         listener: Receives notes, and may stop the batch.
+
+    Raises:
+        StorageError: When nothing more can be written.
+        ModelError: For an error of the network before any frame was refined.
+        UsageError: For an error of the settings before any frame was refined.
+        DeviceError: The cluster cannot be used.
     """
     for records in dict.fromkeys(of_frame[frame.name] for frame in to_do):
         # The frames that are refined alike.
@@ -80,8 +85,8 @@ def refine_all(
         if records.request.ray is not None:
             yield from _refine_on_workers(deciding, wanted, records, worked, listener)
         else:
-            with open_method(records.request, deciding) as method:
-                yield from refine_frames(wanted, method, records, worked, listener.stopped)
+            with _open_method(records.request, deciding) as method:
+                yield from _refine_frames(wanted, method, records, worked, listener.stopped)
         if listener.stopped():
             return
 
@@ -92,13 +97,8 @@ def spread(count: int) -> list[int]:
 
 
 @contextmanager
-def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
-    """Yields the method, open for any number of frames; None if no frame can be read.
-
-    Args:
-        request: The batch.
-        deciding: The frames that decide what is open for all.
-    """
+def _open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
+    """Yields the method, whose open settings these frames decide; None if none can be read."""
     frames = _readable(request, deciding)
     first = next(frames, None)
     if first is None:
@@ -147,7 +147,7 @@ class _Work:
             self.error = error
 
 
-def refine_frames(
+def _refine_frames(
     frames: Iterable[FrameFiles],
     method: Method | None,
     records: Records,
@@ -156,17 +156,8 @@ def refine_frames(
 ) -> Generator[FrameRecord, None, None]:
     """Refines and writes each frame; yields the record of each, in their order.
 
-    Args:
-        frames: The frames to refine.
-        method: The method, open. None if no frame of the batch could be read.
-        records: The results.
-        worked: Whether a frame was refined with these settings before.
-        stopped: True if no further frame is to be begun.
-
-    Raises:
-        StorageError: When nothing more can be written.
-        ModelError: For an error of the network before any frame was refined.
-        UsageError: For an error of the settings before any frame was refined.
+    An error is of its frame alone, unless nothing more can be written, or it is of the network or
+    the settings before any frame was refined.
     """
 
     def read(files: FrameFiles) -> _Work:
@@ -241,20 +232,15 @@ class Worker:
     """The folder that relative paths start from."""
     max_pixels: int | None
     threads: int
-    method: Method | None = None
-    """The method, open until the process ends; None before the first call."""
     stack: ExitStack = field(default_factory=ExitStack)
 
     def refine(self, frames: Sequence[FrameFiles], worked: bool) -> list[FrameRecord]:
-        """Returns the records of frames as `refine_frames`; DeviceError without the files."""
-        if self.method is None:
-            self._begin()
-            opened = open_method(self.records.request, self.deciding)
-            self.method = self.stack.enter_context(opened)
-        return list(refine_frames(frames, self.method, self.records, worked))
+        """Returns the records of frames as `_refine_frames`; DeviceError without the files."""
+        return list(_refine_frames(frames, self.method, self.records, worked))
 
-    def _begin(self) -> None:
-        """Makes the process like the driver's."""
+    @functools.cached_property
+    def method(self) -> Method | None:
+        """The method, open until the process ends, which is made like the driver's first."""
         import cv2
         import torch
 
@@ -267,6 +253,7 @@ class Worker:
         torch.set_num_threads(self.threads)
         cv2.setNumThreads(self.threads)
         set_max_pixels(self.max_pixels)
+        return self.stack.enter_context(_open_method(request, self.deciding))
 
 
 def _refine_on_workers(
@@ -278,8 +265,7 @@ def _refine_on_workers(
 ) -> Iterator[FrameRecord]:
     """Refines and writes frames on Ray workers; yields the records as they are done.
 
-    A worker that dies is replaced, and its frames are tried again one by one, by any worker. The
-    record of a frame that kills its workers says so.
+    A worker that dies is replaced, and its frames are tried again one by one, by any worker.
     """
     with _connected(records.request.ray or LOCAL) as ray:
         count, start = _plan(ray, deciding, records)

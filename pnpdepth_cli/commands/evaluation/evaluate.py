@@ -15,10 +15,9 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest, scoring_of
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
-from pnpdepth_cli.commands.ordered_pool import THREADS, in_order
+from pnpdepth_cli.commands.pipeline import THREADS, in_order, versions
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
-from pnpdepth_cli.commands.stopwatch import versions
 from pnpdepth_cli.commands.tables import Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord

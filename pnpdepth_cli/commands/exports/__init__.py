@@ -21,7 +21,7 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.tables import count_of
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
-from pnpdepth_cli.dataset.frame_files import ImageSource
+from pnpdepth_cli.dataset.frame_files import ImageSource, name_problem
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
@@ -187,7 +187,7 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     scale = (sparse and sparse.unit_scale) or 1.0
     own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
     name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
-    if not 1e-9 < scale < 1e9 or not _is_fit(name):
+    if not 1e-9 < scale < 1e9 or name_problem(name) or not name.isprintable():
         raise FileFormatError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
     if isinstance(image, Path) and (height, width) not in sizes_of(image):
@@ -204,10 +204,3 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
         pose=pose,
         unit_scale=scale,
     )
-
-
-def _is_fit(name: str) -> bool:
-    """Whether a name of a record is fit for a file: relative, inside, and printable."""
-    path = PurePosixPath(name)
-    inside = path.parts and not path.is_absolute() and ".." not in path.parts
-    return bool(inside) and name.isprintable() and "\\" not in name

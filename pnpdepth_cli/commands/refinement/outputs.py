@@ -6,7 +6,6 @@ import base64
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +82,11 @@ def remove_outdated(outputs: Outputs) -> None:
     record = outputs.get("record")
     if record is None:
         return
-    endings = (end for suffix in DEPTH_SUFFIXES for end in endings_of(suffix).values())
-    files = dict.fromkeys(record.with_name(record.stem + end) for end in endings)
-    for path in (record, *(path for path in files if path not in outputs.values())):
+    endings = {end for suffix in DEPTH_SUFFIXES for end in endings_of(suffix).values()}
+    outdated = {record.with_name(record.stem + end) for end in endings} - {*outputs.values()}
+    for path in (record, *sorted(outdated)):
         try:
-            if path.is_file():
-                path.unlink()
+            path.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(path, error) from error
 
@@ -261,5 +259,5 @@ def _colours(image: Image | None, frame: Refined) -> NDArray[np.uint8]:
     return depth_scale(frame.after).paint(frame.after)
 
 
-def _text(values: NDArray[Any], kind: str) -> str:
+def _text(values: NDArray[np.number], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

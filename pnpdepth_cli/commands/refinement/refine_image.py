@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
+from pnpdepth_cli.commands.pipeline import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.refinement.outputs import (
     plan_outputs,
     remove_outdated,
@@ -20,7 +21,6 @@ from pnpdepth_cli.commands.refinement.outputs import (
     write_outputs,
 )
 from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
-from pnpdepth_cli.commands.stopwatch import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.tables import names_of_depths
 from pnpdepth_cli.completion.baselines import Baseline
 from pnpdepth_cli.completion.interpolation import linear
@@ -220,41 +220,27 @@ def _record_of(
 
 def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
     """The errors of each stage and of linear interpolation, by each basis that the frame has."""
-    maps = {BEFORE: refined.before, AFTER: refined.after}
-    beside: dict[str, DepthMap] = {}
-    if frame.gt is not None or len(refined.held_out):
+    gt, errors = frame.gt, dict[str, Stages]()
+    maps, beside = {BEFORE: refined.before, AFTER: refined.after}, dict[str, DepthMap]()
+    if gt is not None or len(refined.held_out):
         beside[LINEAR] = linear(frame.points).numpy()
-    errors = {
-        GT: _against_truth(frame, refined, maps, beside, with_baselines=with_baselines),
-        HELD_OUT: _at_points(refined.held_out, maps | beside),
-        VALIDATION: _at_validation_points(refined, with_baselines=with_baselines),
-        USED: _at_points(refined.used, maps),
-    }
+    at_held_out = _at_points(refined.held_out, maps | beside)
+    # Against the truth, all others are scored on the pixels where the result is known.
+    if gt is not None:
+        if with_baselines:
+            before, given = torch.from_numpy(refined.before), frame.points
+            depths = _each_baseline(lambda baseline: baseline(given, before))
+            beside |= {name: depth.numpy() for name, depth in depths if name != LINEAR}
+        known = np.where(refined.after > 0, gt, np.float32(0))
+        stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
+        errors[GT] = {
+            name: _scores(depth, gt if name == AFTER else known)
+            for name, depth in (maps | stages | beside).items()
+        }
+    errors[HELD_OUT] = at_held_out
+    errors[VALIDATION] = _at_validation_points(refined, with_baselines=with_baselines)
+    errors[USED] = _at_points(refined.used, maps)
     return {basis: stages for basis, stages in errors.items() if stages}
-
-
-def _against_truth(
-    frame: Frame,
-    refined: Refined,
-    maps: dict[str, DepthMap],
-    beside: dict[str, DepthMap],
-    *,
-    with_baselines: bool,
-) -> Stages:
-    """Scores of the result, and those of all others on the pixels where the result is known."""
-    gt = frame.gt
-    if gt is None:
-        return {}
-    if with_baselines:
-        before, given = torch.from_numpy(refined.before), frame.points
-        depths = _each_baseline(lambda baseline: baseline(given, before))
-        beside = beside | {name: d.numpy() for name, d in depths if name != LINEAR}
-    known = np.where(refined.after > 0, gt, np.float32(0))
-    stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
-    return {
-        name: _scores(depth, gt if name == AFTER else known)
-        for name, depth in (maps | stages | beside).items()
-    }
 
 
 def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:

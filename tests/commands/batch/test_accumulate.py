@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames, with_neighbours
+from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest
@@ -78,40 +78,42 @@ def test_a_frame_is_done_again_when_a_neighbours_points_or_poses_change(tmp_path
     assert accumulating(root) == ["drive_002", "drive_003"]
 
 
-STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+def linked(root: Path, rows: list[str], poses: str = "") -> list[FrameFiles]:
+    """The frames of a list with neighbours, and these poses."""
+    (root / "list.csv").write_text("\n".join(["name,sparse,camera,calib", *rows]) + "\n")
+    (root / "p.txt").write_text(poses)
+    for name in ("s.png", "calib.txt"):
+        (root / name).write_bytes(b"")
+    request = BatchRequest(
+        source=root / "list.csv", output=root / "out", refine=RefineRequest(), accumulate=2,
+        poses=root / "p.txt" if poses else None,
+    )  # fmt: skip
+    return [*find_frames(request).frames]
+
+
+STILL, TURNED = "1 0 0 0 0 1 0 0 0 0 1 0\n", "0 -1 0 4 1 0 0 0 0 0 1 1\n"
 
 
 def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) -> None:
-    kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_1", 3), ("a_2", 3)]
-    frames = [
-        FrameFiles(name=name, sparse=tmp_path / f"{name}_{camera}.png", camera=camera, pose=STILL)
-        for name, camera in kinds
-    ]
-    linked = with_neighbours(frames, 2)
-    assert [[each.files.sparse.stem for each in frame.neighbours] for frame in linked] == [
-        ["a_2_2"], ["a_1_2"], [], ["a_2_3"], ["a_1_3"],
+    kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_3", 3), ("a_4", 3)]
+    rows = [f"{name},s.png,{camera},calib.txt" for name, camera in kinds]
+    frames = linked(tmp_path, rows, 5 * STILL)
+    assert [[each.files.name for each in frame.neighbours] for frame in frames] == [
+        ["a_2"], ["a_1"], [], ["a_4"], ["a_3"],
     ]  # fmt: skip
 
 
-def test_motion_leads_from_the_neighbours_camera_to_the_frames() -> None:
-    turned = ((0.0, -1.0, 0.0, 4.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0))
-    frames = [
-        FrameFiles(name=f"a_{number}", sparse=Path("s.png"), pose=pose)
-        for number, pose in enumerate((STILL, turned))
-    ]
-    (of_turned,), (of_still,) = (each.neighbours for each in with_neighbours(frames, 1))
-    assert of_turned.motion == turned
-    np.testing.assert_allclose(
-        of_still.motion, [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]], atol=1e-12
-    )
+def test_motion_leads_from_the_neighbours_camera_to_the_frames(tmp_path: Path) -> None:
+    frames = linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"], STILL + TURNED)
+    (of_turned,), (of_still,) = (each.neighbours for each in frames)
+    assert of_turned.motion == ((0, -1, 0, 4), (1, 0, 0, 0), (0, 0, 1, 1))
+    back = [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]]
+    np.testing.assert_allclose(of_still.motion, back, atol=1e-12)
 
 
-def test_neighbours_need_points_and_images_or_poses() -> None:
-    without_points = FrameFiles(name="a", pose=STILL)
-    without_pose = FrameFiles(name="a", sparse=Path("s.png"))
-    for frame in (without_points, without_pose):
-        with pytest.raises(UsageError, match="a: --accumulate"):
-            with_neighbours([frame, frame], 1)
+def test_neighbours_need_images_or_poses(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a_2: --accumulate"):
+        linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"])
 
 
 def rendered_drive(root: Path) -> Path:

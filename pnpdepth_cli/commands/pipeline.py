@@ -1,18 +1,50 @@
-"""Measures a run: seconds per stage, peak memory, and versions of libraries."""
+"""Frames through threads, in order, and what a run took: seconds, peak memory, versions."""
 
 from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import psutil
-import torch
 
 from pnpdepth_cli import __version__
+
+if TYPE_CHECKING:
+    import torch
+
+THREADS = 2
+"""Threads that read beside the computation, and that write."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], workers: int
+) -> Generator[Result, None, None]:
+    """Yields work(item) of each item in order, computed by several threads.
+
+    Only a few items are taken in advance, so memory does not grow with their number.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if waiting[0].done() or len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 @contextmanager
@@ -29,6 +61,8 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
     """Returns the peak memory of the process, and of the GPU if one is used, in 10^6 bytes."""
     peak = {"process": round(_peak_resident_bytes() / 1e6, 1)}
     if device.type == "cuda":
+        import torch
+
         peak["gpu"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
     return peak
 
@@ -45,10 +79,9 @@ def _peak_resident_bytes() -> int:
 
 def versions() -> dict[str, str]:
     """Returns the versions of the program, Python and the numerical libraries."""
-    libraries = ("numpy", "opencv-python-headless", "OpenEXR")
+    libraries = ("torch", "numpy", "opencv-python-headless", "OpenEXR")
     return {
         "pnpdepth": __version__,
         "python": platform.python_version(),
-        "torch": torch.__version__,
         **{name: metadata.version(name) for name in libraries},
     }

@@ -6,7 +6,7 @@ from itertools import count
 
 import pytest
 
-from pnpdepth_cli.commands.ordered_pool import in_order
+from pnpdepth_cli.commands.pipeline import in_order
 
 
 def test_results_come_in_order_and_few_items_are_taken_ahead() -> None:
