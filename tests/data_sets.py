@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +16,22 @@ from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 from tests.colmap_models import write_text_model
-from tests.empty_files import touch, tree
+
+
+def touch(*paths: Path) -> None:
+    """Creates the files and their folders."""
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def tree(root: Path, patterns: str) -> None:
+    """Creates the files of patterns such as "rgb/{a,b}.png depth/a.png" below a folder."""
+    for pattern in patterns.split():
+        parts = re.split(r"\{([^}]*)\}", pattern)
+        choices = [part.split(",") if index % 2 else [part] for index, part in enumerate(parts)]
+        touch(*(root / "".join(path) for path in itertools.product(*choices)))
+
 
 HEIGHT, WIDTH = 24, 32
 DRIVE = "2011_09_26_drive_0002_sync"

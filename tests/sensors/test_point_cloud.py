@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.point_cloud import (
     PointCloud,
     View,
@@ -43,15 +42,6 @@ def plane_depth(normal: tuple[float, float, float], distance: float) -> np.ndarr
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     rays = np.stack([(columns - 15.5) / 30, (rows - 11) / 28, np.ones((HEIGHT, WIDTH))], -1)
     return (distance / (rays @ np.array(normal))).astype(np.float32)
-
-
-def test_points_of_a_lens_with_distortion_project_back_onto_their_pixels() -> None:
-    camera = Camera(intrinsics=INTRINSICS, distortion=(-0.1, 0.02, 0.001, -0.002, 0.0))
-    depth = np.full((HEIGHT, WIDTH), 2, np.float32)
-    xyz = whole(depth, camera).xyz.astype(np.float64)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    assert pixels_of(camera, xyz) == pytest.approx(pixels, abs=1e-3)
 
 
 @settings(max_examples=25, deadline=None)

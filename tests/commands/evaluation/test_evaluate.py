@@ -22,7 +22,7 @@ from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.sensors.pixels import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
-from tests.empty_files import touch
+from tests.data_sets import touch
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:

@@ -10,8 +10,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, name_problem
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.errors import FileFormatError, InputError
 from pnpdepth_cli.protocols import ODOMETRY_PART
-from tests.data_sets import read_frames
-from tests.empty_files import touch
+from tests.data_sets import read_frames, touch
 
 
 def manifest(folder: Path, text: str) -> Path:
