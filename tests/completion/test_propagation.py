@@ -103,17 +103,6 @@ def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(k
     assert torch.equal(result, again)
 
 
-@pytest.mark.parametrize("kind", PROPAGATIONS)
-def test_depth_at_positions_equals_the_dense_depth(kind: str) -> None:
-    gt, rgb, prediction = scene()
-    points = random_points(gt, 40)
-    positions = torch.tensor([[3.0, 4.0], [63.0, 47.0], [20.0, 30.0]])
-    queries = SparsePoints(xy=positions, depth=torch.ones(3), size=SIZE)
-    depth = propagate(prediction, points, rgb, kind=kind)
-    at_positions = propagate_at(prediction, points, rgb, positions, kind=kind)
-    assert torch.allclose(at_positions, queries.sample(depth), rtol=1e-4)
-
-
 @pytest.mark.parametrize(("kind", "rtol"), [("gp", 0.01), ("local", 1e-5)])
 def test_a_large_image_has_at_every_second_pixel_the_depth_of_that_pixel_alone(
     kind: str, rtol: float

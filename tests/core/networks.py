@@ -156,7 +156,6 @@ class Frozen:
 
 
 MAKES: dict[str, Callable[[Tensor, Tensor], Any]] = {
-    "dict": lambda a, b: {"deep": a, "shallow": b},
     "dataclass": Frozen,
     "nested": lambda a, b: {"out": [(a, 3), {"x": b}], 5: "text"},
 }
@@ -170,8 +169,6 @@ def structured(kind: str) -> nn.Module:
         if kind == "nested":
             deep, shallow = out["out"][0][0], out["out"][1]["x"]
             out["out"].pop()
-        elif kind == "dict":
-            deep, shallow = out.pop("deep"), out.pop("shallow")
         else:
             deep, shallow = out.deep, out.shallow
         shallow += 1

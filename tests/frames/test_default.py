@@ -98,26 +98,19 @@ def split_of(depth: Tensor) -> ValidatedFrame:
     return ValidatedFrame(whole=frame, kept=frame, points=points, weights=torch.ones(len(depth)))
 
 
-def test_a_network_alone_is_aligned_updated_and_propagated() -> None:
-    frame = with_gt(frame_in_memory(60))
+@pytest.mark.parametrize(("of_scanner", "kind"), [(False, "gp"), (True, "local")])
+def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kind: str) -> None:
+    frame = with_gt(scan_frame() if of_scanner else frame_in_memory(60))
     result = refined(frame, member(Brightness, settings=UPDATES))
     assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
-    expected = propagate(updated, frame.points, frame.rgb, kind="gp")
+    expected = propagate(updated, result.used, frame.rgb, kind=kind)
     assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
     assert np.array_equal(result.after, result.stages["propagated"])
     assert np.array_equal(result.before, result.stages["before"])
     assert result.weights == {"brightness": 1.0}
     errors = [float(np.abs(d - depth_of_scene().numpy()).mean()) for d in result.stages.values()]
     assert errors[-1] < errors[0]
-
-
-def test_the_residual_of_scan_lines_is_propagated_by_lines_through_the_nearest_points() -> None:
-    frame = with_gt(scan_frame())
-    result = refined(frame, member(Brightness, settings=UPDATES))
-    updated = torch.from_numpy(result.stages["updated"])
-    expected = propagate(updated, result.used, frame.rgb, kind="local")
-    assert np.allclose(result.after, expected.numpy(), rtol=1e-5)
 
 
 def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None:
@@ -262,6 +255,10 @@ def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_err
     (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
     assert "80 validation points" in note
     assert "compact without the image" in wrong.weights
+    assert wrong.validation is not None
+    assert (
+        "alone" not in wrong.validation.predicted
+    )  # nothing else than compact, which has an image
     stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
     assert "compact without the image" not in stated.weights
     assert not any(note.startswith("warning: the image") for note in stated.notes)

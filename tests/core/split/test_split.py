@@ -37,9 +37,6 @@ NO_CUT = {
 """Layers that give no tensor or never run, and one whose cut would not be a cut (`torn`)."""
 
 
-# ------------------------------------------------------------------ the invariant
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
     network, x = build(name), image()
@@ -123,9 +120,6 @@ def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
         assert torch.equal(split.rear(z), whole)
 
 
-# ------------------------------------------------------------------ how often things run
-
-
 def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> None:
     network, x = build("two branches"), image()
     with Split(network, "cut") as split, torch.no_grad():
@@ -159,9 +153,6 @@ def test_nothing_of_a_image_stays_in_memory_after_the_split_closes() -> None:
     del split
 
 
-# ------------------------------------------------------------------ z
-
-
 def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
     network, x = build("midas"), image()
     with Split(network, "unit1") as split:
@@ -173,9 +164,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
         assert z.grad is not None
         assert bool((z.grad != 0).any())
     assert all(parameter.grad is None for parameter in network.parameters())
-
-
-# ------------------------------------------------------------------ naming the layer
 
 
 def with_an_unused_layer() -> nn.Module:
@@ -194,7 +182,7 @@ def with_an_unused_layer() -> nn.Module:
         (with_an_unused_layer, "unused"),
         (NETWORKS["repeated"], "same"),
         (NETWORKS["repeated"], "same#4"),
-        (NETWORKS["dict output"], "cut[wide]"),
+        (NETWORKS["nested output"], "cut[wide]"),
         (NETWORKS["nested output"], "cut"),
         (NETWORKS["side effects"], "hide"),
         (NETWORKS["in place"], "flat"),
@@ -221,9 +209,6 @@ def test_the_rear_needs_a_front_that_succeeded_and_may_be_tried_again() -> None:
         with pytest.raises(ModelError):
             split.rear(z[:, :3])
         assert torch.equal(split.rear(z), plain(network, x))
-
-
-# ------------------------------------------------------------------ leaving no trace
 
 
 def state_of(network: nn.Module) -> dict[str, Any]:
@@ -333,9 +318,6 @@ def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
         assert torch.equal(split.rear(z), split.rear(z))
         assert not torch.equal(network.head.weight, before)
     assert torch.equal(network.head.weight, before)
-
-
-# ------------------------------------------------------------------ hooks and side effects
 
 
 def test_the_networks_own_hooks_run_in_every_pass() -> None:
