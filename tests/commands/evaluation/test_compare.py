@@ -1,19 +1,20 @@
-"""Runs compared: gains and p-values by hand, and what cannot be compared."""
+"""Runs compared: gains and p-values by hand, what cannot be compared, and the plot."""
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.compare import Comparison, compare
+from pnpdepth_cli.commands.evaluation.compare import compare, plot_comparison
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.measures import MEASURES
@@ -31,53 +32,34 @@ def run(root: Path, name: str, errors: dict[str, list[float]], **options: Any) -
     return str(path)
 
 
-def summary(folder: Path, *records: FrameRecord) -> Path:
-    """The summary of a batch of these frames."""
-    folder.mkdir(exist_ok=True)
-    path = folder / "summary.json"
-    write_json(path, {"command": "batch", "frames": [record.to_json() for record in records]})
-    return path
-
-
-def names_of(comparison: Comparison) -> list[str]:
-    return [run.name for run in comparison.runs]
-
-
 FIRST = {"a": [2.0, 2.0], "b": [4.0, 4.0], "c": [1.0, 1.0]}
-BETTER = {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]}
 
 
-def test_a_lower_error_is_a_positive_gain(tmp_path: Path) -> None:
-    comparison = compare([run(tmp_path, "one", FIRST), run(tmp_path, "two", BETTER)])
+def test_a_lower_error_is_a_positive_gain_and_a_run_is_no_better_than_itself(
+    tmp_path: Path,
+) -> None:
+    one = run(tmp_path, "one", FIRST)
+    two = run(tmp_path, "two", {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]})
+    comparison = compare([one, two])
     gain = comparison.runs[1].gains["mae"]
     assert gain.percent == pytest.approx(100 * 2.5 / 7)
     assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
     assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
-    assert names_of(comparison) == ["one", "two"]
+    assert [(each.name, each.gains == {}) for each in comparison.runs] == [
+        ("one", True),
+        ("two", False),
+    ]
     assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
     (note,) = comparison.notes
     assert note.startswith("warning: 3 frames are too few")
 
-
-def test_a_run_is_no_better_than_itself_and_one_is_not_compared(tmp_path: Path) -> None:
-    path = run(tmp_path, "one", FIRST)
-    comparison = compare([path, path])
-    for gain in comparison.runs[1].gains.values():
+    same = compare([one, one])
+    for gain in same.runs[1].gains.values():
         assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
-    assert names_of(comparison) == [path, path]
-    assert comparison.to_json()["runs"][1]["gains"]["mae"]["low_percent"] is None
+    (_, of_json) = json.loads(json.dumps(same.to_json()))["runs"]
+    assert (of_json["name"], of_json["gains"]["mae"]["low_percent"]) == (one, None)
     with pytest.raises(UsageError):
-        compare([path])
-
-
-def test_frames_are_paired_by_name_and_the_others_reported(tmp_path: Path) -> None:
-    one = run(tmp_path, "one", {"a": [2.0], "only one": [9.0]})
-    (tmp_path / "gt" / "only one.npy").unlink()
-    comparison = compare([one, run(tmp_path, "two", {"a": [1.0]})])
-    gain = comparison.runs[1].gains["mae"]
-    assert (comparison.frames, gain.percent) == (("a",), pytest.approx(50))
-    assert np.isnan(gain.p_value)  # of one frame there is nothing to resample
-    assert comparison.notes[0].endswith("left out: only one")
+        compare([one])
 
 
 def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path: Path) -> None:
@@ -102,28 +84,35 @@ def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path:
     assert [measure.key for measure in chosen] == ["delta1", "silog"]
 
 
-def test_a_measure_that_a_frame_lacks_is_compared_over_the_other_frames(tmp_path: Path) -> None:
+def test_what_not_all_runs_have_is_left_out_and_reported(tmp_path: Path) -> None:
     rng, paths, means = np.random.default_rng(0), [], []
     for name, size in (("c", 1.0), ("d", 0.5)):
         errors = {f"{n:04}": (size * rng.uniform(1, 2, 4)).tolist() for n in range(9)}
-        path = Path(run(tmp_path, name, errors))
+        path = Path(run(tmp_path, name, errors | ({"e": [9.0]} if name == "c" else {})))
         record = json.loads(path.read_text())
-        scores = [frame["errors"]["ground_truth"]["after"] for frame in record["frames"]]
+        scores = [frame["errors"]["ground_truth"]["after"] for frame in record["frames"][:9]]
         scores[0]["imae"] = None
         path.write_text(json.dumps(record))
         means.append(np.mean([each["imae"] for each in scores[1:]]))
         paths.append(str(path))
+        (tmp_path / "gt" / "e.npy").unlink(missing_ok=True)
     comparison = compare(paths, columns=("mae", "imae"))
     gain = comparison.runs[1].gains["imae"]
+    assert (len(comparison.frames), gain.p_value) == (9, 2 / 2**8)
     assert comparison.runs[0].mean["imae"] == pytest.approx(means[0])
     assert gain.percent == pytest.approx(100 * (1 - means[1] / means[0]))
-    assert gain.p_value == 2 / 2**8
-    assert any(note.startswith("iMAE: over 8 of 9 frames") for note in comparison.notes)
+    assert comparison.notes[0].endswith("left out: e")
+    assert comparison.notes[1].startswith("iMAE: over 8 of 9 frames")
 
 
-def test_runs_of_other_definitions_or_without_a_common_frame_are_refused(tmp_path: Path) -> None:
-    one = run(tmp_path, "one", {"a": [1.0]})
-    devkit = run(tmp_path, "three", {"a": [1.0]}, protocol="kitti-devkit")
+def test_runs_of_other_definitions_frames_or_pixels_are_refused_or_warned_of(
+    tmp_path: Path,
+) -> None:
+    one = run(tmp_path, "one", {"a": [1.0, 1.0]})
+    (note,) = compare([one, run(tmp_path, "less", {"a": [1.0, -10.0]})]).notes
+    assert note.startswith("warning: 1 frame with other numbers of scored pixels")
+    assert "100.00%, 50.00%" in note
+    devkit = run(tmp_path, "three", {"a": [1.0, 1.0]}, protocol="kitti-devkit")
     with pytest.raises(InputError, match="definitions usual and kitti-devkit"):
         compare([one, devkit])
     (tmp_path / "gt" / "a.npy").unlink()
@@ -131,42 +120,30 @@ def test_runs_of_other_definitions_or_without_a_common_frame_are_refused(tmp_pat
         compare([one, run(tmp_path, "two", {"b": [1.0]})])
 
 
-def test_other_pixels_cause_a_warning(tmp_path: Path) -> None:
-    one = run(tmp_path, "one", {"a": [1.0, 1.0]})
-    (note,) = compare([one, run(tmp_path, "less", {"a": [1.0, -10.0]})]).notes
-    assert note.startswith("warning: 1 frame with other numbers of scored pixels")
-    assert "100.00%, 50.00%" in note
-
-
-SCORES: dict[str, Scores] = {
-    "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
-    "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
-}
-WITH_MRE: dict[str, Scores] = {stage: scores | {"mre": 0.5} for stage, scores in SCORES.items()}
-
-
 def test_a_batch_is_compared_with_what_it_started_from_by_groups(tmp_path: Path) -> None:
+    scores: dict[str, Scores] = {
+        "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
+        "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
+    }
+    with_mre = {stage: own | {"mre": 0.5} for stage, own in scores.items()}
     records = [
-        FrameRecord(name=f"{n}", group="abc"[n % 3], errors={"ground_truth": scores})
-        for n, scores in enumerate([WITH_MRE, *[SCORES] * 8])
+        FrameRecord(name=f"{n}", group="abc"[n % 3], errors={"ground_truth": own})
+        for n, own in enumerate([with_mre, *[scores] * 8])
     ]
-    path = summary(tmp_path / "x", *records, FrameRecord(name="drive/3", status="failed"))
-    comparison = compare([f"{path}:before", str(tmp_path / "x")])
+    frames = [each.to_json() for each in (*records, FrameRecord(name="9", status="failed"))]
+    (tmp_path / "x").mkdir()
+    write_json(tmp_path / "x" / "summary.json", {"command": "batch", "frames": frames})
+    comparison = compare([f"{tmp_path}/x/summary.json:before", str(tmp_path / "x")])
     assert len(comparison.frames) == 9
     gains = comparison.runs[1].gains
     assert list(gains) == ["rmse", "mae", "delta1"]
     assert (gains["rmse"].percent, gains["delta1"].percent) == (50, pytest.approx(20))
     assert gains["mae"].p_value == 2 / 8
     assert comparison.notes[-1].startswith("warning: 3 groups of frames are too few")
-    assert names_of(comparison) == ["x:before", "x"]
+    assert [each.name for each in comparison.runs] == ["x:before", "x"]
 
 
-BROKEN = [
-    '{"frames": []}',
-    '{"frames": [1]}',
-    '{"frames": [{"errors": {"ground_truth": {}}}]}',
-    '{"command": "eval", "protocol": {"name": "other"}, "measures": []}',
-]
+BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '{"measures": []}']
 
 
 @pytest.mark.parametrize("text", BROKEN)
@@ -176,3 +153,76 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
     for other in (str(tmp_path / "broken.json"), f"{one}:before"):
         with pytest.raises(FileFormatError, match=r"broken\.json|one\.json"):
             compare([one, other])
+
+
+def batch(folder: Path, mae: float, **varied: str) -> str:
+    """The summary of a batch of one frame whose MAE was 1 m before refinement."""
+    counts: Scores = {"pixels": 4, "coverage": 1.0}
+    stages: dict[str, Scores] = {"before": {"mae": 1.0} | counts, "after": {"mae": mae} | counts}
+    record = FrameRecord(name="a", errors={"ground_truth": stages}).to_json()
+    name = ",".join(varied.values())
+    (folder / name).mkdir()
+    write_json(folder / name / "summary.json", {"frames": [record], "varied": varied})
+    return str(folder / name)
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that are written."""
+    figure, written = pytest.importorskip("matplotlib.figure").Figure, list[Any]()
+    savefig = figure.savefig
+    monkeypatch.setattr(
+        figure, "savefig", lambda self, *a, **k: (written.append(self), savefig(self, *a, **k))
+    )
+    return written
+
+
+def test_numbers_lie_along_the_axis_names_make_lines_and_a_point_is_the_mean_over_seeds(
+    tmp_path: Path, figures: list[Any]
+) -> None:
+    errors = {"100 x 0": 0.5, "20 x 0": 1.0, "20 x 1": 0.5, "20 y 0": 0.5, "100 y 0": 1.25}
+    runs = []
+    for values, mae in errors.items():
+        count, loss, seed = values.split()
+        runs.append(batch(tmp_path, mae, sample=count, loss=loss, seed=seed))
+    plot_comparison(compare(runs), tmp_path / "p.svg")
+    above, below = figures[0].axes
+    assert (below.get_xlabel(), below.get_xscale()) == ("sample", "log")
+    lines = {line.get_label(): line.get_xydata().tolist() for line in above.get_lines()}
+    assert lines["loss=x"] == [[20, 0.75], [100, 0.5]]
+    assert lines["loss=y"] == [[20, 0.5], [100, 1.25]]
+    gains = [line.get_ydata().tolist() for line in below.get_lines()]
+    assert gains == [[25, 50], [50, -25]]
+    (legend,) = figures[0].legends
+    named = [text.get_text() for text in legend.get_texts()]
+    assert named == ["loss=x", "loss=y", "before refinement"]
+
+
+def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
+    runs = [batch(tmp_path, 0.5, method=name) for name in ("paper", "fused")]
+    for name in ("one.png", "two.png"):
+        plot_comparison(compare(runs), tmp_path / name)
+    (_, below), ticks = figures[0].axes, figures[0].axes[1].get_xticklabels()
+    assert [tick.get_text() for tick in ticks] == ["paper", "fused"]
+    assert below.get_lines()[0].get_xdata().tolist() == [0, 1]
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_plot_needs_one_option_a_known_format_leave_to_replace_a_file_and_matplotlib(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    one, two = batch(tmp_path, 0.5, lr="1%"), batch(tmp_path, 0.5, lr="3%")
+    comparison = compare([one, two])
+    with pytest.raises(UsageError, match="same options"):
+        plot_comparison(compare([one, batch(tmp_path, 0.5, loss="l2")]), tmp_path / "p.png")
+    with pytest.raises(UsageError, match=r"\.svg"):
+        plot_comparison(comparison, tmp_path / "p.jpg")
+    (tmp_path / "p.pdf").touch()
+    with pytest.raises(OutputError):
+        plot_comparison(comparison, tmp_path / "p.pdf")
+    plot_comparison(comparison, tmp_path / "p.pdf", overwrite=True)
+    assert (tmp_path / "p.pdf").read_bytes().startswith(b"%PDF")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError, match="plot"):
+        plot_comparison(comparison, tmp_path / "p.png")
