@@ -151,7 +151,7 @@ def test_images_count_alike_and_one_without_prediction_in_neither_means_nor_cove
 
 
 FAULTS = [
-    (lambda p: p.write_bytes(b"no depth"), "is not a depth file"),
+    (lambda p: p.write_bytes(b"no depth"), "a_depth.npy"),
     (lambda p: depth_file(p, [[0, 0]]), "holds no valid depth"),
     (lambda p: depth_file(p, [[1, 1, 1]]), "is 3×1 but the ground truth"),
 ]
