@@ -68,6 +68,13 @@ class SparsePoints(Generic[A]):
         moved = replace(self, xy=xy, size=(height, width))
         return moved.select(in_frame(xy, moved.size))
 
+    def mirrored(self: SparsePoints[Tensor]) -> SparsePoints[Tensor]:
+        """Returns the points with left and right of the frame exchanged."""
+        import torch
+
+        x, y = self.xy.unbind(dim=1)
+        return replace(self, xy=torch.stack([self.size[1] - 1 - x, y], dim=1))
+
     def select(self, mask: Tensor | NDArray[np.bool_] | slice) -> SparsePoints[A]:
         """Returns the points where mask, (N,) bool of the same library, is true; or a slice."""
         return replace(self, xy=self.xy[mask], depth=self.depth[mask])

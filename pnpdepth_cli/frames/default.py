@@ -30,6 +30,7 @@ from pnpdepth_cli.frames.fuse import (
     scanner_shares,
     split_frame,
     weighted_mean,
+    with_mirrored,
 )
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
@@ -59,6 +60,7 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     experts, warnings = add_blind_expert(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts, split)
+    experts = with_mirrored(networks, experts, weights)
     fused = weighted_mean([(e.dense(split), w) for e in experts if (w := weights[e.name]) > 0])
     # Points far from the depth of a network that weighs them are outliers, too.
     if judge.weighs_points and not is_dense(inliers.points):
@@ -125,7 +127,7 @@ def _stages(
     """The user's network after each step of its own, and the network that takes a prior alone."""
     assert own.whole is not None
     before, updated = own.whole.before, own.whole.after
-    propagated = updated if own.of_scanner else _propagate(updated, frame, split)
+    propagated = updated if own.of_scanner else _propagate(own.dense(split), frame, split)
     stages = {BEFORE: before, UPDATED: updated, PROPAGATED: propagated}
     if alone is not None:
         stages[ALONE] = _propagate(alone.dense(split), frame, split)

@@ -105,6 +105,17 @@ class Frame:
         """Returns the same image with other sparse depth."""
         return replace(self, points=points)
 
+    def mirrored(self) -> Frame:
+        """Returns the frame with left and right of image, points and prior exchanged."""
+        outliers, prior = self.outliers, self.prior
+        return replace(
+            self,
+            rgb=None if self.rgb is None else self.rgb.flip(-1),
+            points=self.points.mirrored(),
+            outliers=None if outliers is None else outliers.mirrored(),
+            prior=None if prior is None else prior.flip(-1),
+        )
+
     def without(self, outliers: Tensor) -> Frame:
         """Returns the frame with some of its points, (N,) bool, moved to its outliers."""
         if not bool(outliers.any()):

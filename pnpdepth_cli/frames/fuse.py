@@ -59,6 +59,9 @@ FEW_POINTS = 50
 """With fewer points, updates of a network that takes them gain nothing: on even frames 2 to 3 %
 with 500 points, 1 % with 100, nothing with 20. A point that contradicts its neighbours may then be
 all that is seen of a small object."""
+MIRRORED_BELOW = 200
+"""With fewer points, the network that takes a prior is not updated, but sees the mirrored frame
+too, in the same time (docs/notes/fusion.md)."""
 LEAST_PART = 0.01
 """A network with less weight has no part in the result, which is said."""
 
@@ -137,11 +140,16 @@ class Expert:
     whole: Prediction | None = None  # from all points. None of linear interpolation
     kept: Prediction | None = None  # from the others; the same as `whole` without validation
     user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
+    frame: Frame | None = None  # what was given to a network that takes a prior
+    mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
     def dense(self, split: ValidatedFrame) -> Tensor:
         """Returns (H, W) metres, 0 = unknown: from all points, the residual not propagated."""
-        return linear(split.whole.points) if self.whole is None else self.whole.after
+        if self.whole is None:
+            return linear(split.whole.points)
+        depth = self.whole.after
+        return depth if self.mirrored is None else weighted_mean([(depth, 1), (self.mirrored, 1)])
 
 
 def predictions(
@@ -241,7 +249,7 @@ def add_blind_expert(
     grey = torch.full_like(rgb, 0.5)
     blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
     expert = _expert(fusing, blind, f"{fusing.name} without the image", updates=False)
-    experts = [*experts, replace(expert, weight=WITHOUT_IMAGE)]
+    experts = [*experts, replace(expert, weight=WITHOUT_IMAGE, frame=None)]
     # It helps nothing if the grey one does as well.
     if (of_linear + split.gain(at, expert.at)) / 2 >= NO_GAIN:
         return experts, ()
@@ -298,6 +306,27 @@ def fit_weights(
     return by_name | {each.name: float(w) for each, w in zip(having, found, strict=True)}
 
 
+def with_mirrored(
+    networks: Sequence[OpenNetwork], experts: list[Expert], weights: Mapping[str, float]
+) -> list[Expert]:
+    """Returns the experts; of few points, those of the network that takes a prior see two frames.
+
+    The second is the mirrored frame. An expert without weight does not need it.
+    """
+    fusing = fusing_network(networks)
+    if fusing is None:
+        return experts
+    fusing.next_image()  # both experts share what is computed for the mirrored image
+    both = list[Expert]()
+    for expert in experts:
+        frame = expert.frame
+        if frame is not None and len(frame.points) < MIRRORED_BELOW and weights[expert.name] > 0:
+            turned = predict(fusing, frame.mirrored(), updates=False).after.flip(-1)
+            expert = replace(expert, mirrored=turned)
+        both.append(expert)
+    return both
+
+
 def scanner_shares(
     experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> dict[str, float]:
@@ -343,7 +372,8 @@ def predict(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Pred
         updates: Whether z is updated, where that gains anything. With a LiDAR's points, updates of
             a network that takes them gain 1 % and take as long as everything else.
     """
-    gains = len(frame.points) >= FEW_POINTS and not is_dense(frame.points)
+    fewest = MIRRORED_BELOW if network.takes_prior else FEW_POINTS
+    gains = len(frame.points) >= fewest and not is_dense(frame.points)
     return network.refine(frame, updates=updates and (gains or not network.takes_points))
 
 
@@ -381,6 +411,7 @@ def _expert(
         whole=own,
         kept=again,
         user=user,
+        frame=whole if network.takes_prior else None,
         of_scanner=user is network and takes_points and split.has_scan_lines,
     )
 

@@ -121,12 +121,11 @@ def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None
     with opened(own, compact()) as networks:
         of_own = networks[0].refine(frame)
         prior = replace(frame, prior=of_own.before)
-        depths = [
-            of_own.after,
-            networks[1].refine(prior).after,
-            networks[1].refine(frame).after,
-            linear(frame.points),
-        ]
+        once = [networks[1].refine(each).after for each in (prior, frame)]
+        networks[1].next_image()
+        turned = [networks[1].refine(each.mirrored()).after.flip(-1) for each in (prior, frame)]
+    both = [(a * b).sqrt() for a, b in zip(once, turned, strict=True)]
+    depths = [of_own.after, *both, linear(frame.points)]
     fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
     expected = propagate(fused, frame.points, frame.rgb, kind="gp")
     assert np.allclose(result.after, expected.numpy(), rtol=1e-4)

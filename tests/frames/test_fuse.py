@@ -1,0 +1,66 @@
+"""What the network that takes a prior sees of a frame with few points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.fuse import MIRRORED_BELOW, Expert, split_frame, with_mirrored
+from pnpdepth_cli.frames.open_network import OpenNetwork
+from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.settings import ClosedSettings
+from tests.frames.scenes import depth_of_scene, frame_in_memory, opened
+
+
+def seen_twice(frame: Frame, weight: float = 1.0) -> tuple[Expert, Expert]:
+    """An expert of `compact`, before and after it sees the mirrored frame, if it does."""
+    own = OpenNetwork(load_network("compact", None), "decoder.s8", ClosedSettings(iterations=0))
+    with opened(own) as networks:
+        at = frame.points.depth[:0]
+        expert = Expert(
+            name="compact", at=at, updated=at, whole=networks[0].refine(frame), frame=frame
+        )
+        (again,) = with_mirrored(networks, [expert], {"compact": weight})
+    return expert, again
+
+
+def test_a_mirrored_frame_has_left_and_right_exchanged_and_mirrored_again_is_the_frame() -> None:
+    frame = replace(frame_in_memory(), prior=depth_of_scene())
+    mirrored = frame.mirrored()
+    width = frame.size[1]
+    xy = frame.points.xy.numpy()
+    np.testing.assert_array_equal(mirrored.points.xy.numpy()[:, 0], width - 1 - xy[:, 0])
+    np.testing.assert_array_equal(mirrored.points.xy.numpy()[:, 1], xy[:, 1])
+    assert mirrored.rgb is not None
+    assert mirrored.prior is not None
+    torch.testing.assert_close(mirrored.rgb[..., 0], frame.rgb[..., -1])  # type: ignore[index]
+    torch.testing.assert_close(mirrored.points.sample(mirrored.prior), frame.points.depth)
+    twice = mirrored.mirrored()
+    torch.testing.assert_close(twice.points.xy, frame.points.xy)
+    torch.testing.assert_close(twice.rgb, frame.rgb)
+
+
+def test_with_few_points_the_depth_is_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> (
+    None
+):
+    frame = frame_in_memory(count=MIRRORED_BELOW - 1)
+    split = split_frame(frame, depth_of_scene(), 0)
+    once, twice = seen_twice(frame)
+    turned, _ = seen_twice(frame.mirrored())
+    assert once.whole is not None
+    assert turned.whole is not None
+    left, right = once.whole.after.numpy(), turned.whole.after.numpy()[:, ::-1]
+    assert np.abs(left - right).max() > 1e-3
+    np.testing.assert_allclose(twice.dense(split), np.sqrt(left * right), rtol=1e-4)
+
+
+def test_with_many_points_or_without_weight_an_expert_sees_the_frame_alone() -> None:
+    for frame, weight in (
+        (frame_in_memory(count=MIRRORED_BELOW), 1.0),
+        (frame_in_memory(count=20), 0.0),
+    ):
+        once, twice = seen_twice(frame, weight)
+        assert twice is once
