@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
-from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.sensors.lens import pixels_of
 
@@ -24,17 +24,19 @@ Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
 Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
 """
 PLAIN = """# a comment
-K: [[700.5, 0, 600], [0, 701, 170],
+K: [[500.5, 0, 320], [0, 501, 240],
     [0, 0, 1]]
 R:
   - [0, -1, 0]
   - [0, 0, -1]
   - [1, 0, 0]
-t: [0.06, -0.08, -0.27]   # metres
-distortion: [-0.3, 0.1, 0.0, 0.001]
-size: [1242, 375]
+t: [0.1, -0.2, -0.3]   # metres
+distortion: [-0.02, 0.01, -0.003, 0.001]
+size: [640, 480]
+lens: fisheye
 """
 K = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
+TURN, SHIFT = [[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0.1, -0.2, -0.3]
 ROS = """image_width: 640
 image_height: 480
 camera_matrix: {{rows: 3, cols: 3, data: [500.5, 0, 320, 0, 501, 240, 0, 0, 1]}}
@@ -64,13 +66,10 @@ cam1:
   camera_model: pinhole
   distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
   distortion_model: radtan
-  intrinsics: [400, 401, 310, 230]
+  intrinsics: [500.5, 501, 320, 240]
   resolution: [640, 480]
 """
 RADIAL = "radial-tangential"
-TURN = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-SHIFT = [0.1, -0.2, -0.3]
-PINHOLE = [[700, 0, 600], [0, 700, 170], [0, 0, 1]]
 POSES = {
     "matrix of 16": "0 -1 0 0.1\n0 0 -1 -0.2\n1 0 0 -0.3\n0 0 0 1\n",
     "matrix of 12": "[[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]  # by rows",
@@ -78,7 +77,6 @@ POSES = {
     "tf": "transforms:\n- transform:\n    translation: {x: 0.1, y: -0.2, z: -0.3}\n"
     "    rotation: {x: 0.5, y: -0.5, z: 0.5, w: 0.5}\n",
 }
-
 ODD = [
     *("!!int ''", "!!bool x", "!!timestamp x", "!!binary é", "!!float z", "{? [] : 1}"),
     *("!!python/name:os.system ''", "1e999", "9" * 5000),
@@ -102,23 +100,15 @@ def opencv_file(coefficients: list[float], **others: int) -> str:
     return file.releaseAndGetString()
 
 
-def facts(calibration: Calibration) -> tuple[Any, ...]:
-    camera, has_pose = calibration.camera, calibration.scanner is not None
-    return camera.intrinsics.tolist(), camera.size, camera.lens, camera.distortion, has_pose
-
-
 def test_kittis_files_become_one_pinhole_camera(tmp_path: Path) -> None:
     path = write(tmp_path, KITTI)
     got = read_calibration(path)
-    assert facts(got) == (PINHOLE, None, RADIAL, (), True)
-    assert got.scanner.rotation.tolist() == TURN
+    assert (got.camera.size, got.camera.distortion) == (None, ())
     # P · [0 -0.08 -0.27 1] must come out the same as K · translation
     p2 = np.array([[700, 0, 600, 42], [0, 700, 170, -0.35], [0, 0, 1, 0.005]])
-    shown = got.camera.intrinsics @ got.scanner.translation
+    shown = got.camera.intrinsics @ got.scanner.square()[:3, 3]
     np.testing.assert_allclose(shown, p2 @ [0, -0.08, -0.27, 1])
     assert read_calibration(path, 0).scanner.translation.tolist() == [0, -0.08, -0.27]
-    with pytest.raises(UsageError):
-        read_calibration(path, 3)
     # odometry has the scanner in Tr, and no rectification
     lines = KITTI.splitlines()
     odometry = "\n".join([*lines[:2], lines[3].replace("Tr_velo_to_cam", "Tr")])
@@ -140,15 +130,11 @@ def test_kitti_360_maps_camera_0_to_the_scanner_and_has_one_rectification(tmp_pa
     point = np.array([12.0, -3.0, 0.5])  # in the scanner's frame
     u, v, w = k @ rectify @ np.linalg.solve(turn, point - to_scanner[:, 3])
     for camera, offset in enumerate(offsets):
-        for path in (tmp_path, tmp_path / "perspective.txt"):
-            calibration = read_calibration(path, camera or None)
-            assert calibration.scanner is not None
-            seen = calibration.scanner.apply(point[None])
-            pixel = pixels_of(calibration.camera, seen)[0]
-            np.testing.assert_allclose([*pixel, seen[0, 2]], [(u + offset) / w, v / w, w])
-            assert calibration.camera.size == (376, 1408)
-    with pytest.raises(UsageError):
-        read_calibration(tmp_path, 2)
+        calibration = read_calibration(tmp_path, camera or None)
+        seen = calibration.scanner.apply(point[None])
+        pixel = pixels_of(calibration.camera, seen)[0]
+        np.testing.assert_allclose([*pixel, seen[0, 2]], [(u + offset) / w, v / w, w])
+        assert calibration.camera.size == (376, 1408)
 
 
 def test_kittis_raw_folder_gives_its_cameras_also_without_the_scanner(tmp_path: Path) -> None:
@@ -159,53 +145,49 @@ def test_kittis_raw_folder_gives_its_cameras_also_without_the_scanner(tmp_path: 
         "calib_cam_to_cam.txt",
     )
     for place in (tmp_path, cameras):
-        assert facts(read_calibration(place)) == (PINHOLE, (375, 1242), RADIAL, (), False)
+        alone = read_calibration(place)
+        assert (alone.camera.size, alone.scanner) == ((375, 1242), None)
     scanner = write(tmp_path, "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.08 -0.27\n", "calib_velo_to_cam.txt")
-    got = read_calibration(scanner)
-    assert got.scanner.rotation.tolist() == TURN
-    assert got.scanner.translation.tolist() == [0.06, -0.08, -0.27]
+    pose = read_calibration(scanner).scanner
+    assert [each.tolist() for each in pose] == [TURN, [0.06, -0.08, -0.27]]
     cameras.unlink()
     with pytest.raises(InputError):
         read_calibration(tmp_path)
 
 
-def test_a_plain_text_file_and_its_json_are_read_the_same(tmp_path: Path) -> None:
-    values: dict[str, Any] = {
-        "K": [[700.5, 0, 600], [0, 701, 170], [0, 0, 1]],
-        "R": TURN,
-        "t": [0.06, -0.08, -0.27],
-        "distortion": [-0.3, 0.1, 0.0, 0.001],
-        "size": [1242, 375],
-    }
-    for text in (PLAIN, json.dumps(values)):
-        got = read_calibration(write(tmp_path, text))
-        distortion = tuple(values["distortion"])
-        assert facts(got) == (values["K"], (375, 1242), RADIAL, distortion, True)
-        assert [each.tolist() for each in got.scanner] == [values["R"], values["t"]]
-    with pytest.raises(UsageError):
-        read_calibration(tmp_path / "calib.txt", 1)
-
-
-FIVE = [-0.1, 0.02, 0.001, -0.002, 0.01]
-FOUR = [-0.02, 0.01, -0.003, 0.001]
+FIVE, FOUR = [-0.1, 0.02, 0.001, -0.002, 0.01], [-0.02, 0.01, -0.003, 0.001]
 EIGHT = [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01]
-NAMED = {
-    "of OpenCV": (opencv_file(FIVE), FIVE, RADIAL),
-    "of OpenCV, fisheye": (opencv_file(FOUR, fisheye_model=1), FOUR, "fisheye"),
-    "of ROS, rational": (ROS.format(model="rational_polynomial", data=EIGHT), EIGHT, RADIAL),
-    "of ROS, fisheye": (ROS.format(model="equidistant", data=FOUR), FOUR, "fisheye"),
-    "of ROS, without distortion": (ROS.format(model="''", data=[0] * 4), [], RADIAL),
-    "an echoed topic": (TOPIC, FIVE, RADIAL),
+VALUES = {"K": K, "R": TURN, "t": SHIFT, "distortion": FIVE, "size": [640, 480]}
+NAMED: dict[str, tuple[str, int | None, list[float], str, bool]] = {
+    "OpenCV": (opencv_file(FIVE), None, FIVE, RADIAL, False),
+    "OpenCV, fisheye": (opencv_file(FOUR, fisheye_model=1), None, FOUR, "fisheye", False),
+    "ROS": (ROS.format(model="rational_polynomial", data=EIGHT), None, EIGHT, RADIAL, False),
+    "ROS, fisheye": (ROS.format(model="equidistant", data=FOUR), None, FOUR, "fisheye", False),
+    "ROS, undistorted": (ROS.format(model="''", data=[0] * 4), None, [], RADIAL, False),
+    "an echoed topic": (TOPIC, None, FIVE, RADIAL, False),
+    "Kalibr": (KALIBR, None, FOUR, "fisheye", False),
+    "Kalibr's second": (KALIBR, 1, FIVE[:4], RADIAL, True),
+    "plain text": (PLAIN, None, FOUR, "fisheye", True),
+    "JSON": (json.dumps(VALUES), None, FIVE, RADIAL, True),
+    "bare": ("500.5 501 320 240 640 480", None, [], RADIAL, False),
 }
-"""Text, coefficients and lens of files that name what they hold, of one camera."""
+"""Text, number of the camera, coefficients, lens, and whether it has the scanner's pose."""
 
 
-@pytest.mark.parametrize(("text", "coefficients", "lens"), NAMED.values(), ids=NAMED)
-def test_files_of_opencv_and_ros_are_read(
-    text: str, coefficients: list[float], lens: str, tmp_path: Path
-) -> None:
-    got = read_calibration(write(tmp_path, text))
-    assert facts(got) == (K, (480, 640), lens, tuple(coefficients), False)
+@pytest.mark.parametrize("kind", NAMED)
+def test_a_camera_is_the_same_in_every_kind_of_file(kind: str, tmp_path: Path) -> None:
+    text, number, coefficients, lens, has_pose = NAMED[kind]
+    got = read_calibration(write(tmp_path, text), number)
+    camera = got.camera
+    assert (camera.intrinsics.tolist(), camera.size, camera.lens) == (K, (480, 640), lens)
+    assert camera.distortion == tuple(coefficients)
+    assert [each.tolist() for each in got.scanner or ()] == ([TURN, SHIFT] if has_pose else [])
+
+
+@pytest.mark.parametrize(("text", "number"), [(KITTI, 3), (KALIBR, 7), (PLAIN, 1), (TOPIC, 0)])
+def test_a_camera_that_is_not_there_is_wrong_usage(text: str, number: int, tmp_path: Path) -> None:
+    with pytest.raises(UsageError):
+        read_calibration(write(tmp_path, text), number)
 
 
 PLAIN_P, SHIFTED_P = [9, 0, 3, 0, 0, 8, 2, 0, 0, 0, 1, 0], [9, 0, 3, -18, 0, 8, 2, 0, 0, 0, 1, 0]
@@ -225,54 +207,38 @@ def test_the_cameras_of_rectified_images_follow_p_and_r(
     p: list[float], r: Any, cameras: dict[str, Any], tmp_path: Path
 ) -> None:
     raw = read_calibration(write(tmp_path, TOPIC.replace("---", f"p: {p}\nr: {r}\n---")))
-    turns = {name: pose.rotation.tolist() for name, (_, pose) in raw.rectified.items()}
-    shifts = {name: pose.translation.tolist() for name, (_, pose) in raw.rectified.items()}
-    assert list(turns) == list(cameras)
-    assert turns == {name: turn or np.eye(3).tolist() for name, (turn, _) in cameras.items()}
-    assert shifts == {name: [x, 0, 0] for name, (_, x) in cameras.items()}
-    for camera, _ in raw.rectified.values():
+    assert list(raw.rectified) == list(cameras)
+    for name, (camera, pose) in raw.rectified.items():
+        turn, x = cameras[name]
         assert camera.intrinsics.tolist() == [[9, 0, 3], [0, 8, 2], [0, 0, 1]]
-
-
-def test_the_cameras_of_a_camchain_are_chosen_by_number(tmp_path: Path) -> None:
-    path = write(tmp_path, KALIBR)
-    first, second = read_calibration(path), read_calibration(path, 1)
-    assert facts(first) == (K, (480, 640), "fisheye", (-0.02, 0.01, -0.003, 0.001), False)
-    assert second.camera.lens == RADIAL
-    assert [each.tolist() for each in second.scanner] == [TURN, SHIFT]
-    with pytest.raises(UsageError):
-        read_calibration(path, 7)
+        assert pose.rotation.tolist() == (turn or np.eye(3).tolist())
+        assert pose.translation.tolist() == [x, 0, 0]
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        KITTI.replace("Tr_velo_to_cam", "Tr_v"),
-        KITTI.replace("P2: 700", "P2: nan"),
+        *(KITTI.replace("Tr_velo_to_cam", "Tr_v"), KITTI.replace("P2: 700", "P2: nan")),
         KITTI.replace("R0_rect: 1", "R0_rect: 1.2"),
         KITTI.replace("velo_to_cam: 0 -1", "velo_to_cam: 0 1"),
         KITTI + KITTI,
-        PLAIN.replace("t:", "#t:"),
-        PLAIN.replace("[-0.3, 0.1, 0.0, 0.001]", "[-0.3]"),
-        PLAIN.replace("1242", "0"),
-        "1 2 3",
-        # its products would overflow
-        PLAIN.replace("700.5", "1e308"),
-        KALIBR.replace("pinhole", "omni"),
+        *(PLAIN.replace("t:", "#t:"), PLAIN.replace("-0.02, ", ""), PLAIN.replace("640", "0")),
+        *("1 2 3", PLAIN.replace("500.5", "1e308"), KALIBR.replace("pinhole", "omni")),
         # YAML that is more than plain texts
         "a: &a [1, 1]\ncamera_matrix: *a\n",
         "camera_matrix: [" * 2000,
         "camera_matrix: 1\n" + " " * 300_000,
         "camera_matrix: !!python/object/apply:os.system ['true']",
         *(f"camera_matrix: {value}\ndistortion_model: plumb_bob\n" for value in ODD),
+        # where the time grows with the square of the length, each of these takes a minute
+        *("a" * 60_000, "a: b\nb\n" + "1\n" * 400_000, "1 " * 2_000_000),
     ],
 )
 @pytest.mark.filterwarnings("error")
 def test_what_is_missing_or_wrong_is_named_in_one_line(tmp_path: Path, text: str) -> None:
-    with pytest.raises(FileFormatError) as error:
+    with pytest.raises(FileFormatError, match=r"calib\.txt") as error:
         read_calibration(write(tmp_path, text))
     assert "\n" not in str(error.value)
-    assert "calib.txt" in str(error.value)
 
 
 @pytest.mark.parametrize("form", POSES)
@@ -280,7 +246,6 @@ def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
     pose = read_extrinsics(write(tmp_path, POSES[form]))
     np.testing.assert_allclose(pose.rotation, TURN, atol=1e-12)
     np.testing.assert_allclose(pose.translation, SHIFT)
-    np.testing.assert_allclose((pose.inverse() @ pose).square(), np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -290,14 +255,6 @@ def test_extrinsics_are_read_in_each_form(form: str, tmp_path: Path) -> None:
         "translation: {x: 1, y: 2, z: 3}\nrotation: {x: 0, y: 0, z: 0, w: one}",
     ],
 )
-def test_what_is_no_pose_is_one_line(text: str, tmp_path: Path) -> None:
+def test_what_is_no_pose_is_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError):
         read_extrinsics(write(tmp_path, text))
-
-
-@pytest.mark.parametrize("text", ["a" * 60_000, "a: b\nb\n" + "1\n" * 400_000, "1 " * 2_000_000])
-def test_a_long_text_that_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
-    """Where the time grows with the square of the length, each of them takes a minute."""
-    (tmp_path / "calib.txt").write_text(text)
-    with pytest.raises(FileFormatError):
-        read_calibration(tmp_path / "calib.txt")
