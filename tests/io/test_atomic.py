@@ -42,8 +42,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(
 ) -> None:
     target = tmp_path / name
     target.write_bytes(b"old")
-    fails = pytest.raises(type(error)) if error is not None else nullcontext()
-    with fails, atomic_path(target) as temporary:
+    with pytest.raises(type(error)) if error else nullcontext(), atomic_path(target) as temporary:
         assert (temporary.parent, temporary.suffix) == (tmp_path, target.suffix)
         temporary.write_bytes(b"new")
         assert target.read_bytes() == b"old"
@@ -53,22 +52,16 @@ def test_a_file_is_replaced_whole_or_not_at_all(
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_link_is_replaced_and_what_it_points_to_stays(tmp_path: Path) -> None:
-    (tmp_path / "real").write_bytes(b"precious")
-    for name, target in (("link.json", "real"), ("broken.json", "missing")):
-        (tmp_path / name).symlink_to(tmp_path / target)
-        with atomic_path(tmp_path / name) as temporary:
-            temporary.write_bytes(b"x")
-        assert not (tmp_path / name).is_symlink()
-    assert (tmp_path / "real").read_bytes() == b"precious"
-    assert not (tmp_path / "missing").exists()
-
-
-def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path: Path) -> None:
+def test_links_are_not_followed_but_the_output_itself_may_be_one(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
+    (tmp_path / "precious").write_bytes(b"mine")
     (tmp_path / "out").symlink_to(tmp_path / "real")
     make_folder(tmp_path / "out/a/b", below=tmp_path / "out")
     assert (tmp_path / "real/a/b").is_dir()
+    (tmp_path / "out/link.json").symlink_to(tmp_path / "precious")
+    with atomic_path(tmp_path / "out/link.json") as temporary:
+        temporary.write_bytes(b"x")
+    assert (tmp_path / "precious").read_bytes() == b"mine"
     (tmp_path / "real/planted").symlink_to(tmp_path)
     with pytest.raises(OutputError):
         make_folder(tmp_path / "out/planted/c", below=tmp_path / "out")
@@ -79,10 +72,8 @@ def test_a_folder_in_the_output_is_no_link_but_the_output_itself_may_be(tmp_path
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").write_text("x")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError) as caught, atomic_path(tmp_path / name):
+    with pytest.raises(OutputError, match=str(tmp_path / name)), atomic_path(tmp_path / name):
         pytest.fail("must not get here")
-    assert str(caught.value).startswith(str(tmp_path / name))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".exr", ".npy"])
@@ -94,24 +85,16 @@ def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suff
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("existed", [False, True])
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_folder_is_replaced_whole_or_not_at_all(
-    tmp_path: Path, existed: bool, fails: bool
-) -> None:
+def test_a_folder_is_replaced_whole_or_not_at_all(tmp_path: Path, fails: bool) -> None:
     folder = tmp_path / "report"
-    if existed:
-        folder.mkdir()
-        (folder / "before").touch()
-
-    expected = pytest.raises(KeyboardInterrupt) if fails else nullcontext()
-    with expected, atomic_folder(folder) as temporary:
+    (folder / "before").mkdir(parents=True)
+    with pytest.raises(ValueError) if fails else nullcontext(), atomic_folder(folder) as temporary:
         (temporary / "after").touch()
         if fails:
-            raise KeyboardInterrupt
-    left = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")]
-    kept = ["report", "report/before"] if existed else []
-    assert left == (kept if fails else ["report", "report/after"])
+            raise ValueError
+    assert [path.name for path in folder.iterdir()] == ["before" if fails else "after"]
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 def test_a_folder_left_by_a_killed_writer_is_removed(tmp_path: Path) -> None:

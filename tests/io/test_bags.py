@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import sqlite3
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,7 +51,7 @@ def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
     "claim",
     [
         *({"height": 0}, {"height": 7}, {"width": 7}, {"step": 5}, {"step": 7}),
-        *({"encoding": name} for name in ("rgb8", "yuv422")),
+        *({"encoding": "rgb8"}, {"encoding": "yuv422"}),
     ],
 )
 def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused(
@@ -72,11 +73,10 @@ def test_an_organised_cloud_gives_its_points_row_by_row(order: str) -> None:
     assert got.tolist() == points.reshape(-1, 3).tolist()
     flat = cloud_points(SimpleNamespace(**(cloud | {"height": 1, "row_step": 0})), "/scan")
     assert flat.tolist() == got[:3].tolist()
-    for claim in ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35}):
+    claims = ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35})
+    for claim in (*claims, {"fields": fields[:2]}):
         with pytest.raises(FileFormatError):
             cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")
-    with pytest.raises(FileFormatError):
-        cloud_points(SimpleNamespace(**(cloud | {"fields": fields[:2]})), "/scan")
 
 
 def read_all(path: Path) -> int:
@@ -116,24 +116,24 @@ def test_a_compressed_bag_is_read(tmp_path: Path) -> None:
 
     plain = read_all(write_bag(tmp_path / "plain.bag"))
     for kind in Writer.CompressionFormat:
-        path = write_bag(tmp_path / f"{kind.name}.bag", compression=kind)
-        assert read_all(path) == plain
+        assert read_all(write_bag(tmp_path / f"{kind.name}.bag", compression=kind)) == plain
 
 
 @pytest.mark.parametrize(
     "metadata",
     [
         "rosbag2_bagfile_information: 3",
+        "rosbag2_bagfile_information: {compression_mode: file}",
         "a: &a [x, x]\nb: &b [*a, *a]\n" + "rosbag2_bagfile_information: {version: [*b, *b]}",
     ],
 )
-def test_metadata_of_another_kind_and_aliases_are_one_line(metadata: str, tmp_path: Path) -> None:
+def test_metadata_of_another_kind_compression_and_aliases_are_refused(
+    metadata: str, tmp_path: Path
+) -> None:
     bag = write_bag(tmp_path / "ros2")
     (bag / "metadata.yaml").write_text(metadata)
-    with pytest.raises(FileFormatError) as caught:
+    with pytest.raises(FileFormatError):
         read_all(bag)
-    assert "metadata.yaml" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -148,12 +148,11 @@ def test_metadata_of_another_kind_and_aliases_are_one_line(metadata: str, tmp_pa
 def test_a_database_that_computes_what_is_read_is_refused(statements: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "ros2")
     (file,) = bag.glob("*.db3")
-    connection = sqlite3.connect(file)
-    if "VIEW schema" in statements:
-        connection.execute("DROP TABLE schema")
-    connection.execute(statements)
-    connection.commit()
-    connection.close()
+    with closing(sqlite3.connect(file)) as connection:
+        if "VIEW schema" in statements:
+            connection.execute("DROP TABLE schema")
+        connection.execute(statements)
+        connection.commit()
     for path in (bag, file):
         with pytest.raises(FileFormatError):
             read_all(path)

@@ -9,36 +9,33 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.colmap_model import MODELS, name_in_model, read_model
+from pnpdepth_cli.io.colmap_model import MODELS, ColmapModel, name_in_model, read_model
 from pnpdepth_cli.sensors.lens import pixels_of
 from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
 
 PARTS = ("cameras", "images", "points3D")
 
 
-def test_a_binary_model_is_read_as_written(tmp_path: Path) -> None:
-    write_binary_model(tmp_path)
+def columns(model: ColmapModel) -> tuple[list[object], ...]:
+    return tuple(model.points[name].tolist() for name in ("number", "xyz", "error", "track"))
+
+
+def test_a_binary_model_is_read_as_written_and_found_in_the_folders_above_it(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "sparse" / "0"
+    write_binary_model(folder)
+    for above in (tmp_path, folder.parent, folder):
+        assert read_model(above).folder == folder
     model = read_model(tmp_path)
-    camera = model.images["dir/1.png"].camera
+    camera, image = model.images["dir/1.png"].camera, model.images["dir/2.png"]
     assert (camera.source, camera.size) == ("SIMPLE_RADIAL camera", (48, 64))
-    assert camera.lens == "radial-tangential"
     assert camera.intrinsics.tolist() == [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]
-    assert camera.distortion == (0.1, 0, 0, 0)
-    assert list(model.images) == ["dir/1.png", "dir/2.png"]
-    assert model.images["dir/2.png"].pose.translation.tolist() == [0.2, 0, 0]
-    assert model.images["dir/2.png"].points.tolist() == [7]
-    points = model.points
-    assert points["xyz"].tolist() == [[0.5, -0.25, 4.0]]
-    assert (points["error"].tolist(), points["track"].tolist()) == ([0.75], [2])
-
-
-def test_a_model_is_found_in_the_folders_above_it(tmp_path: Path) -> None:
-    write_binary_model(tmp_path / "sparse" / "0")
-    for above in (tmp_path, tmp_path / "sparse", tmp_path / "sparse" / "0"):
-        assert read_model(above).folder == tmp_path / "sparse" / "0"
-    (tmp_path / "other").mkdir()
+    assert (camera.lens, camera.distortion) == ("radial-tangential", (0.1, 0, 0, 0))
+    assert (image.pose.translation.tolist(), image.points.tolist()) == ([0.2, 0, 0], [7])
+    assert columns(model) == ([7], [[0.5, -0.25, 4.0]], [0.75], [2])
     with pytest.raises(InputError):
-        read_model(tmp_path / "other")
+        read_model(folder.parent / "1")
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -85,10 +82,9 @@ def test_a_photo_is_found_by_the_longest_name_that_ends_its_path(tmp_path: Path)
     model = read_model(tmp_path)
     assert name_in_model(model, Path("/photos/right/1.png")) == "right/1.png"
     assert name_in_model(model, Path("anywhere/2.png")) == "2.png"
-    with pytest.raises(InputError):
-        name_in_model(model, Path("/photos/1.png"))
-    with pytest.raises(InputError):
-        name_in_model(model, Path("/photos/9.png"))
+    for name in ("1.png", "9.png"):
+        with pytest.raises(InputError):
+            name_in_model(model, Path("/photos") / name)
 
 
 def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
@@ -97,9 +93,7 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
         "# comment\n\n7 1 2 3 9 8 7 0.5 1 0 2 0\n8 4 5 6 9 8 7 1\n"
     )
     model = read_model(tmp_path)
-    assert model.points["xyz"].tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert model.points["error"].tolist() == [0.5, 1]
-    assert model.points["track"].tolist() == [2, 0]
+    assert columns(model) == ([7, 8], [[1, 2, 3], [4, 5, 6]], [0.5, 1], [2, 0])
     assert model.images["b.png"].points.tolist() == [1, 2, 3]
     assert model.images["b.png"].pose.translation.tolist() == [0.1, 0, 0]
 

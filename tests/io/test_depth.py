@@ -51,7 +51,6 @@ def test_float_formats_give_back_every_known_depth_exactly(
     again = read_depth(path)
     assert again.values.dtype == np.float32
     assert np.array_equal(again.values, known)
-    assert not again.reading.assumed
 
 
 @settings(max_examples=60, deadline=None)
@@ -69,26 +68,18 @@ def test_png_gives_back_every_code_and_its_scale(
     again = read_depth(path)
     assert np.array_equal(again.values, depth)
     assert (again.reading.scale, again.reading.assumed) == (scale, False)
-    assert again.reading.source.endswith("(from the file)")
 
 
-def test_other_programs_read_what_is_written_of_any_memory_layout_and_case_of_the_suffix(
-    tmp_path: Path,
-) -> None:
+def test_other_programs_read_what_is_written_of_any_memory_layout(tmp_path: Path) -> None:
     depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)[::-1].T
-    for suffix in DEPTH_SUFFIXES:
-        first, second = tmp_path / f"d{suffix}", tmp_path / f"another{suffix.upper()}"
-        write_depth(first, depth)
-        write_depth(second, np.ascontiguousarray(depth))
-        assert first.read_bytes() == second.read_bytes()
-        assert np.array_equal(read_depth(second).values, depth)
-    for suffix in (".tif", ".pfm"):
+    for suffix in FLOAT_SUFFIXES:
+        write_depth(tmp_path / f"d{suffix.upper()}", depth)
+    for suffix in (".TIF", ".PFM"):
         other = cv2.imread(str(tmp_path / f"d{suffix}"), cv2.IMREAD_UNCHANGED)
         assert np.array_equal(other, depth)
-    assert np.array_equal(np.load(tmp_path / "d.npz")["depth"], depth)
-    with OpenEXR.File(str(tmp_path / "d.exr"), separate_channels=True) as file:
-        assert list(file.channels()) == ["Z"]
-        assert file.channels()["Z"].pixels.dtype == np.float32
+    assert np.array_equal(np.load(tmp_path / "d.NPZ")["depth"], depth)
+    with OpenEXR.File(str(tmp_path / "d.EXR"), separate_channels=True) as file:
+        assert np.array_equal(file.channels()["Z"].pixels, depth)
         assert file.header()["compression"] == OpenEXR.ZIP_COMPRESSION
 
 
@@ -98,8 +89,7 @@ ONE = [[1.0]]
 @pytest.mark.parametrize(
     ("name", "depth", "scale", "error"),
     [
-        ("d.png", [[1, 65.535]], 1000, OutputError),
-        ("d.png", [[1, 1e30]], 256, OutputError),
+        *(("d.png", [[1, large]], 1000, OutputError) for large in (65.535, 1e30)),
         ("d.png", [[1, 1e-3, 1e-4]], 256, OutputError),
         *(("d.png", ONE, s, UsageError) for s in (0, np.nan)),
         *((name, ONE, 256, OutputError) for name in ("d.jpg", "d")),
@@ -118,17 +108,10 @@ FLOAT = Reading("PFM", None, False)
 BY_256, BY_1000 = (Reading("PNG", scale, False) for scale in (256.0, 1000.0))
 
 
-def test_a_ratio_that_no_wrong_scale_gives_needs_no_word_and_an_assumed_one_is_an_error() -> None:
-    for ratio in (np.nan, 0, 1, 2, 3.906 * 1.11, 3.906 / 1.11):
-        assert scale_warning("depths", ratio, {"--scale": BY_256, "--gt-scale": BY_256}) is None
-    kinds = {"--scale": FLOAT, "--gt-scale": BY_256._replace(assumed=True)}
-    with pytest.raises(InputError):
-        scale_warning("depths", 3.9, kinds)
-
-
 @pytest.mark.parametrize(
     ("ratio", "depth", "truth", "advice"),
     [
+        *((r, BY_256, BY_256, "None") for r in (np.nan, 0, 1, 2, 3.906 * 1.11, 3.906 / 1.11)),
         (4.2, BY_256, FLOAT, "--scale 1000 (now 256)"),
         (0.256, FLOAT, BY_256, "--gt-scale 1000 (now 256)"),
         (0.001, BY_1000, None, "--scale 1 (now 1000)"),
@@ -139,6 +122,10 @@ def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
     ratio: float, depth: Reading, truth: Reading | None, advice: str
 ) -> None:
     assert advice in str(scale_warning("depths", ratio, {"--scale": depth, "--gt-scale": truth}))
+    kinds = {"--scale": depth._replace(assumed=True), "--gt-scale": truth}
+    if depth.scale and advice != "None":
+        with pytest.raises(InputError):
+            scale_warning("depths", ratio, kinds)
 
 
 def test_the_range_has_count_and_ends_and_says_how_to_change_an_assumed_scale() -> None:
@@ -149,42 +136,31 @@ def test_the_range_has_count_and_ends_and_says_how_to_change_an_assumed_scale() 
     assert "--depth-scale 1000" in describe_range(np.array([3.125, 13.28]), assumed)
 
 
-SIZE = (10, 20)
-ROWS = [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]
-IMAGE = np.array([[0, 2, 0, 0], [3, 0, 0, 4]], dtype=np.float32)
+SIZE, ROWS = (10, 20), [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]
 
 
 def rows_of(path: Path) -> list[list[float]]:
     points = read_sparse(path, size=SIZE)[0]
-    assert points.size == SIZE
-    return np.column_stack([points.xy, points.depth]).tolist()
+    assert (points.xy.dtype, points.depth.dtype) == (np.float32, np.float32)
+    return [*np.column_stack([points.xy, points.depth]).tolist(), list(points.size)]
 
 
-def test_an_image_gives_its_known_pixels_row_by_row(tmp_path: Path) -> None:
-    write_depth(tmp_path / "s.png", IMAGE)
-    write_depth(tmp_path / "s.exr", IMAGE)
-    for name in ("s.png", "s.exr"):
-        sparse, reading = read_sparse(tmp_path / name)
-        assert sparse.xy.tolist() == [[1, 0], [0, 1], [3, 1]]
-        assert sparse.depth.tolist() == [2, 3, 4]
-        assert (sparse.xy.dtype, sparse.depth.dtype) == (np.float32, np.float32)
-        assert sparse.size == (2, 4)
-        assert not reading.assumed
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_an_image_gives_its_known_pixels_row_by_row(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"s{suffix}"
+    write_depth(path, np.array([[0, 2, 0, 0], [3, 0, 0, 4]], np.float32))
+    assert rows_of(path) == [[1, 0, 2], [0, 1, 3], [3, 1, 4], [2, 4]]
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".txt"])
 def test_an_array_of_rows_is_a_list_and_rows_that_are_no_numbers_are_counted(
-    tmp_path: Path,
+    tmp_path: Path, suffix: str
 ) -> None:
     wrong = [[np.nan, 2, 3], [1, np.inf, 3], [1, 1, np.nan], [1, 1, -2], [1, 1, 0]]
-    rows = np.array([*ROWS, *wrong], np.float32)
-    np.save(tmp_path / "s.npy", rows)
-    np.savez(tmp_path / "s.npz", rows.astype(np.float64))
-    np.savetxt(tmp_path / "s.txt", rows)
-    for name in ("s.npy", "s.npz", "s.txt"):
-        assert rows_of(tmp_path / name) == ROWS
-        reading = read_sparse(tmp_path / name, size=SIZE)[1]
-        assert reading.source.startswith("point list")
-        assert "without 5 rows" in reading.source
+    save = {".npy": np.save, ".npz": np.savez, ".txt": np.savetxt}[suffix]
+    save(tmp_path / f"s{suffix}", np.array([*ROWS, *wrong]))
+    assert rows_of(tmp_path / f"s{suffix}") == [*ROWS, list(SIZE)]
+    assert "without 5 rows" in read_sparse(tmp_path / f"s{suffix}", size=SIZE)[1].source
 
 
 @pytest.mark.parametrize(
@@ -200,10 +176,10 @@ def test_common_ways_of_writing_rows_are_read_and_unknown_depth_is_dropped(
     tmp_path: Path, text: str
 ) -> None:
     (tmp_path / "s.csv").write_text(text, encoding="utf-8", newline="")
-    assert rows_of(tmp_path / "s.csv") == ROWS
+    assert rows_of(tmp_path / "s.csv") == [*ROWS, list(SIZE)]
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".txt", ".csv"])
+@pytest.mark.parametrize("suffix", [".npy", ".csv"])
 def test_rows_are_of_a_scan_or_of_pixels_by_their_content_whatever_the_format(
     tmp_path: Path, suffix: str
 ) -> None:
@@ -222,10 +198,8 @@ def test_rows_are_of_a_scan_or_of_pixels_by_their_content_whatever_the_format(
 @pytest.mark.parametrize(
     ("name", "content", "error"),
     [
-        ("s.csv", "1 2 3\n4 5\n", FileFormatError),
-        ("s.csv", "1 2 3 4\n", FileFormatError),
-        ("s.csv", "u v w\n1 2 3\n", FileFormatError),
-        ("s.csv", "1,5;2,5;3,5\n", FileFormatError),
+        *(("s.csv", text, FileFormatError) for text in ("1 2 3\n4 5\n", "1 2 3 4\n", "1 2\n3 4\n")),
+        *(("s.csv", text, FileFormatError) for text in ("u v w\n1 2 3\n", "1,5;2,5;3,5\n")),
         ("s.csv", "1 2 3\n", SizeError),
         ("none.csv", None, InputError),
         ("s.npy", [[1, 1, 2]], FileFormatError),

@@ -28,9 +28,8 @@ def test_all_bits_are_kept_alpha_is_dropped_and_grey_is_repeated(
     tmp_path: Path, suffix: str, colours: np.ndarray
 ) -> None:
     path, top = tmp_path / f"a{suffix}", np.float32(np.iinfo(colours.dtype).max)
-    blue_first = colours[:, :, ::-1]
-    alpha = np.concatenate([blue_first, np.zeros_like(colours[:, :, :1])], axis=2)
-    for pixels in (blue_first, alpha) if suffix == ".png" else (blue_first,):
+    alpha = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)
+    for pixels in (alpha[:, :, :3], alpha) if suffix == ".png" else (alpha[:, :, :3],):
         cv2.imwrite(str(path), pixels)
         assert np.array_equal(read_rgb(path).values, colours.astype(np.float32) / top)
     cv2.imwrite(str(path), colours[:, :, :1])

@@ -28,8 +28,7 @@ def pcd_bytes(points: NDArray[np.float32], stored: str = "binary") -> bytes:
     )
     if stored == "ascii":
         return (header + "".join(f"7 {x:.9g} {y:.9g} {z:.9g} 0 1\n" for x, y, z in points)).encode()
-    layout = np.dtype([("i", "u1"), ("p", "<f4", 3), ("n", "<f4", 2)])
-    rows = np.zeros(n, layout)
+    rows = np.zeros(n, [("i", "u1"), ("p", "<f4", 3), ("n", "<f4", 2)])
     rows["p"] = points
     return header.encode() + rows.tobytes()
 
@@ -38,18 +37,12 @@ def compressed_pcd_bytes(points: NDArray[np.float32]) -> bytes:
     """The same fields one after the other, as LZF: literals, but for n, which copies itself."""
     header = pcd_bytes(points).partition(b"DATA")[0] + b"DATA binary_compressed\n"
     literal = bytes(len(points)) + points.T.astype("<f4").tobytes()
-    packed = b"".join(
-        bytes([len(part) - 1]) + part
-        for part in (literal[at : at + 32] for at in range(0, len(literal), 32))
-    )
+    parts = [literal[at : at + 32] for at in range(0, len(literal), 32)]
+    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
     packed += b"\x00\x00"  # one byte of n; the others are copies from one byte back
-    left = 8 * len(points) - 1
-    while left:
-        length = min(left, 250)
-        packed += bytes([7 << 5, length - 9, 0])
-        left -= length
-    claimed = len(points) * (1 + 12 + 8)
-    return header + struct.pack("<II", len(packed), claimed) + packed
+    for at in range(0, 8 * len(points) - 1, 250):
+        packed += bytes([7 << 5, min(8 * len(points) - 1 - at, 250) - 9, 0])
+    return header + struct.pack("<II", len(packed), len(points) * (1 + 12 + 8)) + packed
 
 
 def ply_bytes(points: NDArray[np.float32], stored: str = "binary_little_endian") -> bytes:
@@ -60,12 +53,11 @@ def ply_bytes(points: NDArray[np.float32], stored: str = "binary_little_endian")
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     )
     if stored == "ascii":
-        rows = "".join(f"9 {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in points)
-        return (header + rows + "3 0 1 2\n").encode()
-    order = "<" if "little" in stored else ">"
-    rows_ = np.zeros(len(points), np.dtype([("r", "u1"), ("p", f"{order}f8", 3)]))
-    rows_["p"] = points
-    return header.encode() + rows_.tobytes() + b"\x03" + bytes(12)
+        text = "".join(f"9 {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in points)
+        return (header + text + "3 0 1 2\n").encode()
+    rows = np.zeros(len(points), [("r", "u1"), ("p", f"{'<' if 'little' in stored else '>'}f8", 3)])
+    rows["p"] = points
+    return header.encode() + rows.tobytes() + b"\x03" + bytes(12)
 
 
 def npy_bytes(points: NDArray[np.float32], dtype: type = np.float64) -> bytes:
@@ -109,9 +101,8 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
     for word in (b"POINTS", b"vertex"):
         lie = lie.replace(word + b" 37\n", word + f" {count}\n".encode())
     (tmp_path / name).write_bytes(lie)
-    with pytest.raises(FileFormatError) as error:
+    with pytest.raises(FileFormatError):
         read_scan(tmp_path / name)
-    assert len(str(error.value)) < 300
 
 
 @pytest.mark.parametrize(

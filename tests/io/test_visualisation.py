@@ -19,16 +19,12 @@ from pnpdepth_cli.io.visualisation import (
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
 
 
-def pixels_of(path: Path) -> np.ndarray:
-    with Image.open(path) as image:
-        image.load()
-        return np.asarray(image)
-
-
 def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
     """The panels of a figure by title."""
-    pixels, boxes = pixels_of(path), content.panels
-    return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in boxes.items()}
+    with Image.open(path) as image:
+        pixels = np.asarray(image)
+    assert content.size == pixels.shape[1::-1]
+    return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in content.panels.items()}
 
 
 def scene(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,21 +36,16 @@ def scene(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rgb, depth, xy.astype(np.float32)
 
 
-def at(depth: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    columns, rows = xy.astype(int).T
-    return depth[rows, columns]
-
-
 @pytest.mark.parametrize(("height", "width", "columns"), [(60, 80, 2), (37, 124, 1), (10, 1700, 1)])
 def test_a_preview_has_its_panels_in_columns_and_depth_in_the_colours_of_one_scale(
     tmp_path: Path, height: int, width: int, columns: int
 ) -> None:
     rgb, depth, xy = scene(height, width)
-    path, before = tmp_path / "p.png", depth * 1.2
-    content = preview(rgb, xy, at(depth, xy), before, depth, path)
-    panels, page = panels_of(path, content), pixels_of(path)
-    scale = depth_scale(at(depth, xy), before, depth)
-    assert (content.size, page.shape[1] <= 1600) == (page.shape[1::-1], True)
+    columns_of, rows_of = xy.astype(int).T
+    path, before, sparse = tmp_path / "p.png", depth * 1.2, depth[rows_of, columns_of]
+    content = preview(rgb, xy, sparse, before, depth, path)
+    panels, scale = panels_of(path, content), depth_scale(sparse, before, depth)
+    assert content.size[0] <= 1600
     assert content.scale_m == (scale.low_m, scale.high_m)
     assert list(panels) == ["Image", "Sparse depth", "Depth before", "Depth after", "Change"]
     assert len({left for left, *_ in content.panels.values()}) == columns
