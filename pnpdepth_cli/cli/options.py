@@ -13,7 +13,7 @@ import click
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice, RefineRequest
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
 FILE = click.Path(path_type=Path)

@@ -25,7 +25,7 @@ from pnpdepth_cli.commands.refinement.refine_request import (
     RefineRequest,
     parse_sample,
 )
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
+from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
 from pnpdepth_cli.settings import Settings
 

@@ -12,7 +12,7 @@ from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import say
 from pnpdepth_cli.commands.refinement.refine_request import parse_sample
 from pnpdepth_cli.commands.requests import FramesRequest
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 
 
 @click.command(short_help="Project a LiDAR scan into a camera image.")

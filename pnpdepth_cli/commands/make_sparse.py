@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.dataset.arrays import check_size, record_of
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import plausible_map
-from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern

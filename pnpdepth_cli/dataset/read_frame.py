@@ -19,10 +19,14 @@ from pnpdepth_cli.dataset.arrays import (
     read_image,
     record_of,
 )
-from pnpdepth_cli.dataset.frame_files import SCAN_ONLY_SUFFIXES, FrameFiles
+from pnpdepth_cli.dataset.frame_files import (
+    SCAN_ONLY_SUFFIXES,
+    FrameFiles,
+    ReadOptions,
+    ScanOptions,
+)
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.dataset.sparse_depth import (
     SparseDepth,

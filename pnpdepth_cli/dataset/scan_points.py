@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import scan_returns
-from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord

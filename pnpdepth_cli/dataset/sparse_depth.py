@@ -16,8 +16,8 @@ from pnpdepth_cli.dataset.arrays import (
     read_levels,
     record_of,
 )
+from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_values
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (

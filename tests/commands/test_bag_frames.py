@@ -17,8 +17,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames, unpack
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import FramesRequest
-from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs

@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.make_sparse import (
     sample_depth,
     simulate_scan,
 )
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.errors import (
     OutputError,
     PnpDepthError,

@@ -18,9 +18,8 @@ from PIL import Image
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.make_sparse import sample_depth
-from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame

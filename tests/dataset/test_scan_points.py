@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.scan_points import check_direction, choose_camera, read_scan_points
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from tests.io.test_scans import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.dataset.arrays import camera_of_file
+from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.dataset.layouts import list_frames
-from pnpdepth_cli.dataset.read_options import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
 from pnpdepth_cli.io.depth import read_depth

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.io.report import VIEWER
 from tests.commands.batches import add_frame, batch, pairs_on_disk
 from tests.commands.report_pages import frames_of

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
-from pnpdepth_cli.dataset.read_options import ReadOptions
+from pnpdepth_cli.dataset.frame_files import ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol

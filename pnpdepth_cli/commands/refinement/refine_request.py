@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.read_options import ReadOptions
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.settings import Settings, option

@@ -10,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
-from pnpdepth_cli.dataset.read_options import ScanOptions
 from pnpdepth_cli.errors import (
     InputError,
     LayerError,

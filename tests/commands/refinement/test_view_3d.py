@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.outputs import _rays
-from pnpdepth_cli.dataset.read_options import ScanOptions
+from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.lens import rays_of

@@ -14,10 +14,9 @@ from pnpdepth_cli.commands.batch.find_frames import request_of
 from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
-from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.dataset.read_options import ReadOptions
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import ODOMETRY_PART
