@@ -60,9 +60,7 @@ def points_of(frame: FrameFiles) -> Points:
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_becomes_frames_with_a_calibration(
-    kind: str, compressed: bool, tmp_path: Path
-) -> None:
+def test_a_bag_becomes_calibrated_frames(kind: str, compressed: bool, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / kind, compressed=compressed)
     written(bag, tmp_path / "frames")
     topic = f"{IMAGES}/compressed" if compressed else IMAGES
@@ -88,9 +86,7 @@ def test_a_bag_becomes_frames_with_a_calibration(
 
 @pytest.mark.parametrize("compressed", ["", "; compressedDepth"])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_depth_images_of_a_bag_are_sparse_depth(
-    encoding: str, compressed: str, tmp_path: Path
-) -> None:
+def test_depth_images_are_sparse_depth(encoding: str, compressed: str, tmp_path: Path) -> None:
     depth, error = depth_m(), 0.004 if encoding + compressed == "32FC1; compressedDepth" else 1e-6
     bag = write_bag(tmp_path / "ros1.bag", depth=encoding + compressed)
     written(bag, tmp_path / "same")
@@ -110,7 +106,7 @@ def test_depth_images_of_a_bag_are_sparse_depth(
     assert (x.min(), y.min(), len(points)) == pytest.approx((0.25, 10, 38 * 63), abs=0.01)
 
 
-def test_a_batch_takes_a_bag_and_writes_its_frames_once(
+def test_a_batch_writes_the_frames_of_a_bag_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag, frame = write_bag(tmp_path / "drive.mcap"), frame_on_disk(tmp_path)
@@ -138,9 +134,7 @@ def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path
 
 
 @pytest.mark.parametrize("clock_s", [-1_699_999_000.5, -2.0])
-def test_two_clocks_are_brought_together_by_the_log_and_that_is_said(
-    clock_s: float, tmp_path: Path
-) -> None:
+def test_the_log_brings_two_clocks_together(clock_s: float, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "ros1.bag", clock_s=clock_s)
     messages = written(bag, tmp_path / "frames", tolerance=0.01)
     assert any("--clock-offset" in message for message in messages)
@@ -167,9 +161,7 @@ def test_a_bag_without_calibration_gets_a_note_that_names_it(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("topic", "focal_px"), [("/front/image_rect_color", RECTIFIED_PX), (IMAGES, FOCAL_PX)]
 )
-def test_images_of_a_bag_are_rectified_by_their_topic(
-    topic: str, focal_px: float, tmp_path: Path
-) -> None:
+def test_images_are_rectified_by_their_topic(topic: str, focal_px: float, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "a.mcap", topic=topic, rectified=True)
     assert any(text.startswith("camera: ") for text in written(bag, tmp_path / "frames"))
     camera = read_calibration(tmp_path / "frames" / "calib.txt").camera
@@ -243,9 +235,7 @@ def test_the_camera_moves_as_the_body_that_it_is_fixed_to(kind: str, tmp_path: P
     assert read_json(tmp_path / "frames/frames.json")["poses"] == "/odom"
 
 
-def test_a_pose_message_is_the_cameras_own_and_without_a_link_none_are_written(
-    tmp_path: Path,
-) -> None:
+def test_a_pose_message_is_the_cameras_own(tmp_path: Path) -> None:
     written(write_bag(tmp_path / "drive.mcap", poses="pose"), tmp_path / "frames")
     rows = read_poses(tmp_path / "frames/poses.txt")
     np.testing.assert_allclose(rows[:, :, :3], [np.eye(3)] * 3, atol=1e-9)

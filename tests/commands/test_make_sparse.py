@@ -48,9 +48,7 @@ def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dic
 
 
 @pytest.mark.parametrize("suffix", [".csv", *DEPTH_SUFFIXES])
-def test_a_projected_scan_lands_where_it_was_made_to_in_every_format(
-    frame: ScanOnDisk, suffix: str
-) -> None:
+def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk, suffix: str) -> None:
     record = projected(frame, f"sparse{suffix}")
     assert record["size"] == [64, 48]
     assert record["points"] == {

@@ -108,14 +108,10 @@ def test_the_camera_is_kept_exactly_and_numbers_of_none_are_refused() -> None:
     "entry",
     [
         [],
-        None,
-        {"name": 1},
         {"status": "unknown"},
         {"points": {"farthest": 4.5}},
-        {"size": [64]},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
         {"inputs": {"sparse": {"path": "s.png", "sampled": {"kind": "none", "count": 1}}}},
-        {"camera": {"intrinsics": [1, 2]}},
         {"inputs": {"sparse": {"path": "s.png", "unit_scale": "x"}}},
     ],
 )

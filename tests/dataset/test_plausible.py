@@ -138,9 +138,7 @@ def test_a_scale_that_would_be_plausible_is_proposed(
 @pytest.mark.parametrize(
     "millimetres", [np.full(3, 2500.0), np.arange(200.0, 900.0)], ids=["far", "whole"]
 )
-def test_a_float_file_in_millimetres_stops_and_the_option_reads_it(
-    millimetres: np.ndarray,
-) -> None:
+def test_a_float_file_in_millimetres_stops_and_the_option_reads_it(millimetres: np.ndarray) -> None:
     with pytest.raises(InputError, match="--depth-scale 1000"):
         divisor_to_metres(millimetres, FLOAT, "x", "--depth-scale", None)
     assert divisor_to_metres(millimetres, FLOAT, "x", "--depth-scale", 1000.0)[0] == 1000

@@ -54,9 +54,7 @@ def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> FrameRecord:
     return run(frame, **(files | changes))
 
 
-def test_a_photo_with_exif_rotation_is_read_as_colmap_reads_it(
-    tmp_path: Path, project: Path
-) -> None:
+def test_a_turned_photo_is_read_as_colmap_reads_it(tmp_path: Path, project: Path) -> None:
     plain = refine(frame_on_disk(tmp_path), project)
     photo = project / "images" / "a.png"
     with Image.open(photo) as image:
@@ -127,9 +125,7 @@ def test_points_with_short_tracks_and_large_errors_are_dropped(project: Path) ->
 
 
 @pytest.mark.parametrize("tracks", ["", "2 0 3 0 4 0"])
-def test_all_points_that_nothing_hides_are_those_of_an_image_without_tracks(
-    tracks: str, project: Path
-) -> None:
+def test_an_image_without_tracks_has_all_visible_points(tracks: str, project: Path) -> None:
     # a fence of 12 × 9 points, 4 units ahead, and a wall of 11 × 8 points behind it
     x, y = np.meshgrid(np.arange(12) * 5 + 4.0, np.arange(9) * 5 + 4.0)
     front = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)])
@@ -148,9 +144,7 @@ def test_all_points_that_nothing_hides_are_those_of_an_image_without_tracks(
     assert any("no tracks" in note for note in sparse.notes)
 
 
-def test_points_behind_the_camera_are_counted_and_a_model_of_nothing_else_refused(
-    project: Path,
-) -> None:
+def test_points_behind_the_camera_are_counted_or_refused(project: Path) -> None:
     points = project / "sparse" / "0" / "points3D.txt"
     behind, beside, near, *others = points.read_text().splitlines(keepends=True)
     behind, beside, near = (

@@ -52,9 +52,7 @@ def at_x(x: float) -> tuple[tuple[float, ...], ...]:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_layout_is_guessed_from_its_folder_and_no_other_takes_it(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_layout_is_guessed_and_no_other_takes_it(name: str, tmp_path: Path) -> None:
     root = tmp_path / "set"
     make, names = MAKERS[name]
     make(root)
@@ -64,9 +62,7 @@ def test_a_layout_is_guessed_from_its_folder_and_no_other_takes_it(
     assert [other for other, layout in LAYOUTS.items() if layout.matches(root)] == [name]
 
 
-def test_pairs_may_lack_truth_and_calibration_and_what_is_in_no_frame_is_listed(
-    tmp_path: Path,
-) -> None:
+def test_pairs_may_lack_parts_and_files_of_no_frame_are_listed(tmp_path: Path) -> None:
     tree(tmp_path, TREES["pairs"][0])
     a, b = read_frames(tmp_path)
     assert (a.gt, a.calib) == (tmp_path / "gt/a.exr", tmp_path / "calib/a.json")
@@ -130,9 +126,7 @@ def test_kittis_depth_as_downloaded_pairs_annotated_velodyne_and_raw(tmp_path: P
 
 
 @pytest.mark.parametrize("start", [".", "2011_09_26", f"2011_09_26/{DRIVE}"])
-def test_a_raw_drive_has_its_calibration_and_the_annotated_depth(
-    start: str, tmp_path: Path
-) -> None:
+def test_a_raw_drive_has_calibration_and_annotated_depth(start: str, tmp_path: Path) -> None:
     tree(tmp_path, TREES["kitti-raw"][0])
     gt = tmp_path / "data_depth_annotated" / "val" / DRIVE / "proj_depth/groundtruth/image_02"
     touch(gt / "0000000005.png")
@@ -150,7 +144,7 @@ def poses_of_odometry(root: Path, *rows: str) -> None:
     (root / "poses/00.txt").write_text("\n".join(rows) + "\n")
 
 
-def test_the_odometrys_training_sequences_have_poses_by_frame_number(
+def test_odometry_has_poses_by_frame_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poses_of_odometry(tmp_path, *(f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in ("0.5", "1", "-1.5e-01")))
@@ -167,17 +161,13 @@ _ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
     ("rows", "named"),
     [("", "00.txt"), (_ROW, "000002.png"), (_ROW[2:], "00.txt"), ("nan" + _ROW[1:], "00.txt")],
 )
-def test_poses_that_are_not_twelve_numbers_a_frame_are_refused(
-    tmp_path: Path, rows: str, named: str
-) -> None:
+def test_poses_are_twelve_numbers_a_frame(tmp_path: Path, rows: str, named: str) -> None:
     poses_of_odometry(tmp_path, rows)
     with pytest.raises(InputError, match=named):
         read_frames(tmp_path)
 
 
-def test_tum_pairs_images_and_depth_that_are_nearest_within_two_hundredths_of_a_second(
-    tmp_path: Path,
-) -> None:
+def test_tum_pairs_images_and_depth_that_are_nearest_in_time(tmp_path: Path) -> None:
     tum(tmp_path)
     with (tmp_path / "rgb.txt").open("a") as file:
         file.write("1.04 rgb/1.04.png\n5 rgb/5.png\n6 rgb/6.png\n")  # 1.033 s is nearer to 1.030 s
@@ -252,9 +242,7 @@ def test_the_low_resolution_depth_of_arkitscenes_keeps_its_points(tmp_path: Path
     assert (len(points), points.xy[0].tolist()) == (HEIGHT * WIDTH // 16, [1.5, 1.5])
 
 
-def test_the_points_of_eth3ds_model_are_sparse_depth_of_its_undistorted_images(
-    tmp_path: Path,
-) -> None:
+def test_eth3ds_model_is_sparse_depth_of_its_undistorted_images(tmp_path: Path) -> None:
     photo = tmp_path / "images/dslr_images_undistorted/DSC_0219.JPG"
     image(photo)
     model = tmp_path / "dslr_calibration_undistorted"
@@ -334,7 +322,7 @@ def test_a_frame_that_is_smaller_than_its_part_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("make", "confident"), [(stray_scanner, 0.75), (record3d, 1.0)])
-def test_a_phones_recording_has_metres_camera_pose_and_confident_points(
+def test_a_phones_recording_is_a_frame(
     make: Callable[[Path], None], confident: float, tmp_path: Path
 ) -> None:
     make(tmp_path)

@@ -62,9 +62,7 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
         ("image\ni\0.png\n", "no file can have this name"),
     ],
 )
-def test_a_line_of_a_manifest_that_means_nothing_is_named(
-    tmp_path: Path, text: str, message: str
-) -> None:
+def test_a_line_that_means_nothing_is_named(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError) as error:
         read_frames(manifest(tmp_path, text))
     assert message in str(error.value)
@@ -116,8 +114,6 @@ def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
         ("x/" + "é" * 120, "is longer than 239 bytes"),
     ],
 )
-def test_a_name_that_leads_elsewhere_or_is_none_of_a_file_has_no_results(
-    name: str, problem: str
-) -> None:
+def test_a_name_that_no_file_can_have_is_refused(name: str, problem: str) -> None:
     assert problem in (name_problem(name) or "")
     assert name_problem("n" * 239) is None
