@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -21,9 +19,6 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint, read_json, write_json
-
-if TYPE_CHECKING:
-    from pnpdepth_cli.frames.frame import Frame
 
 MOST_FRAMES = 64
 """Frames of a sequence that are learnt from, spread over it."""
@@ -83,11 +78,7 @@ def _learn_once(
     return why
 
 
-def _learn(
-    lessons: Sequence[RefineRequest],
-    path: Path,
-    listener: Listener,
-) -> str | None:
+def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> str | None:
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
     from safetensors.torch import save_file  # these import torch
 
@@ -100,22 +91,16 @@ def _learn(
         if listener.stopped():
             raise KeyboardInterrupt
 
-    def read() -> Iterator[tuple[str, Frame]]:
-        for each in lessons:
-            check()
-            yield each.files.name, read_requested(each)
-
     # The network learns from the frames, if they are enough.
-    frames = read()
-    name, first = next(frames)
+    first = read_requested(lessons[0])
     if why := too_little(len(lessons), first):
         return why
     choice = lessons[0].network
     network = load_network(choice.model, choice.checkpoint, choice.device)
     network = resolve_definition(network, first.registered())
-    frames, seed = itertools.chain([(name, first)], frames), lessons[0].method.seed
+    frames = ((each.files.name, read_requested(each)) for each in lessons)
     try:
-        learnt = learn(network, frames, seed=seed, on_step=check)
+        learnt = learn(network, frames, seed=lessons[0].method.seed, on_step=check)
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"

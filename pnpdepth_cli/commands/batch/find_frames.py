@@ -219,33 +219,26 @@ def _files_to_read(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
 def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     """Yields the files that are read for a frame, with their part."""
     files, scan = request.files, request.reading.scan
-    # The frame's own.
-    parts = [("image", files.image), ("sparse", files.sparse), ("gt", files.gt)]
-    parts += [("sparse mask", files.sparse_mask)] if files.sparse is not None else []
-    for part, source in parts:
-        path = None if source is None else file_of(source)
-        if path is not None and part == "sparse" and path.is_dir():  # a COLMAP model
-            yield from ((f"sparse {file.name}", file) for file in model_files(path))
-        elif path is not None:
-            yield part, path
+    sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
+    if files.sparse is not None:
+        sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.
     for each in files.neighbours:
-        points, image = each.files.sparse or each.files.gt, each.files.image
-        if points is not None:
-            path = file_of(points)
-            yield f"sparse of {path.stem}", path
-            if each.motion is None and image is not None:
-                yield f"image of {path.stem}", file_of(image)
+        if (points := each.files.sparse or each.files.gt) is not None:
+            sources[f"sparse of {points.stem}"] = points
+            sources[f"image of {points.stem}"] = each.files.image if each.motion is None else None
     # Masks, and what calibrates the camera.
     if files.gt is not None:
-        yield from ((f"mask {number}", path) for number, path in enumerate(files.masks))
-    if scan.extrinsics is not None:
-        yield "extrinsics", scan.extrinsics
-    calib = scan.over(files).calib
-    if calib is not None and calib.is_dir():
-        yield from ((f"calib {path.name}", path) for path in sorted(calib.glob("calib_*.txt")))
-    elif calib is not None:
-        yield "calib", calib
+        sources |= {f"mask {number}": path for number, path in enumerate(files.masks)}
+    sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}
+    # Of a folder, a COLMAP model or KITTI's calibrations, each file.
+    for part, source in sources.items():
+        path = None if source is None else file_of(source)
+        if path is not None and path.is_dir():
+            inside = model_files(path) if part == "sparse" else sorted(path.glob("calib_*.txt"))
+            yield from ((f"{part} {file.name}", file) for file in inside)
+        elif path is not None:
+            yield part, path
 
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:

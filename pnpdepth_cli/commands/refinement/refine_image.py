@@ -22,7 +22,6 @@ from pnpdepth_cli.commands.refinement.outputs import (
 )
 from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
 from pnpdepth_cli.commands.tables import names_of_depths
-from pnpdepth_cli.completion.baselines import Baseline
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset.frame_record import (
@@ -56,7 +55,7 @@ def refine_image(request: RefineRequest) -> FrameRecord:
         request: Files, network and settings of the refinement.
 
     Raises:
-        PnpDepthError: Any of its kinds; then nothing is written.
+        PnpDepthError: What was asked for is at fault; then nothing is written.
     """
     seconds = dict[str, float]()
     outputs = plan_outputs(request)
@@ -228,9 +227,8 @@ def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[
     # Against the truth, all others are scored on the pixels where the result is known.
     if gt is not None:
         if with_baselines:
-            before, given = torch.from_numpy(refined.before), frame.points
-            depths = _each_baseline(lambda baseline: baseline(given, before))
-            beside |= {name: depth.numpy() for name, depth in depths if name != LINEAR}
+            others = _other_baselines(frame.points, torch.from_numpy(refined.before))
+            beside |= {name: depth.numpy() for name, depth in others}
         known = np.where(refined.after > 0, gt, np.float32(0))
         stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
         errors[GT] = {
@@ -256,11 +254,12 @@ def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:
     return float((known > 0).mean()) if known.size else None
 
 
-def _each_baseline(predict: Callable[[Baseline], Tensor]) -> Iterator[tuple[str, Tensor]]:
-    """The prediction of each baseline that does not fail on the frame."""
+def _other_baselines(points: SparsePoints, before: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """The prediction of each baseline but the linear one that does not fail on the frame."""
     for name, baseline in BASELINES.items():
         with suppress(ModelError):  # such as a line through points that are all equally far
-            yield name, predict(baseline)
+            if name != LINEAR:
+                yield name, baseline(points, before)
 
 
 def _scores(depth: DepthMap, gt: DepthMap) -> Scores:
@@ -288,7 +287,6 @@ def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
         return {}
     predicted, count = dict(validation.predicted), len(validation.points)
     if with_baselines:
-        kept, network = validation.kept, validation.network
-        others = _each_baseline(lambda baseline: baseline(kept, network))
-        predicted |= {name: validation.points.sample(d) for name, d in others if name != LINEAR}
+        others = _other_baselines(validation.kept, validation.network)
+        predicted |= {name: validation.points.sample(depth) for name, depth in others}
     return {name: {"mae": validation.error(at), "points": count} for name, at in predicted.items()}
