@@ -25,8 +25,12 @@ NAMES = ("a", "b", "c", "d")
 class RecordingListener:
     """Keeps the messages and records of a batch."""
 
-    def __init__(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        self.stopped = stopped
+    def __init__(
+        self,
+        stopped: Callable[[], bool] = lambda: False,
+        on_frame: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.stopped, self._on_frame = stopped, on_frame
         self.messages: list[str] = []
         self.records: list[FrameRecord] = []
         self.to_do = 0
@@ -39,6 +43,7 @@ class RecordingListener:
 
     def frame(self, record: FrameRecord) -> None:
         self.records.append(record)
+        self._on_frame()
 
     @property
     def names(self) -> list[str]:

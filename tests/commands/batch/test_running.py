@@ -6,7 +6,7 @@ import os
 import shutil
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import pytest
 
 from pnpdepth_cli.commands.batch.batch_request import parse_address
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
-from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
@@ -54,24 +53,16 @@ def root(frames: Path) -> Iterator[Path]:
     shutil.rmtree(frames / "out", ignore_errors=True)
 
 
-class Doing(RecordingListener):
-    """Does something at a record."""
-
-    def __init__(self, number: int, what: Callable[[], Any]) -> None:
-        super().__init__()
-        self._number, self._what = number, what
-
-    def frame(self, record: FrameRecord) -> None:
-        super().frame(record)
-        if len(self.records) == self._number:
-            self._what()
-
-
 @pytest.mark.slow
 @on_a_cluster
 def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
     lost = cluster.worker_nodes.copy().pop()
-    listener = Doing(2, lambda: cluster.remove_node(lost, allow_graceful=False))
+
+    def lose() -> None:
+        if len(listener.records) == 2:
+            cluster.remove_node(lost, allow_graceful=False)
+
+    listener = RecordingListener(on_frame=lose)
     result = batch(root, listener, ray=cluster.address)
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead

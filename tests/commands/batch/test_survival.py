@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError, StorageError
 from pnpdepth_cli.io import atomic
 from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, results
@@ -50,15 +49,13 @@ def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(
     root = pairs_on_disk(tmp_path / "drive", NAMES[:2])
     inner = RecordingListener()
 
-    class Beside(RecordingListener):
-        def frame(self, record: FrameRecord) -> None:
-            super().frame(record)
-            for shard in ((1, 2), None):
-                with pytest.raises(OutputError, match="another batch"):
-                    batch(root, shard=shard)
-            batch(root, inner, shard=(2, 2))
+    def run_others() -> None:
+        for shard in ((1, 2), None):
+            with pytest.raises(OutputError, match="another batch"):
+                batch(root, shard=shard)
+        batch(root, inner, shard=(2, 2))
 
-    outer = Beside()
+    outer = RecordingListener(on_frame=run_others)
     counts = batch(root, outer, shard=(1, 2)).counts
     assert (outer.names, inner.names) == (["a"], ["b"])
     assert counts["done"] == 2
