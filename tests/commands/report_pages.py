@@ -60,11 +60,6 @@ def frames_of(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def images_of(folder: Path) -> dict[str, bytes]:
-    """Returns the images of a report by name."""
-    return {path.name: path.read_bytes() for path in sorted((folder / "images").iterdir())}
-
-
 def everything(folder: Path) -> dict[str, bytes]:
     """The files of a report by their names."""
     return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -30,17 +30,11 @@ from pnpdepth_cli.measures import MEASURES
 
 @pytest.mark.parametrize(
     ("before", "after", "text", "style"),
-    [
-        (None, 1.0, "–", "dim"),
-        (1.0, nan, "–", "dim"),
-        (0.0, 1.0, "–", "dim"),
-        (2, 2, "+0.0%", "dim"),
-        (1.0, 0.5, "-50.0%", "good"),
-        (1.0, 1.5, "+50.0%", "bad"),
-    ],
-)
+    [(1.0, nan, "–", "dim"), (0.0, 1.0, "–", "dim"), (2, 2, "+0.0%", "dim"),
+     (1.0, 0.5, "-50.0%", "good"), (1.0, 1.5, "+50.0%", "bad")],
+)  # fmt: skip
 def test_a_change_is_relative_and_coloured_by_whether_it_is_better(
-    before: float | None, after: float | None, text: str, style: str
+    before: float, after: float, text: str, style: str
 ) -> None:
     cell = change(before, after)
     assert (cell, cell.style) == (text, style)
@@ -172,16 +166,12 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -
         assert table.title.endswith("; without the pixels of sparse points")
 
 
-@pytest.mark.parametrize(
-    ("weights", "after"),
-    [
-        ({"net": 1.0}, "net, residual propagated"),
-        ({"net": 0.0, "compact": 1.0}, "fused (compact 100%)"),
-        ({"net": 0.25, "compact": 0.75}, "fused (net 25%, compact 75%)"),
-    ],
-)
-def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part(
-    weights: dict[str, float], after: str
-) -> None:
-    record = record_of("net", "compact", weights=weights)
-    assert names_of_depths(record) == ("net, aligned with the points", after)
+def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
+    afters = {
+        (1.0, 0.0): "net, residual propagated",
+        (0.0, 1.0): "fused (compact 100%)",
+        (0.25, 0.75): "fused (net 25%, compact 75%)",
+    }
+    for (net, compact), after in afters.items():
+        record = record_of("net", "compact", weights={"net": net, "compact": compact})
+        assert names_of_depths(record) == ("net, aligned with the points", after)

@@ -18,7 +18,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
 from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, refinement
-from tests.commands.report_pages import everything, frames_of, images_of, page_data
+from tests.commands.report_pages import everything, frames_of, page_data
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_the_page_links_the_panels_that_a_frames_record_names_and_shows_their_er
     assert values["mae_change"] != 0
 
 
-def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_drawn_again(
+def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what_changed(
     root: Path, report: Path
 ) -> None:
     answers = iter([False, True, True, True])
@@ -74,27 +74,23 @@ def test_what_runs_before_and_what_was_lost_is_in_the_next_report_without_being_
     batch(root, html=report, shard=(1, 2))  # a and c
     shutil.rmtree(report)
     assert done(root, html=report) == ["b", "d"]
-    before = everything(report)
-    missing = report / "images" / f"{frames_of(report)['b']['key']}_preview.png"
-    drawn = {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
-    missing.unlink()
+    before, key = everything(report), {n: f["key"] for n, f in frames_of(report).items()}
+    (report / "images" / f"{key['b']}_preview.png").unlink()
     batch(root, html=report)
     assert before == everything(report)
-    assert drawn == {p: p.stat().st_mtime_ns for p in (report / "images").iterdir()}
 
-
-def test_a_frame_that_is_redone_has_new_images_and_one_that_is_gone_has_none(
-    root: Path, report: Path
-) -> None:
-    batch(root, html=report)
-    before, key = images_of(report), {n: f["key"] for n, f in frames_of(report).items()}
+    # a frame that is redone has new images, one that is gone has none, and a lost one stays lost
     cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
     (root / "rgb/d.png").unlink()
-    batch(root, html=report)
-    after = images_of(report)
-    changed = {name.partition("_")[0] for name in after if before[name] != after[name]}
-    assert changed == {key["a"]}
-    assert {name.partition("_")[0] for name in before.keys() - after.keys()} == {key["d"]}
+    (root / "out/b_preview.png").unlink()
+    assert done(root, html=report) == ["a"]
+    after, frames = everything(report), frames_of(report)
+    images = {name: name.partition("_")[0] for name in before if name.endswith(".png")}
+    assert {own for name, own in images.items() if name not in after} == {key["b"], key["d"]}
+    left = images.keys() & after.keys()
+    assert {images[name] for name in left if before[name] != after[name]} == {key["a"]}
+    assert (frames["b"]["key"], frames["c"]["key"]) == (None, key["c"])
+    assert frames["b"]["values"]["rmse_change"] is not None
 
 
 def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_are_stated(
@@ -159,37 +155,20 @@ def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
     assert {*frames_of(report)["a"]["values"].values()} == {None}
 
 
-def test_the_report_may_lie_in_the_results_and_the_results_among_the_frames(root: Path) -> None:
-    report = root / "out" / "report"
-    for _ in range(2):
-        batch(root, html=report)
-        assert tuple(frames_of(report)) == NAMES
-
-
-def test_outputs_inside_the_inputs_or_around_them_are_refused(root: Path, tmp_path: Path) -> None:
+def test_a_report_may_lie_in_the_results_but_holds_nothing_and_replaces_none_unasked(
+    root: Path, tmp_path: Path
+) -> None:
     for folder in (root / "rgb", root, root / "out", tmp_path):
         with pytest.raises(OutputError, match=re.escape(str(folder))):
             batch(root, html=folder, refine={"overwrite": True})
     assert not (root / "out").exists()
-
-
-def test_another_batchs_report_is_replaced_only_on_request(root: Path, report: Path) -> None:
-    batch(root, html=report)
+    report = root / "out" / "report"
+    for _ in range(2):
+        batch(root, html=report)
+        assert tuple(frames_of(report)) == NAMES
     before = everything(report)
     with pytest.raises(OutputError, match="--overwrite"):
         batch(root, output=root / "other", html=report)
     assert everything(report) == before
     batch(root, output=root / "other", html=report, refine={"overwrite": True})
     assert page_data(report)["title"].endswith("other")
-
-
-def test_an_image_that_was_deleted_is_not_made_again_and_the_report_does_without(
-    root: Path, report: Path
-) -> None:
-    batch(root)
-    (root / "out/b_preview.png").unlink()
-    assert done(root, html=report) == []
-    frames = frames_of(report)
-    assert frames["b"]["key"] is None
-    assert all(frames[name]["key"] for name in "acd")
-    assert frames["b"]["values"]["rmse_change"] is not None

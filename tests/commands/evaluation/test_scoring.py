@@ -15,38 +15,28 @@ from pnpdepth_cli.io.depth import write_depth
 
 RNG = np.random.default_rng(0)
 GT = RNG.uniform(1, 9, (40, 50)).astype(np.float32)
-WHERE = RNG.random(GT.shape) < 0.7
-"""Where the ground truth is known."""
+TRUTH = np.where(RNG.random(GT.shape) < 0.7, GT, 0)
+"""The ground truth where it is known."""
 
 
-def test_median_is_that_of_monodepth2_and_empty_predictions_stay_empty() -> None:
-    predicted = (GT * RNG.uniform(0.2, 0.4, GT.shape)).astype(np.float32)
-    predicted[:, :10] = 0
-    both = WHERE & (predicted > 0)
-    # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
-    ratio = np.median(GT[both]) / np.median(predicted[both])
-    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), "median")
-    assert fit is not None
-    assert fit == pytest.approx((ratio, 0), rel=1e-6)
-    assert depth == pytest.approx(predicted * ratio, rel=1e-6)
-
-
-@pytest.mark.parametrize("scale_by", ["affine", "affine-disparity"])
-def test_affine_is_the_least_squares_fit_of_marigold_and_midas(scale_by: str) -> None:
-    """In depth or in disparity: np.linalg.lstsq of [pred, 1] to the ground truth."""
-    in_depth = scale_by == "affine"
-    target = GT if in_depth else 1 / GT
+@pytest.mark.parametrize("scale_by", ["median", "affine", "affine-disparity"])
+def test_a_fit_is_that_of_monodepth2_marigold_or_midas(scale_by: str) -> None:
+    target = 1 / GT if scale_by == "affine-disparity" else GT
     predicted = ((target - 0.05) / 3 + RNG.normal(0, 0.002, GT.shape)).astype(np.float32)
     predicted[:3] = 0  # unknown
-    both = WHERE & (predicted > 0)
-    a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
-    (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)
-    depth, fit = scale_prediction(predicted, np.where(WHERE, GT, 0), scale_by)
-    assert fit is not None
+    both = (TRUTH > 0) & (predicted > 0)
+    if scale_by == "median":
+        # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
+        s, t = np.median(GT[both]) / np.median(predicted[both]), 0.0
+    else:
+        a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
+        (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)
+    depth, fit = scale_prediction(predicted, TRUTH, scale_by)
     assert fit == pytest.approx((s, t), rel=1e-5)
     assert not depth[:3].any()
     fitted = np.maximum(s * predicted + t, 0)[3:]
-    assert depth[3:] == pytest.approx(fitted if in_depth else 1 / fitted, rel=1e-4, abs=1e-6)
+    expected = 1 / fitted if scale_by == "affine-disparity" else fitted
+    assert depth[3:] == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
 def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
