@@ -80,9 +80,9 @@ def codes(path: Path, value: int, height: int = HEIGHT, width: int = WIDTH, ever
     _write(path, depth)
 
 
-def mask(path: Path) -> None:
+def mask(path: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
     """The left half is valid."""
-    _write(path, np.where(np.arange(WIDTH) < WIDTH // 2, 255, 0) * np.ones((HEIGHT, 1), np.uint8))
+    _write(path, np.where(np.arange(width) < width // 2, 255, 0) * np.ones((height, 1), np.uint8))
 
 
 def _write(path: Path, pixels: np.ndarray) -> None:

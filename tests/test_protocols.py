@@ -22,7 +22,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
-from tests.data_sets import SELECTED, eth3d, image, void
+from tests.data_sets import SELECTED, codes, eth3d, image, mask, void
 
 KITTI = (352, 1216)
 
@@ -35,41 +35,32 @@ def nyu(root: Path) -> None:
 
 
 def ibims(root: Path) -> None:
-    """Two frames of 640×480 in 2 m to 3 m, whose left half is valid."""
-    valid = np.zeros((480, 640), np.uint8)
-    valid[:, :320] = 255
-    depth = np.linspace(2, 3, 640) * np.ones((480, 1)) * 65535 / 50
-    for name in ("corridor_01", "office_02"):
-        image(root / f"rgb/{name}.png", 480, 640)
-        for folder, values in (
-            ("depth", depth.astype(np.uint16)),
-            ("mask_invalid", valid),
-            ("mask_transp", np.full_like(valid, 255)),
-        ):
-            (root / folder).mkdir(exist_ok=True)
-            cv2.imwrite(str(root / folder / f"{name}.png"), values)
+    """Two frames in 2 m, whose left half is valid."""
+    for name in ("corridor_01.png", "office_02.png"):
+        image(root / "rgb" / name, 480, 640)
+        image(root / "mask_transp" / name, 480, 640)
+        mask(root / "mask_invalid" / name, 480, 640)
+        codes(root / "depth" / name, round(2 * 65535 / 50), 480, 640)
 
 
 def scannet(root: Path) -> None:
     image(root / "scene0707_00/color/0.jpg", 480, 640)
-    (root / "scene0707_00/depth").mkdir()
-    cv2.imwrite(str(root / "scene0707_00/depth/0.png"), np.full((480, 640), 2000, np.uint16))
+    codes(root / "scene0707_00/depth/0.png", 2000, 480, 640)
     (root / "scene0707_00/intrinsic").mkdir()
 
 
 def kitti(root: Path) -> None:
     """A frame with points in 20 m on every 4th pixel of every 4th row, and one point in 5 m."""
-    names = {kind: SELECTED.format(kind) for kind in ("image", "velodyne_raw", "groundtruth_depth")}
-    image(root / f"image/{names['image']}.png", *KITTI)
     truth, points = np.zeros(KITTI, np.uint16), np.zeros(KITTI, np.uint16)
     truth[100:] = points[100::4, ::4] = 20 * 256
     points[201, 601] = 5 * 256
-    for folder, values in (("groundtruth_depth", truth), ("velodyne_raw", points)):
-        (root / folder).mkdir()
-        cv2.imwrite(str(root / f"{folder}/{names[folder]}.png"), values)
+    image(root / f"image/{SELECTED.format('image')}.png", *KITTI)
+    for kind, values in (("groundtruth_depth", truth), ("velodyne_raw", points)):
+        (root / kind).mkdir()
+        cv2.imwrite(str(root / kind / f"{SELECTED.format(kind)}.png"), values)
     (root / "intrinsics").mkdir()
     text = " ".join(map(str, (700, 0, 608, 0, 700, 176, 0, 0, 1)))
-    (root / f"intrinsics/{names['image']}.txt").write_text(text)
+    (root / f"intrinsics/{SELECTED.format('image')}.txt").write_text(text)
 
 
 # by protocol: the data set, its frames, the points and the scored pixels of each frame

@@ -31,8 +31,24 @@ def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
     return path
 
 
+def frame(root: Path, prediction: Any, gt: Any, name: str = "a") -> Path:
+    """A prediction in out/ and its ground truth in gt/."""
+    depth_file(root / "gt" / f"{name}.npy", gt)
+    return depth_file(root / "out" / f"{name}_depth.npy", prediction)
+
+
+def code_image(path: Path, codes: Any) -> None:
+    """A PNG that does not say its scale."""
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.array(codes, np.uint16))
+
+
 def scored(root: Path, **options: Any) -> Evaluation:
     return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
+
+
+def says(evaluation: Evaluation, text: str) -> bool:
+    return any(text in note for note in evaluation.notes)
 
 
 def folders(root: Path, predictions: str, truths: str) -> Path:
@@ -70,9 +86,9 @@ def test_files_are_matched_by_name(
     tmp_path: Path, predictions: str, truths: str, expected: dict[str, str | None]
 ) -> None:
     names = dict.fromkeys(expected)
-    for frame in scored(folders(tmp_path, predictions, truths)).frames:
-        if "prediction" in frame.inputs:
-            names[frame.name] = Path(frame.inputs["prediction"].path).name
+    for each in scored(folders(tmp_path, predictions, truths)).frames:
+        if "prediction" in each.inputs:
+            names[each.name] = Path(each.inputs["prediction"].path).name
     assert names == expected
 
 
@@ -82,7 +98,6 @@ UNMATCHED = [
     ("a.png", "", "out", "gt", InputError, "gt holds no depth file"),
     ("a.png", "a.png", "out/b.png", "gt/a.png", InputError, "b.png"),
     ("1.png", "0001.png", "out", "gt", InputError, "are 1; ground truth is 0001"),
-    ("a.png", "a.png", "out/a.png", "gt", UsageError, "two files"),
     ("a.png", "a.png", "out/a.png", "list.csv", UsageError, "two files"),
     ("a.png", "a.png", "out", "list.csv", InputError, "'manifest'"),  # without ground truth
 ]
@@ -104,11 +119,8 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> No
         depth_file(tmp_path / f"gt/{place}/depth/0.png", [[2]])
         depth_file(tmp_path / f"out/{place}/0_depth.png", [[2]])
     (tmp_path / "out/summary.json").write_text(json.dumps({"layout": "image-depth"}))
-    frames = scored(tmp_path).frames
-    assert [(frame.name, frame.status) for frame in frames] == [
-        ("north/0", "done"),
-        ("south/0", "done"),
-    ]
+    found = {each.name: each.status for each in scored(tmp_path).frames}
+    assert found == {"north/0": "done", "south/0": "done"}
 
 
 def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -> None:
@@ -119,7 +131,7 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
     scan = FileRecord(path=str(sparse), calibration="calib.txt")
     FrameRecord(inputs={"sparse": scan}).write(out / "b.json")
     (out / "c.json").write_text("not JSON at all")
-    files = [frame.inputs for frame in scored(tmp_path).frames]
+    files = [each.inputs for each in scored(tmp_path).frames]
     assert [[*each] for each in files] == [[*FILES], [*FILES][:2], [*FILES][:2]]
     assert (files[0]["sparse"].path, files[0]["image"].path) == (str(sparse), str(image))
 
@@ -127,10 +139,8 @@ def test_the_record_beside_a_prediction_names_its_sparse_depth(tmp_path: Path) -
 @pytest.fixture
 def two(tmp_path: Path) -> Path:
     """Two frames: errors of 1 and 1 m over two pixels, and of 3 m over one, half predicted."""
-    depth_file(tmp_path / "out" / "a_depth.npy", [[2, 3]])
-    depth_file(tmp_path / "gt" / "a.npy", [[1, 4]])
-    depth_file(tmp_path / "out" / "ü b_depth.npy", [[8, 0]])
-    depth_file(tmp_path / "gt" / "ü b.npy", [[5, 5]])
+    frame(tmp_path, [[2, 3]], [[1, 4]])
+    frame(tmp_path, [[8, 0]], [[5, 5]], "ü b")
     return tmp_path
 
 
@@ -143,8 +153,8 @@ def test_images_count_alike_and_one_without_prediction_in_neither_means_nor_cove
     for name in ("a", "ü b"):
         FrameRecord(inputs={"sparse": sparse}).write(two / "out" / f"{name}.json")
     result = scored(two, exclude_sparse=exclude_sparse)
-    assert [frame.name for frame in result.frames if frame.status == "failed"] == ["c"]
-    assert (result.mean["rmse"], result.counts["coverage"]) == ((1 + 3) / 2, pixels / known)
+    assert [each.name for each in result.frames if each.status == "failed"] == ["c"]
+    assert result.mean["rmse"] == (1 + 3) / 2
     assert "coverage over 2 of 3 frames" in means_table(result).title
     counts = {"frames": 3, "scored": 2, "pixels": pixels, "coverage": pixels / known}
     assert result.to_json()["counts"] == counts
@@ -167,10 +177,10 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
     spoil(path)
     depth_file(two / "out" / "extra.depth.npy", [[1]])
     result = scored(two)
-    assert [frame.status for frame in result.frames] == ["failed", "done"]
+    assert [each.status for each in result.frames] == ["failed", "done"]
     assert message in (result.frames[0].message or "")
-    assert any(note.startswith("warning: frame a was not scored") for note in result.notes)
-    assert result.notes[0].startswith("warning: 1 of 3 predictions have no ground truth")
+    assert says(result, "warning: frame a was not scored")
+    assert says(result, "warning: 1 of 3 predictions have no ground truth")
     assert result.mean["rmse"] == 3
     with pytest.raises(InputError, match=re.escape(str(path))):
         evaluate(alone)
@@ -197,127 +207,99 @@ def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
     }
 
 
-@pytest.fixture(scope="module")
-def random_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.ndarray]:
-    """Two frames of 640×480 with ground truth from 0.2 to 12 m, and predictions with holes."""
-    root, rng = tmp_path_factory.mktemp("random"), np.random.default_rng(0)
+PROTOCOLS: list[tuple[dict[str, Any], float, float, tuple[int, int, int, int]]] = [
+    ({"protocol": "nyu-eigen"}, 1e-3, 10, (45, 471, 41, 601)),
+    ({"protocol": "garg", "max_depth": 6.0}, 1e-3, 6, (195, 476, 23, 616)),
+    ({"max_depth": 5.0, "delta": 1.25}, 0, 5, (0, 480, 0, 640)),
+]
+
+
+@pytest.mark.parametrize(("options", "low", "high", "window"), PROTOCOLS)
+def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
+    options: dict[str, Any],
+    low: float,
+    high: float,
+    window: tuple[int, int, int, int],
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
     gt = rng.uniform(0.2, 12, (2, 480, 640)).astype(np.float32)
     prediction = (gt * np.exp(rng.normal(0, 0.2, gt.shape))).astype(np.float32)
     gt[rng.random(gt.shape) < 0.3] = 0
     prediction[rng.random(gt.shape) < 0.1] = 0
     for number in range(2):
-        depth_file(root / "out" / f"{number}_depth.npy", prediction[number])
-        depth_file(root / "gt" / f"{number}.npy", gt[number])
-    return root, prediction, gt
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"protocol": "nyu-eigen"}, {"max_depth": 5.0, "delta": 1.25}],
-)
-def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
-    random_frames: tuple[Path, np.ndarray, np.ndarray], options: dict[str, Any]
-) -> None:
-    root, prediction, gt = random_frames
-    counts = gt < 5
+        frame(tmp_path, prediction[number], gt[number], str(number))
+    inside, (top, bottom, left, right) = np.zeros((480, 640), bool), window
+    inside[top:bottom, left:right] = True
+    counts = inside & (gt > low) & (gt < high)
+    coverage = np.mean(prediction[counts] > 0)
     if "protocol" in options:
-        prediction = np.clip(prediction, np.float32(1e-3), 10)  # empty ones too, as BTS does
-        counts = (gt > 1e-3) & (gt < 10)
-        counts[:, :45] = counts[:, 471:] = counts[:, :, :41] = counts[:, :, 601:] = False
+        prediction = np.clip(prediction, np.float32(low), high)  # empty ones too, as BTS does
     rows = [brute(*each) for each in zip(prediction, gt, counts, strict=True)]
-    result = scored(root, **options)
+    result = scored(tmp_path, **options)
     assert result.mean == {
         key: pytest.approx(np.mean([row[key] for row in rows]), rel=1e-9) for key in rows[0]
     }
-    assert result.counts["coverage"] < 1
-
-
-def test_empty_predictions_are_skipped_or_scored_as_the_lower_bound(tmp_path: Path) -> None:
-    prediction = np.zeros((20, 30))
-    prediction[:, :15] = 8
-    depth_file(tmp_path / "out" / "a.npy", prediction)
-    depth_file(tmp_path / "gt" / "a.npy", np.full((20, 30), 5))
-    skipped, lowest = scored(tmp_path), scored(tmp_path, protocol="garg")
-    assert (skipped.mean["mae"], skipped.counts["coverage"]) == (3, 0.5)
-    # the crop has columns 1 to 27, of which the prediction has 14
-    assert lowest.mean["mae"] == pytest.approx((14 * 3 + 13 * (5 - 0.001)) / 27)
-    assert lowest.counts["coverage"] == 14 / 27
+    assert result.counts["coverage"] == pytest.approx(coverage)
 
 
 def test_an_interval_ends_at_what_the_measure_can_be_and_few_groups_have_none(
     tmp_path: Path,
 ) -> None:
     for name, depth in zip("abcdefgh", [2.0] * 6 + [2.1, 9.0], strict=True):
-        depth_file(tmp_path / "out" / f"{name}.npy", [[depth]])
-        depth_file(tmp_path / "gt" / f"{name}.npy", [[2]])
+        frame(tmp_path, [[depth]], [[2]], name)
+        frame(tmp_path / "groups", [[depth]], [[2]], f"{'fg'[name > 'd']}/{name}")
     found = scored(tmp_path).interval or {}
     assert (found["rmse"][0], found["delta1"][1]) == (0.0, 1.0)
     assert found["rmse"][1] > 7 / 8 > found["delta1"][0]
-    for folder in ("out", "gt"):
-        for path in [*(tmp_path / folder).iterdir()]:
-            group = path.parent / "fg"[path.stem > "d"]
-            group.mkdir(exist_ok=True)
-            path.rename(group / path.name)
-    result = scored(tmp_path)
+    result = scored(tmp_path / "groups")
     assert result.interval is None
-    assert any("no interval: 2 groups of frames are too few" in note for note in result.notes)
-    assert [frame.group for frame in result.frames] == ["f"] * 4 + ["g"] * 4
+    assert says(result, "no interval: 2 groups of frames are too few")
+    assert [each.group for each in result.frames] == ["f"] * 4 + ["g"] * 4
 
 
 def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     tmp_path: Path,
 ) -> None:
-    codes = np.full((480, 640), 1000, np.uint16)
     for folder in ("out", "gt"):
-        (tmp_path / folder).mkdir()
-        cv2.imwrite(str(tmp_path / folder / "a.png"), codes)
-    assert scored(tmp_path).mean["rmse"] == 0
+        code_image(tmp_path / folder / "a.png", np.full((480, 640), 1000))
     by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)
-    assert by_option.mean["mae"] == 0
-    assert by_option.frames[0].inputs["gt"].scale == 1000
-    nyu = scored(tmp_path, protocol="nyu-eigen")
-    assert any("÷ 1000; --gt-scale to change" in note for note in nyu.notes)
+    assert (by_option.mean["mae"], by_option.frames[0].inputs["gt"].scale) == (0, 1000)
+    assert says(scored(tmp_path, protocol="nyu-eigen"), "÷ 1000; --gt-scale to change")
     depth_file(tmp_path / "out" / "a.png", np.ones((480, 640)), scale=100)
     own = scored(tmp_path, protocol="nyu-eigen")
     assert own.mean["rmse"] == 0
-    assert any("÷ 100 (from the file)" in note for note in own.notes)
+    assert says(own, "÷ 100 (from the file)")
 
 
-@pytest.mark.parametrize(
-    ("side", "option", "field"),
-    [("gt", "--gt-scale", "gt_scale"), ("out", "--pred-scale", "pred_scale")],
-)
+@pytest.mark.parametrize(("side", "option"), [("gt", "--gt-scale"), ("out", "--pred-scale")])
 def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
-    tmp_path: Path, side: str, option: str, field: str
+    tmp_path: Path, side: str, option: str
 ) -> None:
     depth = np.random.default_rng(0).integers(1, 9, (6, 8)).astype(np.float32)
     for folder in ("gt", "out"):
         depth_file(tmp_path / folder / "a.npy", depth)
     (tmp_path / side / "a.npy").unlink()
-    cv2.imwrite(str(tmp_path / side / "a.png"), np.rint(depth * 1000).astype(np.uint16))
+    code_image(tmp_path / side / "a.png", depth * 1000)
     with pytest.raises(InputError, match=rf"{option} 1000 \(now 256\)"):
         scored(tmp_path)
+    field = option[2:].replace("-", "_")
     assert scored(tmp_path, **{field: 1000.0}).mean["rmse"] == 0
-    stated = scored(tmp_path, **{field: 256.0})
-    assert any("a scale is probably wrong" in note for note in stated.notes)
+    assert says(scored(tmp_path, **{field: 256.0}), "a scale is probably wrong")
 
 
-def test_scored_pixels_with_a_sparse_point_are_counted_and_can_be_excluded(
-    tmp_path: Path,
-) -> None:
+def test_scored_pixels_with_a_sparse_point_are_counted_and_can_be_excluded(tmp_path: Path) -> None:
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     points = np.where(np.arange(100).reshape(10, 10) < 5, gt, 0)
     prediction = np.where(points > 0, points, gt + 1)
     prediction[0, 4] = 0  # not scored
-    depth_file(tmp_path / "gt" / "a.npy", gt)
-    depth_file(tmp_path / "out" / "a.npy", prediction)
+    frame(tmp_path, prediction, gt)
     sparse, record = depth_file(tmp_path / "sparse.npy", points), tmp_path / "out" / "a.json"
     FrameRecord(inputs={"sparse": FileRecord(path=str(sparse))}).write(record)
-    (note,) = (n for n in scored(tmp_path).notes if "sparse input" in n)
-    assert note.startswith("4 of the scored pixels")
+    assert says(scored(tmp_path), "4 of the scored pixels have a point of the sparse input")
     without = scored(tmp_path, exclude_sparse=True)
     assert (scores_of(without.frames[0])["known"], without.mean["mae"]) == (95, pytest.approx(1))
-    assert not [n for n in without.notes if "sparse input" in n]
+    assert not says(without, "sparse input")
     sparse.write_bytes(b"spoilt")
     for _ in range(2):  # points that cannot be read, then none that are named
         assert scores_of(scored(tmp_path).frames[0])["given"] is None
@@ -331,42 +313,36 @@ def test_points_that_were_drawn_from_the_ground_truth_are_drawn_again_to_be_excl
 ) -> None:
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     drawn = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
-    depth_file(tmp_path / "out" / "a.npy", np.where(drawn > 0, gt, gt + 1))
-    path = str(depth_file(tmp_path / "gt" / "a.npy", gt))
-    sampled = FileRecord(path=path, sampled=Sampling(kind="uniform", count=30, seed=7))
-    for size, given in (((10, 10), 30), ((9, 9), None), (None, None)):
+    path = frame(tmp_path, np.where(drawn > 0, gt, gt + 1), gt)
+    sampled = FileRecord(path=str(path), sampled=Sampling(kind="uniform", count=30, seed=7))
+    for size, given in (((9, 9), None), (None, None), ((10, 10), 30)):
         record = FrameRecord(inputs={"sparse": sampled}, size=size)
         record.write(tmp_path / "out" / "a.json")
         assert scores_of(scored(tmp_path).frames[0])["given"] == given
-        if given:
-            without = scored(tmp_path, exclude_sparse=True)
-            assert without.mean["mae"] == pytest.approx(1)
-            assert scores_of(without.frames[0])["known"] == 70
+    without = scored(tmp_path, exclude_sparse=True)
+    assert (without.counts["pixels"], without.mean["mae"]) == (70, pytest.approx(1))
 
 
 def test_a_prediction_in_model_units_is_warned_of_unless_it_is_scaled(two: Path) -> None:
     FrameRecord(unit="model units").write(two / "out" / "a.json")
-    warning = "warning: 1 prediction in model units"
-    assert any(note.startswith(warning) for note in scored(two).notes)
-    depth_file(two / "out" / "ü b_depth.npy", [[8, 9]])
-    notes = scored(two, scale_by="median").notes
-    assert not any("model units" in note for note in notes)
-    assert "scale-by median: factor 0.7941 (median of 2 images)" in "; ".join(notes)
+    assert says(scored(two), "warning: 1 prediction in model units")
+    frame(two, [[8, 9]], [[5, 5]], "ü b")
+    result = scored(two, scale_by="median")
+    assert not says(result, "model units")
+    assert says(result, "scale-by median: factor 0.7941 (median of 2 images)")
 
 
 def test_a_smaller_prediction_is_resized_on_request(tmp_path: Path) -> None:
-    depth_file(tmp_path / "gt" / "a.npy", [[1, 1, 3, 3], [1, 1, 3, 3]])
-    depth_file(tmp_path / "out" / "a.npy", [[1, 3]])
+    frame(tmp_path, [[1, 3]], [[1, 1, 3, 3], [1, 1, 3, 3]])
     assert scored(tmp_path, resize=True).mean["mae"] == 0.25
-    depth_file(tmp_path / "out" / "a.npy", [[0, 3]])
+    frame(tmp_path, [[0, 3]], [[1, 1, 3, 3], [1, 1, 3, 3]])
     result = scored(tmp_path, resize=True)
     assert (result.counts["pixels"], result.mean["mae"]) == (4, 0)
 
 
 def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) -> None:
-    for folder, codes in (("out", [[65535, 512]]), ("gt", [[256, 512]])):
-        (tmp_path / folder).mkdir()
-        cv2.imwrite(str(tmp_path / folder / "a.png"), np.array(codes, np.uint16))
+    code_image(tmp_path / "out" / "a.png", [[65535, 512]])
+    code_image(tmp_path / "gt" / "a.png", [[256, 512]])
     devkit = scored(tmp_path, protocol="kitti-devkit")
     assert devkit.mean["mae"] == pytest.approx((65535 / 256 - 1) / 2)
     assert scored(tmp_path).counts["pixels"] == 1
@@ -374,17 +350,14 @@ def test_the_development_kit_takes_the_largest_code_for_a_depth(tmp_path: Path) 
 
 def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    for name in ("a", "b", "c"):
+    for name in "abc":
         gt = rng.uniform(2, 9, (20, 30)) if name != "b" else np.full((20, 30), 2.0)
-        depth_file(tmp_path / "gt" / f"{name}.npy", gt)
-        depth_file(tmp_path / "out" / f"{name}.npy", gt * rng.uniform(0.9, 1.1, gt.shape))
-    default, more = (
-        scored(tmp_path),
-        scored(tmp_path, columns=("mae", "boundary_f1"), depth_limits=(4.0, 6.0)),
-    )
+        frame(tmp_path, gt * rng.uniform(0.9, 1.1, gt.shape), gt, name)
+    default = scored(tmp_path)
+    more = scored(tmp_path, columns=("mae", "boundary_f1"), depth_limits=(4.0, 6.0))
     assert list(more.mean)[: len(default.mean)] == list(default.mean)
     assert default.mean.items() <= more.mean.items()
-    first, second, third = (scores_of(frame)["rmse_far"] for frame in more.frames)
+    first, second, third = (scores_of(each)["rmse_far"] for each in more.frames)
     assert math.isnan(second)  # a wall in 2 m has no far pixels
     assert more.mean["rmse_far"] == pytest.approx((first + third) / 2)
     assert scores_of(more.frames[1])["boundary_f1"] == 0
@@ -395,13 +368,12 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
 def test_distances_of_a_wide_camera_are_scored_as_depth(of: str, tmp_path: Path) -> None:
     depth = np.random.default_rng(0).uniform(2, 4, (48, 64)).astype(np.float32)
     x, y = (np.arange(64) - 31.5) / 32, (np.arange(48) - 23.5) / 32  # 90° across
-    depth_file(tmp_path / "gt.npy", depth * np.sqrt(1 + x**2 + y[:, None] ** 2))
-    depth_file(tmp_path / "out" / "a_depth.npy", depth + 1)
+    frame(tmp_path, depth + 1, depth * np.sqrt(1 + x**2 + y[:, None] ** 2))
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64, 3), np.uint8))
     intrinsics = [[32.0, 0.0, 31.5], [0.0, 32.0, 23.5], [0.0, 0.0, 1.0]]
     (tmp_path / "calib.txt").write_text(f"K: {np.ravel(intrinsics).tolist()}")
     calib = "calib.txt" if of == "list" else ""
-    (tmp_path / "list.csv").write_text(f"image,gt,calib,name,group\na.png,gt.npy,{calib},a,b")
+    (tmp_path / "list.csv").write_text(f"image,gt,calib,name,group\na.png,gt/a.npy,{calib},a,b")
     camera = CameraRecord.of(Camera(intrinsics=np.array(intrinsics)), None)
     record = FrameRecord(size=(64, 48), camera=camera if of == "record" else None)
     record.write(tmp_path / "out" / "a.json")
