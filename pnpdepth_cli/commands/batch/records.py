@@ -290,13 +290,21 @@ def summarise(
 
 
 def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
-    """The names of the frames by their notes, warnings first; notes differ in more than numbers."""
+    """The names of the frames by their notes, warnings first.
+
+    Of notes that differ in numbers alone, the first stands for all, with its frame's name.
+    """
     kinds = defaultdict[str, dict[str, str]](dict)
     for record in records:
         for note in record.notes:
             if note.startswith(("warning", "note")) or ", unsure (" in note:
                 kinds[_NUMBER.sub("", note)].setdefault(record.name, note)
-    noted = {next(iter(of.values())): list(of) for of in kinds.values()}
+    noted: dict[str, list[str]] = {}
+    for of in kinds.values():
+        first, note = next(iter(of.items()))
+        if len({*of.values()}) > 1:
+            note += f" (numbers of {first})"
+        noted[note] = list(of)
     return dict(sorted(noted.items(), key=lambda item: not item[0].startswith("warning")))
 
 

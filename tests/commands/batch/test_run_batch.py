@@ -311,7 +311,8 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
     assert told.errors["ground_truth"]["after"]["rmse"] == 1
     assert told.weights == {"net": {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}}
     names = [record.name for record in records]
-    assert told.frame_notes == {kind.format(0): names for kind in kinds}
+    of_first = f" (numbers of {names[0]})"
+    assert told.frame_notes == {kind.format(0) + of_first: names for kind in kinds}
     assert ["4 frames count as 2 groups of frames" in note for note in told.notes] == [True]
 
 
