@@ -41,9 +41,6 @@ _LONGEST_HEADER = 1 << 16
 _MOST_COMPRESSED = 100
 """Times as many bytes as compressed ones; three bytes of LZF make at most 264."""
 
-_MOST_DIGITS = 18
-"""Most digits of a count; Python refuses to convert thousands of them."""
-
 Points = NDArray[np.float32]
 
 
@@ -129,33 +126,26 @@ Column = tuple[str, str, int]
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of a PCD, ASCII, binary or compressed."""
     header, body = _header(path, data, "PCD", b"DATA")
-    entries = {words[0].upper(): words[1:] for words in header if not words[0].startswith("#")}
-    missing = [k for k in ("FIELDS", "SIZE", "TYPE", "POINTS", "DATA") if not entries.get(k)]
-    if missing:
-        raise damaged(path, "PCD", f"has no {missing[0]} in its header")
-    names, kinds, sizes = entries["FIELDS"], entries["TYPE"], entries["SIZE"]
-    counts = entries.get("COUNT", ["1"] * len(names))
-    if not len(names) == len(kinds) == len(sizes) == len(counts):
-        raise damaged(path, "PCD", "names another number of fields than it describes")
-    columns = [
-        (name, _PCD_TYPES.get(kind + size, f"?{size}"), _whole(path, count))
-        for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True)
-    ]
-    number, stored = _whole(path, entries["POINTS"][0]), entries["DATA"][0].lower()
-    if stored not in ("ascii", "binary", "binary_compressed"):
-        raise FileFormatError(f"{path} is a PCD with {stored} data; save it as binary or ascii")
+    entries = {words[0].upper(): words[1:] for words in header}
+    try:
+        names, kinds, sizes = (entries[entry] for entry in ("FIELDS", "TYPE", "SIZE"))
+        fields = zip(names, kinds, sizes, entries.get("COUNT", ["1"] * len(names)), strict=True)
+        columns = [(name, _PCD_TYPES[kind + size], int(n)) for name, kind, size, n in fields]
+        number, stored = int(entries["POINTS"][0]), entries["DATA"][0].lower()
+        order = {"ascii": None, "binary": "<", "binary_compressed": "<"}[stored]
+    except (LookupError, ValueError) as error:
+        raise damaged(path, "PCD", f"has a wrong header ({error})") from error
     if stored == "binary_compressed":
         body = _decompress_rows(path, columns, number, body)
-    points = _xyz(path, "PCD", columns, number, body, None if stored == "ascii" else "<")
-    return points, f"{stored} PCD"
+    return _xyz(path, "PCD", columns, number, body, order), f"{stored} PCD"
 
 
 def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:
     """The rows of a compressed PCD: two sizes, then all numbers of each field, compressed."""
-    sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns if "?" not in kind]
-    packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
-    whole = len(sizes) == len(columns) and claimed == number * sum(sizes)
-    if not whole or packed > len(body) - 8 or claimed > _MOST_COMPRESSED * (packed + 1):
+    sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns]
+    packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
+    is_whole = claimed == number * sum(sizes) and packed <= len(body) - 8
+    if not is_whole or min(sizes, default=-1) < 0 or claimed > _MOST_COMPRESSED * (packed + 1):
         raise damaged(path, "PCD", "is cut short, or no compressed one")
     data = _lzf(body[8 : 8 + packed])
     if data is None or len(data) != claimed:
@@ -189,23 +179,16 @@ def _lzf(packed: bytes) -> bytes | None:
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of the vertices of a PLY, ASCII or binary."""
     header, body = _header(path, data, "PLY", b"end_header")
-    if header[0] != ["ply"] or header[1][0] != "format":
-        raise damaged(path, "PLY", "does not begin with ply and its format")
-    elements = [i for i, words in enumerate(header) if words[0] == "element"]
-    if not elements or header[elements[0]][1:2] != ["vertex"] or len(header[elements[0]]) != 3:
-        raise FileFormatError(f"{path}: its first element is not vertex; save points first")
-    columns: list[Column] = []
-    for words in header[slice(*[*elements, len(header)][:2])]:
-        if words[0] != "property":
-            continue
-        if len(words) != 3 or words[1] not in _PLY_KINDS:
-            raise FileFormatError(f"{path}: {' '.join(words)!r} of a vertex is not one number")
-        columns.append((words[2], _PLY_KINDS[words[1]], 1))
-    stored = header[1][1] if len(header[1]) > 1 else ""
-    if stored not in _PLY_ORDERS:
-        raise damaged(path, "PLY", f"has the unknown format {stored!r}")
-    number = _whole(path, header[elements[0]][2])
-    points = _xyz(path, "PLY", columns, number, body, _PLY_ORDERS[stored])
+    try:
+        marks = [i for i, words in enumerate(header) if words[0] in ("element", "end_header")]
+        (_, element, number), stored = header[marks[0]], header[1][1]
+        properties = [each for each in header[marks[0] : marks[1]] if each[0] == "property"]
+        columns = [(name, _PLY_KINDS[kind], 1) for _, kind, name in properties]
+        points = _xyz(path, "PLY", columns, int(number), body, _PLY_ORDERS[stored])
+    except (LookupError, ValueError) as error:
+        raise damaged(path, "PLY", f"has a wrong header ({error})") from error
+    if (header[0], header[1][0], element) != (["ply"], "format", "vertex"):
+        raise FileFormatError(f"{path} is no PLY whose first element is vertex; save points first")
     return points, "ascii PLY" if stored == "ascii" else "binary PLY"
 
 
@@ -235,7 +218,7 @@ def _xyz(
             raise FileFormatError(f"{path}: a {kind} without one {name} ({listing}); add it")
     if not number:
         return np.empty((0, 3), np.float32)
-    if number * sum(counts) > len(body):  # each number has a byte at least
+    if not 0 <= number * sum(counts) <= len(body):  # each number has a byte at least
         raise damaged(path, kind, f"claims {number:,} points in {len(body):,} bytes")
     fields = [(f"f{i}", order + t if order else "f8", (n,)) for i, (_, t, n) in enumerate(columns)]
     try:
@@ -249,12 +232,6 @@ def _xyz(
     if len(rows) < number:
         raise damaged(path, kind, f"is cut short: {len(rows):,} of {number:,} points")
     return _first_columns(np.hstack([rows[f"f{names.index(name)}"] for name in "xyz"]))
-
-
-def _whole(path: Path, text: str) -> int:
-    if not text.isdecimal() or len(text) > _MOST_DIGITS:
-        raise FileFormatError(f"{path}: {one_line(text)[:40]!r} in its header is no count")
-    return int(text)
 
 
 def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
