@@ -100,57 +100,66 @@ def opencv_file(coefficients: list[float], **others: int) -> str:
     return file.releaseAndGetString()
 
 
-def test_kittis_files_become_one_pinhole_camera(tmp_path: Path) -> None:
-    path = write(tmp_path, KITTI)
-    got = read_calibration(path)
-    assert (got.camera.size, got.camera.distortion) == (None, ())
-    # P · [0 -0.08 -0.27 1] must come out the same as K · translation
-    p2 = np.array([[700, 0, 600, 42], [0, 700, 170, -0.35], [0, 0, 1, 0.005]])
-    shown = got.camera.intrinsics @ got.scanner.square()[:3, 3]
-    np.testing.assert_allclose(shown, p2 @ [0, -0.08, -0.27, 1])
-    assert read_calibration(path, 0).scanner.translation.tolist() == [0, -0.08, -0.27]
-    # odometry has the scanner in Tr, and no rectification
-    lines = KITTI.splitlines()
-    odometry = "\n".join([*lines[:2], lines[3].replace("Tr_velo_to_cam", "Tr")])
-    same = read_calibration(write(tmp_path, odometry))
-    assert np.array_equal(same.scanner.square(), got.scanner.square())
+RECTIFY = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+TO_CAMERA = np.column_stack([TURN, SHIFT])
+PROJECTIONS = {
+    0: np.array([[552.5, 0, 682, 0], [0, 552.5, 238.7, 0], [0, 0, 1, 0]]),
+    2: np.array([[552.5, 0, 682, 42], [0, 552.5, 238.7, -0.35], [0, 0, 1, 0.005]]),
+}
 
 
-def test_kitti_360_maps_camera_0_to_the_scanner_and_has_one_rectification(tmp_path: Path) -> None:
-    k, turn = np.array([[552.5, 0, 682], [0, 552.5, 238.7], [0, 0, 1]]), np.array(TURN, float).T
-    rectify = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
-    to_scanner = np.column_stack([turn, [0.77, 0.29, -0.16]])
-    offsets, lines = (0.0, -328.7), ["calib_time: 03-Apr-2018 18:47:03", "corner_dist: 0.100000"]
-    for camera, offset in enumerate(offsets):
-        p = np.column_stack([k, [offset, 0, 0]])
-        for name, values in {"S_rect": [1408, 376], "R_rect": rectify, "P_rect": p}.items():
-            lines.append(f"{name}_{camera:02}: {' '.join(map(str, np.ravel(values).tolist()))}")
-    (tmp_path / "perspective.txt").write_text("\n".join(lines))
-    np.savetxt(tmp_path / "calib_cam_to_velo.txt", to_scanner.reshape(1, 12))
-    point = np.array([12.0, -3.0, 0.5])  # in the scanner's frame
-    u, v, w = k @ rectify @ np.linalg.solve(turn, point - to_scanner[:, 3])
-    for camera, offset in enumerate(offsets):
-        calibration = read_calibration(tmp_path, camera or None)
-        seen = calibration.scanner.apply(point[None])
-        pixel = pixels_of(calibration.camera, seen)[0]
-        np.testing.assert_allclose([*pixel, seen[0, 2]], [(u + offset) / w, v / w, w])
-        assert calibration.camera.size == (376, 1408)
+def kitti_file(path: Path, **values: object) -> Path:
+    """A file of named numbers; without a colon after R_rect and Tr_velo_cam, as KITTI has it."""
+    lines = ["calib_time: 03-Apr-2018 18:47:03"] if "S_rect_00" in values else []
+    for name, numbers in values.items():
+        colon = "" if name in ("R_rect", "Tr_velo_cam") else ":"
+        lines.append(f"{name}{colon} {' '.join(map(str, np.ravel(numbers).tolist()))}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
-def test_kittis_raw_folder_gives_its_cameras_also_without_the_scanner(tmp_path: Path) -> None:
-    cameras = write(
-        tmp_path,
-        "calib_time: 09-Jan-2012 13:57:47\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
-        "S_rect_02: 1242 375\nP_rect_02: 700 0 600 42 0 700 170 0 0 0 1 0\n",
-        "calib_cam_to_cam.txt",
-    )
-    for place in (tmp_path, cameras):
-        alone = read_calibration(place)
-        assert (alone.camera.size, alone.scanner) == ((375, 1242), None)
-    scanner = write(tmp_path, "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.08 -0.27\n", "calib_velo_to_cam.txt")
-    pose = read_calibration(scanner).scanner
-    assert [each.tolist() for each in pose] == [TURN, [0.06, -0.08, -0.27]]
-    cameras.unlink()
+def kitti_files(folder: Path, kind: str) -> Path:
+    """The calibration of this data set; the folder, or the file."""
+    plain = {f"P{n}": projection for n, projection in PROJECTIONS.items()}
+    rectified = {f"P_rect_0{n}": projection for n, projection in PROJECTIONS.items()}
+    sized = {"R_rect_00": RECTIFY, "S_rect_00": [1408, 376], "S_rect_02": [1408, 376], **rectified}
+    path = folder / "calib.txt"
+    if kind == "object":
+        return kitti_file(path, **plain, R0_rect=RECTIFY, Tr_velo_to_cam=TO_CAMERA)
+    if kind == "tracking":
+        return kitti_file(path, **plain, R_rect=RECTIFY, Tr_velo_cam=TO_CAMERA)
+    if kind == "odometry":  # already rectified
+        return kitti_file(path, **plain, Tr=RECTIFY @ TO_CAMERA)
+    if kind == "raw":
+        kitti_file(folder / "calib_velo_to_cam.txt", R=TURN, T=SHIFT)
+        return kitti_file(folder / "calib_cam_to_cam.txt", **sized).parent
+    turn = np.array(TURN).T
+    to_scanner = np.column_stack([turn, -turn @ SHIFT])
+    np.savetxt(folder / "calib_cam_to_velo.txt", to_scanner.reshape(1, 12))
+    return kitti_file(folder / "perspective.txt", **sized)
+
+
+@pytest.mark.parametrize("kind", ["object", "tracking", "odometry", "raw", "360"])
+def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Path) -> None:
+    path, point = kitti_files(tmp_path, kind), np.array([12.0, -3.0, 0.5])
+    for number, projection in PROJECTIONS.items():
+        u, v, w = projection @ [*(RECTIFY @ TO_CAMERA @ [*point, 1]), 1]
+        got = read_calibration(path, number)
+        seen = got.scanner.apply(point[None])
+        pixel = pixels_of(got.camera, seen)[0]
+        np.testing.assert_allclose([*pixel, seen[0, 2]], [u / w, v / w, w], rtol=1e-9)
+        assert got.camera.size == ((376, 1408) if kind in ("raw", "360") else None)
+    own = read_calibration(path, 0 if kind == "360" else 2).scanner
+    assert np.array_equal(read_calibration(path).scanner.square(), own.square())
+    with pytest.raises(UsageError):
+        read_calibration(path, 3)
+
+
+def test_kittis_raw_folder_may_lack_the_scanner_but_not_the_cameras(tmp_path: Path) -> None:
+    kitti_files(tmp_path, "raw")
+    (tmp_path / "calib_velo_to_cam.txt").unlink()
+    assert read_calibration(tmp_path / "calib_cam_to_cam.txt").scanner is None
+    (tmp_path / "calib_cam_to_cam.txt").unlink()
     with pytest.raises(InputError):
         read_calibration(tmp_path)
 

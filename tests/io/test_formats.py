@@ -152,8 +152,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
 
 
 def test_several_parts_and_a_crop_of_the_display_are_refused(tmp_path: Path) -> None:
-    header = {"type": OpenEXR.scanlineimage}
-    parts = [OpenEXR.Part(dict(header), {name: METRES}, name) for name in ("left", "right")]
+    parts = [OpenEXR.Part({"type": OpenEXR.scanlineimage}, {n: METRES}, n) for n in ("a", "b")]
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "parts.exr"))
     window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))

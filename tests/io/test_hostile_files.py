@@ -55,16 +55,13 @@ def test_tags_that_share_their_bytes_are_refused(where: str, tmp_path: Path) -> 
     count, path, outside = 3000, tmp_path / "tags.tif", io.BytesIO()
     Image.new("RGB", (300, 100)).save(outside, "TIFF")
     content = bytearray(outside.getvalue())
-    table = b"".join(struct.pack("<HHII", 256 + number, 2, 90_000, 8) for number in range(count))
     (first,) = struct.unpack_from("<I", content, 4)
-    entries = first + 2
-    end = entries + 12 * struct.unpack_from("<H", content, first)[0]
-    if where == "first page":
-        struct.pack_into("<I", content, 4, len(content))
-    elif where == "second page":
-        struct.pack_into("<I", content, end, len(content))
-    else:  # in the place of the last tag
+    end = first + 2 + 12 * struct.unpack_from("<H", content, first)[0]
+    if where == "exif":  # in the place of the last tag
         struct.pack_into("<HHII", content, end - 12, 34665, 4, 1, len(content))
+    else:
+        struct.pack_into("<I", content, 4 if where == "first page" else end, len(content))
+    table = b"".join(struct.pack("<HHII", 256 + number, 2, 90_000, 8) for number in range(count))
     path.write_bytes(content + struct.pack("<H", count) + table + bytes(4))
     for read in (read_rgb, read_depth):
         with pytest.raises(FileFormatError):
@@ -87,20 +84,14 @@ def claiming(content: bytes, name: str, kind: str, value: bytes) -> bytes:
     return content[:start] + value + content[start + len(value) :]
 
 
-def window(*corners: int) -> bytes:
-    return struct.pack("<4i", *corners)
-
-
 PLAIN, HIGH = exr("Z"), 2**31 - 1
 TILED = exr("Z", type=OpenEXR.tiledimage, tiles=OpenEXR.TileDescription())
+WINDOW, DISPLAY = ("dataWindow", "box2i"), ("displayWindow", "box2i")
+MANY = exr(*(f"c{n}" for n in range(5000)))
 EXRS = {
-    "every pixel there is": claiming(
-        PLAIN, "dataWindow", "box2i", window(-HIGH, -HIGH, HIGH, HIGH)
-    ),
-    "a display of every pixel": claiming(PLAIN, "displayWindow", "box2i", window(0, 0, HIGH, HIGH)),
-    "5,000 channels": claiming(
-        exr(*(f"c{n}" for n in range(5000))), "dataWindow", "box2i", window(0, 0, 99, 99)
-    ),
+    "every pixel there is": claiming(PLAIN, *WINDOW, struct.pack("<4i", -HIGH, -HIGH, HIGH, HIGH)),
+    "a display of every pixel": claiming(PLAIN, *DISPLAY, struct.pack("<4i", 0, 0, HIGH, HIGH)),
+    "5,000 channels": claiming(MANY, *WINDOW, struct.pack("<4i", 0, 0, 99, 99)),
     "an attribute of 2 GB": exr("Z", a="x").replace(
         b"a\0string\0\1\0\0\0", b"a\0string\0\xff\xff\xff\x7f"
     ),
@@ -151,7 +142,6 @@ def test_pages_of_a_tiff_that_overlap_are_refused() -> None:
 
 
 READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha256_of, read_scan]
-DEPTH = np.full((6, 8), 2.5, np.float32)
 
 
 @pytest.mark.parametrize("read", READERS)
@@ -170,34 +160,42 @@ def test_a_device_a_pipe_and_a_sparse_file_of_terabytes_are_refused_unread(
             read(huge)
 
 
-def npz(path: Path, content: bytes, compression: int = zipfile.ZIP_DEFLATED) -> None:
+def npz(path: Path, content: bytes, compression: int = zipfile.ZIP_DEFLATED) -> bytes:
     with zipfile.ZipFile(path, "w", compression) as archive:
         archive.writestr("depth.npy", content)
+    return path.read_bytes()
 
 
 def npy(shape: tuple[int, ...], body: bytes) -> bytes:
-    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
     buffer = io.BytesIO()
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(buffer, header)
     return buffer.getvalue() + body
 
 
+@pytest.mark.parametrize(
+    ("shape", "data_bytes", "compression"),
+    [
+        ((6, 8), 600 << 20, zipfile.ZIP_DEFLATED),
+        ((10_000, 5_000), 1000, zipfile.ZIP_DEFLATED),
+        *(
+            ((6, 8), 4 * 6 * 8, compression)
+            for compression in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+        ),
+    ],
+)
 def test_an_npz_that_lies_or_is_too_large_is_refused(
-    tmp_path: Path,
+    tmp_path: Path, shape: tuple[int, int], data_bytes: int, compression: int
 ) -> None:
-    path, valid = tmp_path / "lie.npz", npy((6, 8), DEPTH.tobytes())
-    npz(path, valid + bytes(600 << 20))
+    npz(tmp_path / "lie.npz", npy(shape, bytes(data_bytes)), compression)
     with little(), pytest.raises(FileFormatError):
-        read_depth(path)
-    lies = [(npy((10_000, 5_000), bytes(1000)), zipfile.ZIP_DEFLATED)]
-    lies += [(valid, compression) for compression in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)]
-    for lie in lies:
-        npz(path, *lie)
-        with little(), pytest.raises(FileFormatError):
-            read_depth(path)
-    npz(path, npy((600, 800), bytes(4 * 600 * 800)))
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, 500)  # uncompressed size
+        read_depth(tmp_path / "lie.npz")
+
+
+def test_an_npz_of_a_wrong_uncompressed_size_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lie.npz"
+    content = bytearray(npz(path, npy((600, 800), bytes(4 * 600 * 800))))
+    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, 500)
     path.write_bytes(content)
     with pytest.raises(FileFormatError):
         read_depth(path)

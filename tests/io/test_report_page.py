@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -74,25 +74,15 @@ def one(page: webdriver.Chrome, css: str) -> WebElement:
 
 
 def names(page: webdriver.Chrome) -> list[str]:
-    script = "return [...document.querySelectorAll('#rows .open')].map(b => b.textContent)"
-    return list(page.execute_script(script))
+    return [row.text for row in page.find_elements(By.CSS_SELECTOR, "#rows .open")]
 
 
-def wait(page: webdriver.Chrome, condition: Callable[[], bool]) -> None:
-    WebDriverWait(page, 20, poll_frequency=0.02).until(lambda _: condition())
-
-
-def loaded(page: webdriver.Chrome, css: str) -> bool:
-    script = "return [...document.querySelectorAll(arguments[0])].every(i => i.naturalWidth > 0)"
-    return bool(page.execute_script(script, css))
-
-
-def open_view(page: webdriver.Chrome, name: str = "a") -> None:
-    """Opens the 3D view of the frame."""
+def open_view(page: webdriver.Chrome) -> None:
+    """Opens the 3D view of frame a."""
     rows = page.find_elements(By.CSS_SELECTOR, "#rows .open")
-    next(row for row in rows if row.text == name).send_keys(Keys.ENTER)
+    rows[names(page).index("a")].send_keys(Keys.ENTER)
     one(page, "button.load").send_keys(Keys.ENTER)
-    wait(page, lambda: bool(page.find_elements(By.CSS_SELECTOR, ".switch")))
+    WebDriverWait(page, 20, poll_frequency=0.02).until(lambda _: one(page, ".switch"))
 
 
 def requested(page: webdriver.Chrome) -> list[str]:
@@ -104,9 +94,12 @@ def requested(page: webdriver.Chrome) -> list[str]:
 def test_it_opens_from_disk_without_an_error_or_a_network_and_loads_views_when_asked(
     page: webdriver.Chrome,
 ) -> None:
-    eager = "document.querySelectorAll('img').forEach(each => { each.loading = 'eager' })"
-    page.execute_script(eager)  # those below the window, too
-    wait(page, lambda: loaded(page, "img"))
+    loaded = (
+        "const all = [...document.querySelectorAll('img')];"
+        "all.forEach(each => { each.loading = 'eager' });"  # those below the window, too
+        "return all.every(each => each.naturalWidth > 0)"
+    )
+    WebDriverWait(page, 20, poll_frequency=0.02).until(lambda _: page.execute_script(loaded))
     before = requested(page)
     open_view(page)
     urls = before + requested(page)

@@ -40,7 +40,7 @@ def test_all_bits_are_kept_alpha_is_dropped_and_grey_is_repeated(
 @pytest.mark.parametrize("mode", ["1", "P", "LA", "CMYK"])
 def test_other_colour_modes_become_rgb(tmp_path: Path, mode: str) -> None:
     Image.new("RGB", (5, 3), "white").convert(mode).save(tmp_path / "a.tif")
-    assert np.array_equal(read_rgb(tmp_path / "a.tif").values, np.ones((3, 5, 3), np.float32))
+    assert (read_rgb(tmp_path / "a.tif").values == np.ones((3, 5, 3))).all()
 
 
 UPRIGHT = np.arange(6).reshape(2, 3)
@@ -50,30 +50,23 @@ STORED += [stored.T for stored in STORED]
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "PNG16", "TIFF", "TIFF16"])
-def test_exif_rotation_is_honoured(tmp_path: Path, kind: str) -> None:
-    for orientation, stored in enumerate(STORED, 1):
-        # 16 x 16 blocks, so that JPEG keeps each one's grey
-        pixels = np.kron(stored.astype(np.uint8) * 50, np.ones((16, 16), np.uint8))
-        exif = Image.Exif()
-        exif[0x0112] = orientation
-        path = tmp_path / f"{orientation}.img"
-        image = Image.fromarray(pixels.astype(np.uint16) * 257 if "16" in kind else pixels)
-        image.save(path, kind.removesuffix("16"), exif=exif)
-        assert "TIFF" in kind or sizes_of(path) == ((32, 48), pixels.shape)
-        values = read_rgb(path).values[8::16, 8::16, 0] * 255
-        assert np.allclose(values, UPRIGHT * 50, atol=1.5), orientation
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_rotation_is_honoured(tmp_path: Path, kind: str, orientation: int) -> None:
+    # 16 x 16 blocks, so that JPEG keeps each one's grey
+    pixels = np.kron(STORED[orientation - 1].astype(np.uint8) * 50, np.ones((16, 16), np.uint8))
+    path, exif = tmp_path / "a.img", Image.Exif()
+    exif[0x0112] = orientation
+    image = Image.fromarray(pixels.astype(np.uint16) * 257 if "16" in kind else pixels)
+    image.save(path, kind.removesuffix("16"), exif=exif)
+    assert "TIFF" in kind or sizes_of(path) == ((32, 48), pixels.shape)
+    values = read_rgb(path).values[8::16, 8::16, 0] * 255
+    assert np.allclose(values, UPRIGHT * 50, atol=1.5)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"", b"hello, world", b"\x93NUMPY\x01\x00"),
-        *(b"\0\0\0\x18ftyp" + brand + b"\0\0\0\0" for brand in (b"avif", b"heic")),
-    ],
-)
-def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize("kind", [b"avif", b"heic", b"", b"hello, world", b"\x93NUMPY\x01\x00"])
+def test_what_is_no_image_is_refused(tmp_path: Path, kind: bytes) -> None:
     path = tmp_path / "a.png"
-    path.write_bytes(content)
+    path.write_bytes(b"\0\0\0\x18ftyp" + kind + b"\0\0\0\0" if len(kind) == 4 else kind)
     with pytest.raises(FileFormatError, match=str(path)):
         read_rgb(path)
 
