@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.depth import read_sparse
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.accumulation import (
@@ -24,12 +24,12 @@ from pnpdepth_cli.sensors.pixels import Points
 
 SIZE = (120, 160)
 CAMERA = Camera(intrinsics=np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
-STILL = np.column_stack([np.eye(3), np.zeros(3)])
 
 
-def room(
-    position: tuple[float, float, float], box_x: float | None, seed: int, count: int = 3000
-) -> Points:
+Shift = tuple[float, float, float]
+
+
+def room(position: Shift, box_x: float | None, seed: int, count: int = 3000) -> Points:
     """What a camera at a position sees: two walls, a floor, and a box 4 m away, if any."""
     rng = np.random.default_rng(seed)
     pixels = rng.permutation(SIZE[0] * SIZE[1])[:count]
@@ -54,9 +54,7 @@ def depth_of_walls(rays: NDArray[np.float64], shift: NDArray[np.float64]) -> NDA
 
 def from_ahead(metres: float) -> NDArray[np.float64]:
     """The motion from a camera that is so far ahead to this one."""
-    motion = STILL.copy()
-    motion[2, 3] = metres
-    return motion
+    return np.column_stack([np.eye(3), [0, 0, metres]])
 
 
 def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
@@ -72,11 +70,10 @@ def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
 
 def test_points_of_a_moved_object_are_dropped() -> None:
     own, later = room((0, 0, 0), -1.0, 0), room((0, 0, 0), 1.0, 1)
-    both = accumulate(own, {1: [(later, STILL)]}, CAMERA)
+    both = accumulate(own, {1: [(later, from_ahead(0))]}, CAMERA)
     moved, depth = both.xy[len(own) :], both.depth[len(own) :]
-    on_old_box = (np.abs((moved[:, 0] - 79.5) / 150 * 4 - 1) < 0.4) & (
-        np.abs((moved[:, 1] - 59.5) / 150 * 4) < 0.4
-    )
+    at = (moved - (79.5, 59.5)) / 150 * 4
+    on_old_box = (np.abs(at - (1, 0)) < 0.4).all(axis=1)
     assert (later.depth == 4).sum() > 100
     assert not (depth[on_old_box] < 4.5).any()
     assert len(moved) < len(later) - 100
@@ -84,7 +81,7 @@ def test_points_of_a_moved_object_are_dropped() -> None:
 
 def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     own, one, two = (room((0, 0, 0), None, seed) for seed in range(3))
-    near, far = {1: [(one, STILL)]}, {2: [(two, STILL)]}
+    near, far = {1: [(one, from_ahead(0))]}, {2: [(two, from_ahead(0))]}
     with_near, with_both = (accumulate(own, each, CAMERA) for each in (near, far | near))
     kept = with_both.xy[: len(with_near)]
     assert kept.tobytes() == with_near.xy.tobytes()
@@ -106,10 +103,7 @@ DRIVE_CAMERA = Camera(intrinsics=np.array([[360.77, 0, 304.53], [0, 360.77, 86.1
 
 
 def points_of(number: int) -> Points:
-    depth = read_depth(DRIVE / f"sparse/drive_{number:03}.png").values
-    y, x = np.nonzero(depth)
-    xy = np.column_stack([x, y]).astype(np.float32)
-    return Points(xy=xy, depth=depth[y, x], size=(depth.shape[0], depth.shape[1]))
+    return read_sparse(DRIVE / f"sparse/drive_{number:03}.png")[0]
 
 
 def image(number: int) -> Keypoints:
@@ -131,7 +125,7 @@ def test_an_image_without_texture_gives_no_motion() -> None:
     assert basis.startswith("0 matches")
 
 
-def seen_from(points: Points, shift: tuple[float, float, float]) -> tuple[Keypoints, Keypoints]:
+def seen_from(points: Points, shift: Shift) -> tuple[Keypoints, Keypoints]:
     """Keypoints at the points, as matched in a camera that has moved, and in their own image."""
     descriptors = np.random.default_rng(0).random((len(points), 128)).astype(np.float32)
     moved = unproject(CAMERA, points.xy, points.depth) + np.array(shift)

@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.projection import (
@@ -101,9 +101,7 @@ def test_a_point_is_hidden_by_a_nearer_one_beside_its_beam(
 
 
 @pytest.mark.parametrize(("edge", "agreement"), [(50, 0.81), (20, -0.11), (None, 0.0)])
-def test_edges_agree_where_they_are_beside_jumps_of_depth(
-    edge: int | None, agreement: float
-) -> None:
+def test_edges_agree_beside_jumps_of_depth(edge: int | None, agreement: float) -> None:
     y, x = np.mgrid[2:60:4, 2:100:4]
     xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
     depth = np.where((xy[:, 0] < 50) & (edge is not None), 2, 5).astype(np.float32)
@@ -118,13 +116,10 @@ def test_edges_agree_where_they_are_beside_jumps_of_depth(
 MAP_SIZE = (240, 640)
 
 
-def points_of(depth: NDArray[np.floating]) -> Points:
+def points_of(depth: NDArray[np.float32]) -> Points:
     rows, columns = np.nonzero(depth)
-    return Points(
-        xy=np.column_stack([columns, rows]).astype(np.float32),
-        depth=depth[rows, columns].astype(np.float32),
-        size=depth.shape,
-    )
+    xy = np.column_stack([columns, rows]).astype(np.float32)
+    return Points(xy=xy, depth=depth[rows, columns], size=depth.shape)
 
 
 def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
@@ -178,9 +173,8 @@ def test_a_frame_is_read_without_occluded_points_unless_they_are_kept(tmp_path: 
 
 def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: Path) -> None:
     for path in sorted((shared_data / "kitti_dc" / "velodyne_raw").glob("*.png")):
-        raw = read_depth(path).values
         gt = read_depth(path.parents[1] / "groundtruth" / path.name).values
-        points = points_of(raw)
+        points, _ = read_sparse(path)
         hidden = occluded_in_map(points)
         assert hidden is not None
         true_depth = gt[tuple(points.xy.astype(int).T[::-1])]
@@ -191,6 +185,6 @@ def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: 
     folder = shared_data / "kitti_object"
     calibration = read_calibration(folder / "calib" / "000001.txt")
     assert calibration.scanner is not None
-    scan = read_scan(folder / "velodyne" / "000001.bin")[0]
+    scan, _ = read_scan(folder / "velodyne" / "000001.bin")
     filtered = project_velodyne(scan, calibration.camera, calibration.scanner, (375, 1242))
     assert occluded_in_map(points_of(as_depth_image(filtered))) is None
