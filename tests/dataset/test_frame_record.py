@@ -56,17 +56,12 @@ RECORD = FrameRecord(
     model=ModelRecord(name="net", spec="net.py", checkpoint=None, checkpoint_sha256=None),
     method=MethodRecord(kind="fixed", reason="--method paper", networks=["net"]),
     settings={"layer": "middle", "iterations": 5, "lr": 0.01, "method": "fused"},
-    weights={"net": 1.0},
-    registration={"zoom": 0.9},
     alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
     loss=[1.0, None],
     errors={"used": {"before": {"mae": 1.0, "points": 9}, "after": {"mae": None, "points": 9}}},
-    improved_fraction=0.5,
     notes=["warning: far"],
     figures={"preview": FigureRecord(size=(9, 8), panels={"Image": (0, 1, 2, 3)}, scale_m=(1, 2))},
     seconds={"read": 0.1},
-    peak_memory_mb={"cpu": 9.0},
-    versions={"pnpdepth": "1"},
 )
 
 

@@ -90,12 +90,9 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
 def test_kittis_selection_pairs_its_long_names(tmp_path: Path) -> None:
     tree(tmp_path, TREES["kitti-depth"][0])
     (frame,) = read_frames(tmp_path)
-    found = [path and path.relative_to(tmp_path) for path in (frame.sparse, frame.gt, frame.calib)]
-    kinds = {"velodyne_raw": ".png", "groundtruth_depth": ".png", "intrinsics": ".txt"}
-    assert found == [
-        Path(kind, SELECTED.format(kind.replace("intrinsics", "image")) + suffix)
-        for kind, suffix in kinds.items()
-    ]
+    for path, kind in ((frame.sparse, "velodyne_raw"), (frame.gt, "groundtruth_depth")):
+        assert path == tmp_path / kind / f"{SELECTED.format(kind)}.png"
+    assert frame.calib == tmp_path / "intrinsics" / f"{SELECTED.format('image')}.txt"
     assert (frame.sparse_scale, frame.gt_scale) == (256, 256)
 
 
