@@ -1,11 +1,15 @@
+"""`pnpdepth batch`: failures, Ctrl-C, progress, and `--vary`."""
+
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,12 +20,17 @@ from pnpdepth_cli.cli.terminal import BatchProgress, progress_bar
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
+NETWORK = ["--model", "drive/net/my_net.py", "--checkpoint", "drive/net/my_net.safetensors"]
 FAILED = FrameRecord(name="x", status="failed", message="bad")
 
 
 def arguments(*more: str) -> list[str]:
-    network = ["--model", "drive/net/my_net.py", "--checkpoint", "drive/net/my_net.safetensors"]
-    return ["batch", "drive", "-o", "out", *network, "--propagate", "none", *more]
+    return ["batch", "drive", "-o", "out", *NETWORK, "--propagate", "none", *more]
+
+
+def summaries() -> dict[str, dict[str, Any]]:
+    """What summary.json says, by the folder."""
+    return {p.parent.name: json.loads(p.read_text()) for p in Path("out").glob("*/summary.json")}
 
 
 def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
@@ -32,8 +41,7 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
         (root / part / "b.png").rename(root / part / "b\nb\x1b.png")
     assert run(arguments()) == 7
     err = capsys.readouterr().err
-    (line,) = [line for line in err.splitlines() if line.startswith("failed")]
-    assert line.startswith("failed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png is empty")
+    assert "\nfailed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png is empty" in err
     assert "out/summary.csv" in err.splitlines()[-1]
     assert "\x1b" not in err
 
@@ -120,3 +128,57 @@ def test_on_a_terminal_there_is_a_bar(
     err = capsys.readouterr().err
     assert "failed: x: bad\n" in err
     assert " 0/2" in err
+
+
+def test_every_combination_is_the_batch_with_these_options(root: Path) -> None:
+    assert run(arguments("--vary", "lr=1%,3%", "--vary", "iterations=0,2", "--limit", "1")) == 0
+    assert {*summaries()} == {f"lr={lr},iterations={k}" for lr in ("1%", "3%") for k in (0, 2)}
+    assert summaries()["lr=3%,iterations=2"]["varied"] == {"lr": "3%", "iterations": "2"}
+    plain = arguments("--lr", "3%", "--iterations", "2", "--limit", "1", "-o", "plain")
+    assert run(plain) == 0
+    depth = Path("plain/a_depth.png").read_bytes()
+    assert Path("out/lr=3%,iterations=2/a_depth.png").read_bytes() == depth
+    assert Path("out/lr=1%,iterations=2/a_depth.png").read_bytes() != depth
+
+
+def test_the_default_method_the_number_of_points_networks_and_switches_can_be_varied(
+    root: Path,
+) -> None:
+    batch = ["batch", "drive", "-o", "out", "--limit", "1"]
+    varied = ["--vary", "method=fused,paper", "--vary", "sample=20,10%"]
+    assert run([*batch, *NETWORK, *varied]) == 0
+    fixed = {name: each["fixed_by"] for name, each in summaries().items()}
+    assert [fixed[f"method=fused,sample={n}"] for n in ("20", "10%")] == [""] * 2
+    assert [fixed[f"method=paper,sample={n}"] for n in ("20", "10%")] == ["--method paper"] * 2
+    varied = ["--vary", "model=eigen-tiny,fcrn-tiny", "--vary", "uncertainty=on,off"]
+    assert run([*batch, "--iterations", "0", *varied]) == 0
+
+
+def test_a_second_run_does_only_what_is_missing_and_failed_frames_stop_no_combination(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "rgb/b.png").write_bytes(b"")
+    assert run(arguments("--limit", "1", "--vary", "iterations=0")) == 0
+    capsys.readouterr()
+    assert run(arguments("--vary", "iterations=0,1")) == 7
+    assert "(1 new)" in capsys.readouterr().err
+    counts = [each["counts"] for each in summaries().values()]
+    assert [(each["done"], each["failed"]) for each in counts] == [(1, 1)] * 2
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["colour=red"], "choose from sample, model"),
+        (["lr=1%,,3%"], "empty"),
+        (["lr=fast"], "lr must be"),
+        (["lr=1%,1%"], "twice"),
+        (["lr=1%,3%", "--lr", "1%"], "--lr is varied"),
+    ],
+)
+def test_what_cannot_be_varied_is_wrong_usage(
+    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
+) -> None:
+    assert run(arguments("--vary", *more)) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not Path("out").exists()

@@ -1,0 +1,81 @@
+"""Options of the commands: in groups of the help, few, and each said once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from pnpdepth_cli.cli.main import cli
+from pnpdepth_cli.cli.options import GroupedCommand
+from pnpdepth_cli.commands.refinement.refine_request import GROUPS, RefineRequest
+from pnpdepth_cli.settings import flag_of, options_of
+
+MOST_OPTIONS = {"refine": 30, "batch": 45}
+MOST_IN_ALL = 150
+MOST_COMMON = 12
+
+
+def commands_of(group: click.Group) -> Iterator[click.Command]:
+    for name in group.list_commands(click.Context(group)):
+        each = group.get_command(click.Context(group), name)
+        assert each is not None
+        yield from commands_of(each) if isinstance(each, click.Group) else [each]
+
+
+def own_options(command: click.Command) -> dict[str, click.Option]:
+    """The options of a command by their long names, without those that print help."""
+    found = {each.opts[-1]: each for each in command.params if isinstance(each, click.Option)}
+    return {name: each for name, each in found.items() if name not in ("--help", "--help-all")}
+
+
+COMMANDS = {str(each.name): each for each in commands_of(cli)}
+
+
+@pytest.mark.parametrize("name", ["refine", "batch", "eval"])
+def test_every_option_has_one_group_of_the_longer_help_and_those_that_matter_are_common(
+    name: str,
+) -> None:
+    # The help is printed before anything is checked.
+    arguments = [name, "missing.png", "--help-all"]
+    result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")
+    grouped, names = COMMANDS[name], {*own_options(COMMANDS[name])}
+    assert isinstance(grouped, GroupedCommand)
+    members = [option for options in grouped.groups.values() for option in options]
+    assert len(members) == len(set(members))
+    assert names <= {*members} & {*result.output.split()}
+    common = grouped.common - {"--help", "--help-all"}
+    assert common <= names
+    assert len(common) <= MOST_COMMON
+
+
+def test_no_command_has_too_many_options_and_none_but_vary_holds_others_in_its_value() -> None:
+    options = {name: own_options(command) for name, command in COMMANDS.items()}
+    assert all(len(options[name]) <= most for name, most in MOST_OPTIONS.items())
+    assert sum(map(len, options.values())) + len(own_options(cli)) <= MOST_IN_ALL
+    found = [option for each in options.values() for option in each.values()]
+    assert [o.name for o in found if "NAME=VALUE" in f"{o.metavar} {o.help}"] == ["vary"]
+
+
+def test_options_of_one_name_say_the_same_thing_in_every_command() -> None:
+    texts: dict[str, set[str | None]] = {}
+    for each in COMMANDS.values():
+        for name, option in own_options(each).items():
+            texts.setdefault(name, set()).add(option.help)
+    own = {
+        *("--output", "--image", "--calib", "--poses", "--html", "--csv", "--latex", "--protocol"),
+        *("--model", "--max-depth", "--columns"),
+    }
+    assert {name for name, helps in texts.items() if len(helps) > 1} <= own
+
+
+def test_every_field_of_a_request_has_one_name_and_its_option_is_one_of_batch() -> None:
+    request = RefineRequest()
+    groups = [request, *(getattr(request, name) for name in GROUPS)]
+    names = [each.name for group in groups for each in fields(group) if each.name not in GROUPS]
+    assert len(names) == len(set(names))
+    flags = {flag_of(each) for group in groups for each in options_of(type(group))}
+    assert flags <= {name for option in COMMANDS["batch"].params for name in option.opts}
