@@ -8,16 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
-from torch import nn
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.models.weights import read_checkpoint
+from tests.bags import write_bag
 
 
 def broken(*_: object, **__: object) -> None:
@@ -25,22 +21,11 @@ def broken(*_: object, **__: object) -> None:
     raise AttributeError("module 'library' has no attribute 'function'")
 
 
-def bag(path: Path) -> None:
-    from tests.bags import write_bag
-
-    write_bag(path)
-
-
 def onnx(path: Path) -> None:
     pytest.importorskip("onnxruntime")
     from tests.models.onnx.onnx_files import write_network
 
     write_network(path)
-
-
-def program(path: Path) -> None:
-    network = nn.Conv2d(3, 1, 3).eval()
-    torch.export.save(torch.export.export(network, (torch.rand(1, 3, 8, 8),)), path)
 
 
 def depth(path: Path) -> None:
@@ -53,15 +38,9 @@ READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]
     ("d.exr", "OpenEXR.File", depth, read_depth),
     ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
     ("d.npz", "zipfile.ZipFile", depth, read_depth),
-    ("i.jpg", "PIL.Image.open", lambda path: Image.new("RGB", (5, 4)).save(path), read_rgb),
-    ("d.mcap", "rosbags.rosbag2.Reader.open", bag, lambda path: open_bag(path).__enter__()),
+    ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, lambda path: open_bag(path).__enter__()),
     ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
-    ("n.pt2", "json.loads", program, lambda path: load_network(str(path), None)),
-    (
-        "w.pt", "pickletools.genops",
-        lambda path: torch.save({"w": torch.ones(2)}, path), read_checkpoint,
-    ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(

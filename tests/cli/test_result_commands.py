@@ -1,4 +1,4 @@
-"""`pnpdepth eval` and `pnpdepth compare` as a user has them."""
+"""`pnpdepth eval`, `compare` and `export` as a user has them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,18 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.io.depth import write_depth
-from tests.commands.frames import frame_on_disk
+from tests.commands.frames import FrameOnDisk
+from tests.commands.test_export import project, results
 
 
-def code_of(*arguments: str | Path) -> int:
-    return run([str(argument) for argument in arguments])
-
-
-def scores_of(record: dict[str, Any]) -> dict[str, Any]:
-    """The scores of a frame's record in JSON."""
-    scores: dict[str, Any] = record["errors"]["ground_truth"]["after"]
-    return scores
+def code_of(line: str) -> int:
+    return run(line.split())
 
 
 @pytest.fixture
@@ -46,32 +40,29 @@ def test_json_is_the_whole_result_with_every_option(
     frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = "--protocol garg --max-depth 10 --scale-by median --delta 1.06 --json"
-    assert code_of("eval", "out", "gt", *options.split()) == 0
+    assert code_of(f"eval out gt {options}") == 0
     record = json.loads(capsys.readouterr().out)
     assert record["scoring"]["max_depth"] == 10
     assert record["mean"]["mre"] == pytest.approx(0, abs=1e-6)  # predictions are 1.1 × too far
-    assert scores_of(record["frames"][0])["factor"] == pytest.approx(1 / 1.1)
+    scores = record["frames"][0]["errors"]["ground_truth"]["after"]
+    assert scores["factor"] == pytest.approx(1 / 1.1)
 
 
 def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path) -> None:
     Path("out/a.npy").unlink()
-    assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 7
-    text = Path("scores.csv").read_bytes().decode()
+    assert code_of("eval out gt --csv new/scores.csv") == 7
+    text = Path("new/scores.csv").read_bytes().decode()
     a, b, c, *_ = csv.DictReader(io.StringIO(text, newline=""))
     assert (a["name"], a["rmse"], a["coverage"]) == ("a", "", "")
     assert a["error"]
     assert c["name"] == "c\nd"
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
-    Path("scores.csv").write_text("mine")
-    assert code_of("eval", "out", "gt", "--csv", "scores.csv") == 2
-    assert Path("scores.csv").read_text() == "mine"
-    assert code_of("eval", "out", "gt", "--csv", "scores.csv", "--overwrite") == 7
+    assert code_of("eval out gt --csv new/scores.csv") == 2
+    assert code_of("eval out gt --csv new/scores.csv --overwrite") == 7
     before = Path("gt/e.npy").read_bytes()
-    assert code_of("eval", "out/e.npy", "gt/e.npy", "--csv", "gt/e.npy", "--overwrite") == 2
+    for file in ("gt/e.npy", "gt/e.npy/s.csv"):
+        assert code_of(f"eval out/e.npy gt/e.npy --csv {file} --overwrite") == 2
     assert Path("gt/e.npy").read_bytes() == before
-    assert code_of("eval", "out", "gt", "--csv", "gt/e.npy/s.csv") == 2
-    assert code_of("eval", "out", "gt", "--csv", "new/s.csv") == 7
-    assert Path("new/s.csv").is_file()
 
 
 def test_columns_choose_measures_and_latex_has_no_thousands_separators(
@@ -79,13 +70,13 @@ def test_columns_choose_measures_and_latex_has_no_thousands_separators(
 ) -> None:
     for path in frames.glob("*/*.npy"):
         np.save(path, 10 * np.load(path))
-    assert code_of("eval", "out", "gt", "--protocol", "kitti", "--columns", "delta1,rmse") == 0
+    assert code_of("eval out gt --protocol kitti --columns delta1,rmse") == 0
     text = capsys.readouterr().out
     assert "MAE" not in text
     assert text.index("δ1") < text.index("RMSE")
-    assert code_of("eval", "out", "gt", "--protocol", "kitti", "--json") == 0
+    assert code_of("eval out gt --protocol kitti --json") == 0
     Path("a.json").write_text(capsys.readouterr().out)
-    assert code_of("compare", "a.json", "a.json", "--columns", "delta1,rmse", "--latex", "-") == 0
+    assert code_of("compare a.json a.json --columns delta1,rmse --latex -") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[3] == r" & $\delta$1 $\uparrow$ & RMSE [mm] $\downarrow$ \\"
     name, delta, rmse = lines[5].removesuffix(r" \\").split(" & ")
@@ -94,23 +85,23 @@ def test_columns_choose_measures_and_latex_has_no_thousands_separators(
 
 
 def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frame, out = frame_on_disk(tmp_path), tmp_path / "out"
-    network = ("--model", frame.model, "--checkpoint", frame.checkpoint)
-    files = (frame.image, "--sparse", frame.sparse, "--gt", frame.gt, "-o", out)
-    assert code_of("refine", *files, *network) == 0
-    capsys.readouterr()
-    (tmp_path / "gt").mkdir()
-    (tmp_path / "gt" / "img.png").write_bytes(frame.gt.read_bytes())
-    assert code_of("eval", out, tmp_path / "gt", "--json") == 0
-    record = json.loads(capsys.readouterr().out)
+    out, truth = frame.folder / "out", frame.folder / "gt"
+    files = f"{frame.image} --sparse {frame.sparse} --gt {frame.gt} -o {out}"
+    assert code_of(f"refine {files} --model {frame.model} --checkpoint {frame.checkpoint}") == 0
     refined = json.loads((out / "img.json").read_text())
+    truth.mkdir()
+    (truth / "img.png").write_bytes(frame.gt.read_bytes())
+    capsys.readouterr()
+    assert code_of(f"eval {out} {truth} --json") == 0
+    (scored,) = json.loads(capsys.readouterr().out)["frames"]
+    after = scored["errors"]["ground_truth"]["after"]
     # the depth was written as whole millimetres
-    assert record["mean"]["mae"] == pytest.approx(scores_of(refined)["mae"], abs=1 / 1000)
-    (scored,) = record["frames"]
+    mae = refined["errors"]["ground_truth"]["after"]["mae"]
+    assert after["mae"] == pytest.approx(mae, abs=1 / 1000)
     assert scored["inputs"]["image"]["path"] == str(frame.image)
-    assert scores_of(scored)["given"] == 60
+    assert after["given"] == 60
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")
@@ -120,5 +111,15 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
     for folder in ("out", "gt"):
         Path(folder, "a.npy").rename(Path(folder, os.fsdecode(b"\xff.npy")))
     for form in ("--json", "--csv -", "--columns rmse"):
-        assert code_of("eval", "out", "gt", *form.split()) == 0
+        assert code_of(f"eval out gt {form}") == 0
     assert b"\\udcff" in capfdbinary.readouterr().out
+
+
+def test_exported_frames_are_counted_and_warnings_go_to_stderr(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, dense = results(project(tmp_path, "OPENCV")), tmp_path / "dense"
+    assert code_of(f"export {folder} --to colmap -o {dense}") == 0
+    out, err = capsys.readouterr()
+    assert out == f"wrote 3 frames in model units: {dense}\n"
+    assert " 3 of 3 images have lens distortion" in err
