@@ -18,15 +18,7 @@ RELATIVE_ERRORS = {torch.float32: 1e-6, torch.float64: 2e-15}
 """The largest ones: 8 roundings, as of a sum of some hundred products in another order."""
 
 PRODUCTS = {
-    "convolution",
-    "convolution_backward",
-    "mm",
-    "addmm",
-    "bmm",
-    "baddbmm",
-    "mv",
-    "addmv",
-    "dot",
+    *("convolution", "convolution_backward", "mm", "addmm", "bmm", "baddbmm", "mv", "addmv", "dot"),
     "_scaled_dot_product_flash_attention_for_cpu",
     "_scaled_dot_product_flash_attention_for_cpu_backward",
 }
@@ -51,13 +43,7 @@ def changed(values: torch.Tensor) -> torch.Tensor:
 class OtherRoundings(TorchDispatchMode):
     """Changes the results of the products while it is entered, forward and backward."""
 
-    def __torch_dispatch__(
-        self,
-        func: Any,
-        types: Any,
-        args: tuple[Any, ...] = (),
-        kwargs: dict[str, Any] | None = None,
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """What func returns, changed in place if it is a product of real numbers."""
         result = func(*args, **(kwargs or {}))
         is_product = func.overloadpacket.__name__.removesuffix("_") in PRODUCTS

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,36 +18,24 @@ from pnpdepth_cli.io.depth import read_depth
 ROOT = Path(__file__).parent.parent
 
 
-def setuptools_settings() -> dict[str, Any]:
-    """Those of pyproject.toml."""
+def test_the_wheel_holds_every_package_and_file_but_the_training_code() -> None:
     tomllib = pytest.importorskip("tomllib", reason="tomllib came with Python 3.11")
-    settings: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    return settings["tool"]["setuptools"]
-
-
-def test_the_wheel_holds_every_package_but_the_training_code() -> None:
     find_packages = pytest.importorskip("setuptools").find_packages
-    packages = find_packages(str(ROOT), **setuptools_settings()["packages"]["find"])
-    folders = (
-        p.parent
-        for r in ("pnpdepth_cli", "model_zoo_defs")
-        for p in (ROOT / r).rglob("__init__.py")
-    )
-    names = (".".join(f.relative_to(ROOT).parts) for f in folders)
-    assert sorted(packages) == sorted(
-        n for n in names if not n.startswith("model_zoo_defs.training")
-    )
-
-
-def test_every_file_that_is_no_module_is_listed_for_the_wheel() -> None:
-    for package, patterns in setuptools_settings()["package-data"].items():
-        listed = {path for pattern in patterns for path in (ROOT / package).glob(pattern)}
-        training = ROOT / "model_zoo_defs" / "training"  # stays out of the wheel
-        files = {path for path in (ROOT / package).rglob("*") if path.is_file()}
-        files = {path for path in files if training not in path.parents}
-        left_out = {path for path in files - listed if path.suffix not in (".py", ".pyc")}
-        weights = {path for path in left_out if path.name.endswith(".safetensors")}
-        assert left_out == weights  # of editions that lie in the repository alone
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    packages = set(find_packages(str(ROOT), **settings["packages"]["find"]))
+    files = {
+        path
+        for package in ("pnpdepth_cli", "model_zoo_defs")
+        for path in (ROOT / package).rglob("*")
+        if path.is_file() and "training" not in path.parts
+    }
+    folders = {path.parent for path in files if path.name == "__init__.py"}
+    assert packages == {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    patterns = settings["package-data"].items()
+    listed = {p for package, globs in patterns for g in globs for p in (ROOT / package).glob(g)}
+    left_out = {path for path in files - listed if path.suffix not in (".py", ".pyc")}
+    # the weights of editions that lie in the repository alone
+    assert {path.suffix for path in left_out} <= {".safetensors"}
 
 
 def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
@@ -62,8 +49,6 @@ def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
 
 def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pnpdepth_cli"]
-    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout == f"pnpdepth, version {pnp.__version__}\n"
     command += ["refine", "no.png", "--sparse", "no.png"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
@@ -107,7 +92,6 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
     (wheel,) = (source / "dist").glob("*.whl")
     assert wheel.stat().st_size < 12e6
     names = zipfile.ZipFile(wheel).namelist()
-    assert "model_zoo_defs/weights/compact.safetensors" in names
     assert not [name for name in names if "training" in name or name.startswith("tests")]
     zipfile.ZipFile(wheel).extractall(installed)
 
@@ -117,14 +101,13 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
         "import pnpdepth_cli; print(pnpdepth_cli.__file__)\n"
         "from pnpdepth_cli.cli.main import main; main()"
     )
-    command = [sys.executable, "-c", code, "refine", str(sample / "rgb.png"), "--sparse"]
-    command += [str(sample / "sparse.png"), "-o"]
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    command = [sys.executable, "-c", code, "refine", sample / "rgb.png"]
+    command += ["--sparse", sample / "sparse.png", "-o"]
 
     def refine(*more: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [*command, *more], env=environment, cwd=empty, capture_output=True, text=True,
-            check=False,
+            [*command, *more], env={**os.environ, "PYTHONPATH": str(installed)}, cwd=empty,
+            capture_output=True, text=True, check=False,
         )  # fmt: skip
 
     done = refine("out")
