@@ -29,11 +29,8 @@ SLOW_FIXTURES = {"chrome", "shared_data"}
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Adds --rounding."""
-    parser.addoption(
-        "--rounding",
-        action="store_true",
-        help="change the results of torch's products as another processor could",
-    )
+    text = "change the results of torch's products as another processor could"
+    parser.addoption("--rounding", action="store_true", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -26,14 +26,12 @@ SHOWN = dict(re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```', PAGE, flags=re.DOTA
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that holds the page's files as an installed package, and the samples."""
     folder = tmp_path_factory.mktemp("extending")
-    (folder / "my_package").mkdir()
-    (folder / "my_package" / "__init__.py").touch()
-    for name, text in SHOWN.items():
-        if name.endswith(".py"):
-            (folder / "my_package" / name).write_text(text)
-    (folder / "my_package" / "my_net.py").write_text(titled_blocks(YOUR_NETWORK)["my_net.py"])
     info = folder / "my_package-1.0.dist-info"
-    info.mkdir()
+    for each in (folder / "my_package", info):
+        each.mkdir()
+    files = {**SHOWN, "__init__.py": "", "my_net.py": titled_blocks(YOUR_NETWORK)["my_net.py"]}
+    for name, text in files.items():
+        (folder / "my_package" / name).write_text(text)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
     entries = SHOWN["pyproject.toml"].replace('[project.entry-points."', "[").replace('"]\n', "]\n")
     (info / "entry_points.txt").write_text(entries.replace('"', ""))
@@ -52,16 +50,14 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
     more = ["--propagate", "median", "--baselines", "--format", "raw"]
-    (package / "list.csv").write_text(
-        "image,sparse,calib\nindoor/rgb.png,indoor/sparse.png,k.txt\n"
-    )
+    frames = "image,sparse,calib\nindoor/rgb.png,indoor/sparse.png,k.txt\n"
+    (package / "list.csv").write_text(frames)
     (package / "k.txt").write_text("K: [550, 0, 320, 0, 550, 240, 0, 0, 1]")
     run(["batch", "list.csv", *network, *method, *more, "-o", "out"], package)
     record = json.loads((package / "out" / "rgb.json").read_text())
     assert record["model"]["name"] == "my-net"
-    assert record["settings"]["loss"] == "charbonnier"
-    assert record["settings"]["update"] == "rmsprop"
-    assert record["settings"]["propagate"] == "median"
+    named = [record["settings"][key] for key in ("loss", "update", "propagate")]
+    assert named == ["charbonnier", "rmsprop", "median"]
     assert record["errors"]["validation"]["farthest"]["mae"] > 0
     assert record["loss"][-1] < record["loss"][0]
     files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]

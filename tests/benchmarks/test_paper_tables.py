@@ -26,23 +26,18 @@ def test_all_depths_are_scored_on_the_same_pixels() -> None:
     before = np.array([[2.0, 2.2, 9.0, 9.0]], np.float32)
     after = np.array([[2.0, 2.0, -1.0, 9.0]], np.float32)
     scores, coverage = scores_of({"before": before, "after": after}, gt)
-    assert scores["before"]["mae"] == pytest.approx(0.1)
-    assert scores["before"]["delta1"] == 100
-    assert scores["before"]["fine1"] == 50
-    assert scores["after"]["mae"] == 0
+    measured = [scores["before"][key] for key in ("mae", "delta1", "fine1")]
+    assert [*measured, scores["after"]["mae"]] == pytest.approx([0.1, 100, 50, 0])
     assert coverage == pytest.approx(2 / 3)
 
 
 def test_rendered_frames_come_from_the_cache_and_end_at_the_kinects_range(tmp_path: Path) -> None:
     depth = np.full((4, 228, 304), 3.0, np.float32)
     depth[:, :, :100] = 11.0
+    rgb, lens = np.full((4, 228, 304, 3), 51, np.uint8), np.tile(LENS, (4, 1))
     ROOMS.folder(tmp_path).mkdir()
-    np.savez(
-        ROOMS.folder(tmp_path) / "shard_00000.npz",
-        rgb=np.full((4, 228, 304, 3), 51, np.uint8),
-        depth=depth,
-        intrinsics=np.tile(LENS, (4, 1)),
-    )
+    shard = ROOMS.folder(tmp_path) / "shard_00000.npz"
+    np.savez(shard, rgb=rgb, depth=depth, intrinsics=lens)
     frames = list(rendered(ROOMS, tmp_path, 3, workers=1).frames())
     assert len(frames) == 3
     assert frames[0].rgb.max() == np.float32(0.2)
@@ -56,14 +51,11 @@ def test_the_table_has_a_row_for_each_network_that_takes_the_points(tmp_path: Pa
     scan[20::2, ::2] = 15.0
     image = np.zeros((100, 400, 3), np.float32)
     entries = entries_of(["sparseconv-tiny", "adnn-tiny"])[0]
+    with_scan = TableFrame(rgb=image, gt=wall, pool=scan, scan=scan)
+    walls = {"name": "walls", "street": True, "count": 1}
     tables = [
-        table_of(
-            FrameSet(name="walls", street=True, count=1, frames=lambda f=frame: iter([f])), entries
-        )
-        for frame in (
-            TableFrame(rgb=image, gt=wall, pool=scan, scan=scan),
-            TableFrame(rgb=image, gt=wall, pool=wall),
-        )
+        table_of(FrameSet(**walls, frames=lambda frame=frame: iter([frame])), entries)
+        for frame in (with_scan, TableFrame(rgb=image, gt=wall, pool=wall))
     ]
     rows = [[(row["network"], row["points"]) for row in table["rows"]] for table in tables]
     assert rows == [[("sparseconv-tiny", 40 * 200), ("adnn-tiny", 40 * 200)], []]

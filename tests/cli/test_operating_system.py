@@ -72,7 +72,6 @@ def test_a_full_stdout_and_too_little_memory_are_one_line(tmp_path: Path) -> Non
     [
         (MemoryError(), 6, "memory is exhausted"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 6, "memory is exhausted"),
-        (ImportError("failed to map segment from shared object"), 6, "memory is exhausted"),
         (PermissionError(errno.EACCES, "Permission denied", str(GT)), 3, "gt.png: Permission"),
         (OSError(errno.ENOSPC, "No space left on device"), 2, "No space"),
         (KeyboardInterrupt(), 130, "interrupted"),
