@@ -150,7 +150,7 @@ def test_the_guide_of_reconstruction_gives_the_scene_and_every_export(folder: Pa
     points = np.array([model.points3D[n].xyz for n in seen if model.points3D[n].track.length() > 2])
     pose = image.cam_from_world()
     depth = (points @ pose.rotation.matrix().T + pose.translation)[:, 2]
-    cloud = read_scan(folder / "room" / "scene.ply").points[:, :3]
+    cloud = read_scan(folder / "room" / "scene.ply")[0][:, :3]
     assert len(cloud) > 10_000
     near = depth < 1.5 * np.median(depth)
     off, _ = cKDTree(cloud).query(points[near])
