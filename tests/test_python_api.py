@@ -159,13 +159,9 @@ def test_arrays_that_cannot_be_used_are_named(
 def test_every_form_of_an_image_is_read_alike() -> None:
     grey = np.random.default_rng(0).integers(0, 256, (6, 8, 1), np.uint8)
     rgb = grey.repeat(3, axis=2)
-    floats, tensor = rgb / np.float32(255), torch.from_numpy(rgb)
-    expected = frame_of_arrays(rgb, [[1.0, 2, 3]]).rgb
-    assert expected is not None
-    for form in (floats, tensor, grey[:, :, 0]):
-        given = frame_of_arrays(form, [[1.0, 2, 3]]).rgb
-        assert given is not None
-        assert torch.equal(given, expected)
+    forms = (rgb, rgb / np.float32(255), torch.from_numpy(rgb), grey[:, :, 0])
+    expected, *others = (frame_of_arrays(form, [[1.0, 2, 3]]).rgb for form in forms)
+    assert all(torch.equal(given, expected) for given in others)
 
 
 def test_rows_that_are_no_points_of_the_image_are_counted() -> None:

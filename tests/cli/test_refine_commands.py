@@ -14,14 +14,12 @@ from typing import Any
 import pytest
 
 from pnpdepth_cli.cli import refine_commands as command
-from pnpdepth_cli.cli import terminal
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.terminal import BatchProgress, progress_bar
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
 NETWORK = ["--model", "drive/net/my_net.py", "--checkpoint", "drive/net/my_net.safetensors"]
-FAILED = FrameRecord(name="x", status="failed", message="bad")
 
 
 def arguments(*more: str) -> list[str]:
@@ -102,32 +100,18 @@ def test_without_a_terminal_there_is_a_line_a_minute(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = 0.0
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: now)
+    monkeypatch.setattr("time.monotonic", lambda: now)
     with progress_bar("batch", "frame") as show:
         display = BatchProgress(show, lambda: False)
         display.begin(600)
         for number in range(300):
             now += 1.0
-            display.frame(FAILED if number == 10 else FrameRecord(name="y"))
+            status = "failed" if number == 10 else "done"
+            display.frame(FrameRecord(name="x", status=status, message="bad"))
     failed, first, *others = capsys.readouterr().err.splitlines()
     assert failed == "failed: x: bad"
     assert "60/600 [01:00<09:00" in first
     assert len(others) == 4
-
-
-def test_on_a_terminal_there_is_a_bar(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(terminal, "_SHOWN_AFTER_S", 0)
-    with progress_bar("batch", "frame") as show:
-        display = BatchProgress(show, lambda: False)
-        display.begin(2)
-        display.frame(FAILED)
-        display.frame(FrameRecord(name="y"))
-    err = capsys.readouterr().err
-    assert "failed: x: bad\n" in err
-    assert " 0/2" in err
 
 
 def test_every_combination_is_the_batch_with_these_options(root: Path) -> None:
