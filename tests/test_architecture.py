@@ -97,9 +97,7 @@ def test_a_library_is_imported_only_where_it_belongs() -> None:
 
 def imports_nothing_of(heavy: str, code: str, *arguments: str) -> str:
     """What a process printed that ran the code and had none of these modules at its end."""
-    check = (
-        f"\nimport sys\nbad = {set(heavy.split())} & set(sys.modules)\nassert not bad, bad"
-    )
+    check = f"\nimport sys\nbad = {set(heavy.split())} & set(sys.modules)\nassert not bad, bad"
     command = [sys.executable, "-c", code + check, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

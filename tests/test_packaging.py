@@ -47,15 +47,6 @@ def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
     assert first == f"## {pnp.__version__} ({released})\n"
 
 
-def test_the_package_runs_as_a_module_like_the_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pnpdepth_cli"]
-    command += ["refine", "no.png", "--sparse", "no.png"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
-    assert done.stderr.startswith("pnpdepth: ")
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() -> None:
     scripts = Path(sys.executable).parent
     if not (shutil.which("bash") and (scripts / "pnpdepth").is_file()):
@@ -73,6 +64,20 @@ def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() 
         check=True,
     )  # fmt: skip
     assert done.stdout.split() == ["cloud", "--uncertainty"]
+
+
+def test_the_public_ci_runs_every_part_of_the_script_on_the_lowest_and_the_highest_python() -> None:
+    yaml, tomllib = map(pytest.importorskip, ("yaml", "tomllib"))
+    script = (ROOT / ".ci" / "run").read_text()
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    steps = [step["run"].split() for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert {program for program, *_ in steps} == {".ci/run"}
+    parts = {part for _, *parts in steps for part in parts if part.isalpha()}
+    parts |= {row["part"] for row in jobs["more"]["strategy"]["matrix"]["include"]}
+    assert parts == {*re.findall(r"^part_(\w+)\(\)", script, re.MULTILINE)}
+    classifiers = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["classifiers"]
+    lowest, *_, highest = (c.split()[-1] for c in classifiers if "Python :: 3." in c)
+    assert jobs["readme"]["strategy"]["matrix"]["python"] == [lowest, highest]
 
 
 @pytest.mark.slow

@@ -7,10 +7,8 @@ import pytest
 
 from benchmarks.paper_figures import ROWS, PaperRow
 from benchmarks.paper_report import bars_of, markdown
-from benchmarks.paper_sets import ROOMS, FrameSet, TableFrame, rendered
+from benchmarks.paper_sets import FrameSet, TableFrame
 from benchmarks.paper_tables import entries_of, scores_of, table_of
-
-LENS = np.array([721.3, 721.3, 455.5, 36.4], np.float32)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.name}-{row.street}")
@@ -29,20 +27,6 @@ def test_all_depths_are_scored_on_the_same_pixels() -> None:
     measured = [scores["before"][key] for key in ("mae", "delta1", "fine1")]
     assert [*measured, scores["after"]["mae"]] == pytest.approx([0.1, 100, 50, 0])
     assert coverage == pytest.approx(2 / 3)
-
-
-def test_rendered_frames_come_from_the_cache_and_end_at_the_kinects_range(tmp_path: Path) -> None:
-    depth = np.full((4, 228, 304), 3.0, np.float32)
-    depth[:, :, :100] = 11.0
-    rgb, lens = np.full((4, 228, 304, 3), 51, np.uint8), np.tile(LENS, (4, 1))
-    ROOMS.folder(tmp_path).mkdir()
-    shard = ROOMS.folder(tmp_path) / "shard_00000.npz"
-    np.savez(shard, rgb=rgb, depth=depth, intrinsics=lens)
-    frames = list(rendered(ROOMS, tmp_path, 3, workers=1).frames())
-    assert len(frames) == 3
-    assert frames[0].rgb.max() == np.float32(0.2)
-    assert set(np.unique(frames[0].gt)) == {0, 3}
-    assert frames[0].scan is None
 
 
 def test_the_table_has_a_row_for_each_network_that_takes_the_points(tmp_path: Path) -> None:

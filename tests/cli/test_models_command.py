@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from importlib import metadata
 
 import pytest
@@ -27,15 +24,6 @@ def test_layers_says_why_a_layer_cannot_be_cut_at(
     lines = capsys.readouterr().out.splitlines()
     shown = {words[0]: words[1:] for words in map(str.split, lines) if words}
     assert shown["unused"] == ["–", *rows["unused"]["problem"].split()]
-
-
-def test_a_stdout_that_cannot_show_every_character_shows_the_others(frame: FrameOnDisk) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pnpdepth_cli", "eval", frame.gt, frame.gt],
-        env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr.decode()
-    assert b"?1 ?  " in done.stdout
 
 
 def test_an_onnx_file_is_refined_and_checked(

@@ -14,7 +14,6 @@ import pytest
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.io.depth import write_depth
-from tests.commands.frames import FrameOnDisk
 from tests.commands.test_export import project, results
 
 
@@ -82,26 +81,6 @@ def test_columns_choose_measures_and_latex_has_no_thousands_separators(
     name, delta, rmse = lines[5].removesuffix(r" \\").split(" & ")
     assert (name, delta) == ("a.json", r"\textbf{100.00\%}")
     assert float(rmse.removeprefix(r"\textbf{").removesuffix("}")) > 1000
-
-
-def test_a_refinement_scores_the_same_when_its_files_are_evaluated(
-    frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, truth = frame.folder / "out", frame.folder / "gt"
-    files = f"{frame.image} --sparse {frame.sparse} --gt {frame.gt} -o {out}"
-    assert code_of(f"refine {files} --model {frame.model} --checkpoint {frame.checkpoint}") == 0
-    refined = json.loads((out / "img.json").read_text())
-    truth.mkdir()
-    (truth / "img.png").write_bytes(frame.gt.read_bytes())
-    capsys.readouterr()
-    assert code_of(f"eval {out} {truth} --json") == 0
-    (scored,) = json.loads(capsys.readouterr().out)["frames"]
-    after = scored["errors"]["ground_truth"]["after"]
-    # the depth was written as whole millimetres
-    mae = refined["errors"]["ground_truth"]["after"]["mae"]
-    assert after["mae"] == pytest.approx(mae, abs=1 / 1000)
-    assert scored["inputs"]["image"]["path"] == str(frame.image)
-    assert after["given"] == 60
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")

@@ -1,0 +1,206 @@
+"""Every error is a line on stderr and the exit code of its kind; a bug is its traceback and 1."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.cli.main import cli, run
+from pnpdepth_cli.io.bags import open_bag
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.models.network import load_network
+from tests.bags import write_bag
+from tests.commands.scan_frames import scan_on_disk
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+GT = SAMPLES / "indoor" / "gt.png"
+POSIX = pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
+NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors"
+COMMANDS = {
+    "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
+    "batch": f"drive -o out {NETWORK}",
+    "sample": "drive/gt/a.png -o sparse.png",
+    "simulate": "drive/gt/a.png --calib calib.txt --sensor vlp-16 -o sparse.png",
+    "project": "img.bin --calib calib.txt -o sparse.png",
+    "eval": "drive/gt drive/gt",
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "more", "code", "message"),
+    [
+        ("refine", f"--layer {'n' * 5000}", 4, "layers --all"),
+        ("refine", f"--model {'n' * 5000}.onnx", 3, ": "),
+        ("refine", "--checkpoint missing.pt", 4, "does not exist"),
+        ("refine", "--device cuda:9", 6, "device cpu"),
+        ("batch", "--shard 0/2", 2, "1/4"),
+        ("batch", "--poses one_pose.txt", 3, "has 1 poses for 2 frames"),
+        ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
+        ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
+        ("--max-pixels 10 sample", "--count 5", 3, "pixels"),
+        ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
+        ("project", "--image missing.png", 3, "missing.png"),
+        ("eval", "--protocol kiti", 2, "kitti"),
+        ("eval", "--columns rmse,none", 2, "--columns none is not one of rmse, mae"),
+        ("compare a.json b.json", "--csv x --latex ./x", 2, "--csv and --latex are the same file"),
+        ("eval", "--json --csv -", 2, "can go to stdout"),
+        ("eval", "--protocol nyu-eigen", 3, "640×480"),
+        ("compare missing.json", "missing.json", 3, "missing.json"),
+        ("compare bad.json", "bad.json", 3, "bad.json"),
+    ],
+)
+def test_the_exit_code_is_that_of_the_kind_of_error(
+    root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
+) -> None:
+    scan_on_disk(root.parent)
+    Path("one_pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    Path("bad.json").write_text('{"frames": [{"name": "a", "scores": 3}]}')
+    before = sorted(root.rglob("*"))
+    assert run(f"{command} {COMMANDS.get(command.split()[-1], '')} {more}".split()) == code
+    out, err = capsys.readouterr()
+    last = err.splitlines()[-1]
+    assert message in last
+    assert len(last) < 2100
+    assert (out, "Traceback" in err) == ("", False)
+    assert sorted(root.rglob("*")) == before
+    # a network is loaded in the folder of its results, which stays
+    outputs = ("sparse.png", "w.safetensors", "x", *(["out"] if code < 4 else []))
+    assert not any(Path(name).exists() for name in outputs)
+
+
+def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The finished line of bash, in which `pnpdepth` is this tree's."""
+    script = f'pnpdepth() {{ {sys.executable} -m pnpdepth_cli "$@"; }}\nset -o pipefail\n{line}\n'
+    environment = os.environ | {"PYTHONPATH": str(SAMPLES.parent)}
+    return subprocess.run(
+        ["bash", "-c", script], cwd=folder, env=environment,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@POSIX
+def test_a_reader_that_stops_early_is_no_error(tmp_path: Path) -> None:
+    write_depth(tmp_path / "a.npy", np.full((8, 8), 2, np.float32))
+    for command in ("eval a.npy a.npy 2>/dev/null", "eval a.npy a.npy --json 2>&1", "--help"):
+        done = shell(f"pnpdepth {command} | true", tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+@POSIX
+def test_a_stdout_that_cannot_show_every_character_shows_the_others(tmp_path: Path) -> None:
+    write_depth(tmp_path / "a.npy", np.full((8, 8), 2, np.float32))
+    done = shell("PYTHONIOENCODING=ascii pnpdepth eval a.npy a.npy", tmp_path)
+    assert "?1 ?  " in done.stdout
+
+
+@POSIX
+def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: Path) -> None:
+    for path in (tmp_path / "pred", tmp_path / "gt"):
+        path.mkdir()
+        for name in "ab":
+            write_depth(path / f"{name}.exr", np.full((40, 30), 2.0, np.float32))
+    data = bytearray((tmp_path / "pred/b.exr").read_bytes())
+    # three blocks of 16 rows, whose offsets stand before the first of them
+    table = next(p for p in range(len(data)) if struct.unpack_from("<Q", data, p)[0] == p + 24)
+    (second,) = struct.unpack_from("<Q", data, table + 8)
+    data[second : second + 4] = b"\xff\xff\xff\x7f"  # the number of its first row
+    (tmp_path / "pred/b.exr").write_bytes(data)
+    done = shell("pnpdepth eval pred gt --json", tmp_path)
+    assert done.returncode == 7, done.stderr
+    assert json.loads(done.stdout)["counts"]["scored"] == 1
+    assert "Warning: Exception raised" not in done.stderr  # OpenEXR's own
+
+
+@POSIX
+def test_a_full_stdout_and_too_little_memory_are_one_line(tmp_path: Path) -> None:
+    lines = {f"ulimit -v 300000; pnpdepth refine {GT} --sparse {GT} -o out": 6}
+    if Path("/dev/full").exists():
+        lines["pnpdepth --help >/dev/full"] = 2
+    for line, code in lines.items():
+        done = shell(line, tmp_path)
+        assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (MemoryError(), 6, "memory is exhausted"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 6, "memory is exhausted"),
+        (PermissionError(errno.EACCES, "Permission denied", str(GT)), 3, "gt.png: Permission"),
+        (OSError(errno.ENOSPC, "No space left on device"), 2, "No space"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_an_error_of_the_system_is_one_line(
+    error: BaseException, code: int, line: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def failing(context: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "invoke", failing)
+    assert run(["doctor"]) == code
+    err = capsys.readouterr().err.strip()
+    assert line in err
+    assert "\n" not in err
+
+
+def broken(*_: object, **__: object) -> None:
+    """As after a library renamed what is used of it."""
+    raise AttributeError("module 'library' has no attribute 'function'")
+
+
+def onnx(path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    from tests.models.onnx.onnx_files import write_network
+
+    write_network(path)
+
+
+def depth(path: Path) -> None:
+    write_depth(path, np.ones((4, 5), np.float32))
+
+
+READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]]] = [
+    ("d.png", "PIL.Image.open", depth, read_depth),
+    ("d.tif", "PIL.TiffImagePlugin.ImageFileDirectory_v2", depth, read_depth),
+    ("d.exr", "OpenEXR.File", depth, read_depth),
+    ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
+    ("d.npz", "zipfile.ZipFile", depth, read_depth),
+    ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, lambda path: open_bag(path).__enter__()),
+    ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "make", "read"), READERS, ids=[name for name, *_ in READERS]
+)
+def test_a_library_without_a_function_is_no_damaged_file(
+    name: str, function: str, make: Callable[[Path], object], read: Callable[[Path], object],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    pytest.importorskip(function.partition(".")[0])
+    make(tmp_path / name)
+    monkeypatch.setattr(function, broken)
+    with pytest.raises(AttributeError, match="no attribute 'function'"):
+        read(tmp_path / name)
+
+
+def test_a_bug_ends_with_code_1_and_its_traceback_on_stderr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth(tmp_path / "d.png")
+    monkeypatch.setattr("PIL.Image.open", broken)
+    assert run(["sample", str(tmp_path / "d.png"), "--count", "3", "-o", "s.png"]) == 1
+    err = capsys.readouterr().err
+    assert "AttributeError" in err.splitlines()[-1]
+    assert "in broken" in err
