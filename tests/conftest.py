@@ -63,10 +63,3 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-
-
-@pytest.fixture
-def seeded() -> torch.Generator:
-    """A generator with seed 0; torch's own random numbers start from seed 0 too."""
-    torch.manual_seed(0)
-    return torch.Generator().manual_seed(0)

@@ -30,9 +30,8 @@ def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -
 
 def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:
     check_claim("a has 5 bytes", 5, 5)
-    for size in (6, -1):
-        with pytest.raises(FileFormatError, match=r"^a has bytes, more than 5; make it smaller$"):
-            check_claim("a has bytes", size, 5, way_out="make it smaller")
+    with pytest.raises(FileFormatError, match=r"^a has bytes, more than 5; make it smaller$"):
+        check_claim("a has bytes", -1, 5, way_out="make it smaller")
     with pytest.raises(ModelError):
         check_claim("a has 6 bytes", 6, 5, error=ModelError)
 

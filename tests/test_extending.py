@@ -22,10 +22,10 @@ PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 SHOWN = dict(re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```', PAGE, flags=re.DOTALL | re.MULTILINE))
 
 
-@pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
     """A folder that holds the page's files as an installed package, and the samples."""
-    folder = tmp_path_factory.mktemp("extending")
+    folder = tmp_path
     info = folder / "my_package-1.0.dist-info"
     for each in (folder / "my_package", info):
         each.mkdir()
@@ -73,12 +73,9 @@ def test_the_files_of_the_page_work_from_another_package(package: Path) -> None:
     raw = (package / "out" / "rgb_depth.raw").read_bytes()
     depth = np.load(package / "exported" / "rgb.npy")
     np.testing.assert_array_equal(depth.ravel(), np.frombuffer(raw, "<f4", offset=12))
-
-
-def test_the_layout_of_the_page_lists_frames(package: Path) -> None:
-    data = package / "data"
-    data.mkdir()
-    shutil.copy(package / "indoor" / "rgb.png", data / "a_image.png")
-    shutil.copy(package / "indoor" / "sparse.png", data / "a_lidar.png")
-    run(["batch", "data", "-o", "out", "--iterations", "0"], package)
-    assert (package / "out" / "a.json").is_file()
+    # A folder in the layout of the page.
+    (package / "data").mkdir()
+    shutil.copy(package / "indoor" / "rgb.png", package / "data" / "a_image.png")
+    shutil.copy(package / "indoor" / "sparse.png", package / "data" / "a_lidar.png")
+    run(["batch", "data", "-o", "flat", "--iterations", "0"], package)
+    assert (package / "flat" / "a.json").is_file()

@@ -170,19 +170,22 @@ def depth(path: Path) -> None:
     write_depth(path, np.ones((4, 5), np.float32))
 
 
-READERS: list[tuple[str, str, Callable[[Path], object], Callable[[Path], object]]] = [
-    ("d.png", "PIL.Image.open", depth, read_depth),
-    ("d.tif", "PIL.TiffImagePlugin.ImageFileDirectory_v2", depth, read_depth),
-    ("d.exr", "OpenEXR.File", depth, read_depth),
-    ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
-    ("d.npz", "zipfile.ZipFile", depth, read_depth),
-    ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, lambda path: open_bag(path).__enter__()),
-    ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
-]
-
-
 @pytest.mark.parametrize(
-    ("name", "function", "make", "read"), READERS, ids=[name for name, *_ in READERS]
+    ("name", "function", "make", "read"),
+    [
+        ("d.png", "PIL.Image.open", depth, read_depth),
+        ("d.tif", "PIL.TiffImagePlugin.ImageFileDirectory_v2", depth, read_depth),
+        ("d.exr", "OpenEXR.File", depth, read_depth),
+        ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
+        ("d.npz", "zipfile.ZipFile", depth, read_depth),
+        (
+            "d.mcap",
+            "rosbags.rosbag2.Reader.open",
+            write_bag,
+            lambda path: open_bag(path).__enter__(),
+        ),
+        ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
+    ],
 )
 def test_a_library_without_a_function_is_no_damaged_file(
     name: str, function: str, make: Callable[[Path], object], read: Callable[[Path], object],
