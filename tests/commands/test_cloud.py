@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +20,29 @@ from pnpdepth_cli.io.scans import read_scan
 HEIGHT, WIDTH = 24, 32
 
 
-def frame(
-    folder: Path, name: str, depth: float = 2.0, outputs: dict[str, str] | None = None
-) -> Path:
-    """A depth file as `refine` writes it, with its image and record."""
+def frame(folder: Path, name: str, depth: float = 2.0, **record: Any) -> Path:
+    """A depth file as `refine` writes it, with its image and these entries of its record."""
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}_depth.png"
     write_depth(path, np.full((HEIGHT, WIDTH), depth, np.float32))
     image = folder / f"{name}.png"
     cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8))
     inputs = {"image": FileRecord(path=str(image))}
-    FrameRecord(inputs=inputs, outputs=outputs or {}).write(folder / f"{name}.json")
+    FrameRecord(inputs=inputs, size=(WIDTH, HEIGHT), **record).write(folder / f"{name}.json")
     return path
+
+
+def camera(right: float | None) -> CameraRecord:
+    """A camera that is so far to the right in the world; None: its pose is unknown."""
+    pose = None if right is None else [[1.0, 0, 0, right], [0, 1, 0, 0], [0, 0, 1, 0]]
+    intrinsics = [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
+    return CameraRecord(
+        intrinsics=intrinsics, lens="radial-tangential", source="made up", pose=pose
+    )
+
+
+def points_of(path: Path) -> np.ndarray:
+    return read_scan(path)[0][:, :3]
 
 
 def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
@@ -41,41 +51,26 @@ def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
     calib.write_text(f"30 0 {WIDTH / 2} 0 30 {HEIGHT / 2} 0 0 1\n")
     request = CloudRequest(**({"depth": path, "output": output, "calib": calib} | values))
     what, notes = write_depth_cloud(request)
-    count = len(read_scan(output)[0])
+    count = len(points_of(output))
     assert what.startswith(f"{count:,} points")
     return count, " ".join([what, *notes])
 
 
-def points_of(path: Path) -> np.ndarray:
-    return read_scan(path)[0][:, :3]
-
-
 def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:
-    count, said = written(frame(tmp_path, "a"), tmp_path / "a.ply")
+    path = frame(tmp_path, "a")
+    count, said = written(path, tmp_path / "a.ply")
     assert count == HEIGHT * WIDTH
     assert "without colours" not in said
     corner = [-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2]  # by the calibration of `written`
     assert points_of(tmp_path / "a.ply")[0] == pytest.approx(corner, rel=1e-5)
     row = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1][:27]
     assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
-
-
-def with_camera(path: Path, pose: list[list[float]] | None) -> Path:
-    """The depth file, with a camera in its record."""
-    beside = path.with_name(path.name.replace("_depth.png", ".json"))
-    camera = CameraRecord(
-        intrinsics=[[20, 0, 0], [0, 20, 0], [0, 0, 1]], lens="radial-tangential",
-        distortion=[], source="made up", pose=pose,
-    )  # fmt: skip
-    replace(FrameRecord.read(beside), camera=camera, size=(WIDTH, HEIGHT)).write(beside)
-    return path
-
-
-POSE = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]
+    with pytest.raises(OutputError, match="--overwrite"):
+        written(path, tmp_path / "a.ply")
 
 
 def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
-    path = with_camera(frame(tmp_path, "a"), POSE)
+    path = frame(tmp_path, "a", camera=camera(5))
     assert "made up" in written(path, tmp_path / "a.ply", calib=None)[1]
     last = [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(last)
@@ -83,8 +78,8 @@ def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
 
 def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path: Path) -> None:
     out, cloud = tmp_path / "out", tmp_path / "o.ply"
-    with_camera(frame(out, "a"), POSE)
-    path = with_camera(frame(out, "b"), None)
+    frame(out, "a", camera=camera(5))
+    path = frame(out, "b", camera=camera(None))
     (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
     with pytest.raises(InputError, match="b_depth"):  # it alone has no pose
@@ -170,12 +165,3 @@ def test_what_cannot_be_done_is_an_error_and_writes_nothing(
     with pytest.raises(error):
         written(path, tmp_path / "o.ply", **values)
     assert not (tmp_path / "o.ply").exists()
-
-
-def test_a_file_that_exists_is_kept_without_overwrite(tmp_path: Path) -> None:
-    path, output = frame(tmp_path, "a"), tmp_path / "o.ply"
-    output.write_text("mine")
-    with pytest.raises(OutputError):
-        written(path, output)
-    assert output.read_text() == "mine"
-    assert written(path, output, overwrite=True)[0]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord, PointsRecord
 from pnpdepth_cli.errors import (
@@ -28,25 +29,9 @@ from pnpdepth_cli.models.network import load_network
 from tests.commands.frames import FrameOnDisk, run
 
 
-def files(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
-
-
-def noted(record: FrameRecord, text: str) -> bool:
-    return any(text in note for note in record.notes)
-
-
 def points_of(record: FrameRecord) -> PointsRecord:
     assert record.points is not None
     return record.points
-
-
-def change_of(record: FrameRecord, basis: str) -> float:
-    """The MAE of the result as a fraction of that before."""
-    before, after = (record.errors[basis][stage]["mae"] for stage in ("before", "after"))
-    assert before is not None
-    assert after is not None
-    return after / before
 
 
 def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
@@ -55,31 +40,27 @@ def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
     asked = {"gt": frame.gt, "iterations": 40, "lr": "20%", "update": "adam", "format": "npy"}
     record = run(frame, **asked)
     for basis in ("used", "ground_truth"):
-        assert change_of(record, basis) < 0.8
-    first, *updated = record.loss
-    assert len(updated) == 40
-    assert updated[-1] is not None
-    assert first is not None
-    assert updated[-1] < first
+        before, after = (record.errors[basis][stage]["mae"] or 0 for stage in ("before", "after"))
+        assert after < 0.8 * before
+    losses = [loss or 0 for loss in record.loss]
+    assert len(losses) == 41
+    assert losses[-1] < losses[0]
     written = np.load(frame.folder / "out" / "img_depth.npy").astype(np.float64)
     error = np.abs(written - read_depth(frame.gt).values)
     assert record.errors["ground_truth"]["after"]["mae"] == pytest.approx(error.mean(), abs=1e-9)
-    range_of_points = points_of(record).nearest, points_of(record).farthest
-    known = read_depth(frame.sparse).values
-    assert range_of_points == (float(known[known > 0].min()), float(known.max()))
+    points, known = points_of(record), read_depth(frame.sparse).values
+    assert (points.nearest, points.farthest) == (known[known > 0].min(), known.max())
 
 
-@pytest.mark.parametrize("scale", [1000.0, 1.0])
 def test_ground_truth_whose_assumed_scale_is_another_one_in_use_stops_and_names_the_option(
-    frame: FrameOnDisk, scale: float
+    frame: FrameOnDisk,
 ) -> None:
-    codes = np.rint(read_depth(frame.gt).values * scale).astype(np.uint16)
+    codes = np.rint(read_depth(frame.gt).values * 1000).astype(np.uint16)
     Image.fromarray(codes).save(frame.folder / "codes.png")  # 256 is assumed
     with pytest.raises(InputError, match="gt_scale"):
         run(frame, gt=frame.folder / "codes.png")
     assert not (frame.folder / "out").exists()
-    if scale > 1:
-        run(frame, gt=frame.folder / "codes.png", gt_scale=scale, iterations=0)
+    run(frame, gt=frame.folder / "codes.png", gt_scale=1000.0, iterations=0)
 
 
 def test_no_iterations_give_the_networks_own_prediction_bit_for_bit(frame: FrameOnDisk) -> None:
@@ -146,17 +127,6 @@ def test_of_a_result_that_cannot_be_written_whole_nothing_stays(
     assert not list((frame.folder / "out").iterdir())
 
 
-def test_a_point_between_pixels_is_enough_and_points_outside_are_counted(
-    frame: FrameOnDisk,
-) -> None:
-    points = frame.folder / "points.csv"
-    points.write_text("x,y,depth\n30.25,20.5,2.0\n500,2,3\n")
-    record = run(frame, sparse=points, iterations=20)
-    assert points_of(record).used == 1
-    assert noted(record, "1 points outside the image")
-    assert change_of(record, "used") < 1
-
-
 def test_the_networks_crop_leaves_the_rest_unknown_and_refuses_points_only_there(
     frame: FrameOnDisk,
 ) -> None:
@@ -197,10 +167,60 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
 ) -> None:
     np.save(frame.folder / "small.npy", frame.depth[:10])
     (frame.folder / "far.csv").write_text("x,y,depth\n500,5,2\n")
-    before = files(frame.folder)
+    before = {*frame.folder.iterdir()}
     paths = {part: changes[part] for part in ("gt", "sparse") if changes.get(part)}
     changes = changes | {part: frame.folder / path for part, path in paths.items()}
     with pytest.raises(error, match=message) as caught:
         run(frame, **changes)
     assert "\n" not in str(caught.value)
-    assert files(frame.folder) == before
+    assert {*frame.folder.iterdir()} == before
+
+
+def test_the_papers_method_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk) -> None:
+    paper = {
+        "layer": "middle", "update": "sign", "lr": "0.01", "iterations": 5, "loss": "l1",
+        "schedule": "constant", "blur": 0.0, "align": "none", "propagate": "none",
+    }  # fmt: skip
+    one, other = (frame.folder / name for name in ("method.npy", "options.npy"))
+    by_name = run(frame, method="paper", output=one)
+    by_options = run(frame, **paper, output=other)
+    assert one.read_bytes() == other.read_bytes()
+    assert by_name.settings == by_options.settings | {"method": "paper"}
+
+
+def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
+    second = frame.folder / "second.py"
+    text = frame.model.read_text().replace('name="tiny"', 'name="second", complete=True')
+    second.write_text(text)
+    request = {"propagate": None, "more_models": (str(second),), "output": frame.folder / "two"}
+    record = run(frame, **request)
+    assert record.method is not None
+    assert record.method.networks == ["tiny", "second", "compact"]
+    with pytest.raises(UsageError, match="several networks are fused"):
+        run(frame, **(request | {"propagate": "none", "overwrite": True}))
+
+
+@pytest.mark.parametrize("propagate", [None, "none"])
+def test_baselines_are_scored_at_validation_points_and_against_the_truth(
+    frame: FrameOnDisk, propagate: str | None
+) -> None:
+    errors = run(frame, baselines=True, gt=frame.gt, propagate=propagate).errors
+    plain = run(frame, gt=frame.gt, propagate=propagate, output=frame.folder / "plain").errors
+    for basis in ("ground_truth", "validation"):
+        assert {*BASELINES, "before", "after"} <= errors[basis].keys()
+    assert plain["ground_truth"].items() <= errors["ground_truth"].items()
+    if propagate is None:  # the fixed method checks itself only for baselines
+        assert plain["validation"].items() <= errors["validation"].items()
+
+
+def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnDisk) -> None:
+    sigma, exact = (
+        read_depth(Path(refined.outputs["sigma"])).values
+        for refined in (
+            run(frame, uncertainty=True, propagate=None, format=name, output=frame.folder / name)
+            for name in ("png", "npy")
+        )
+    )
+    assert sigma.shape == frame.depth.shape
+    assert (sigma > 0).all()
+    assert np.abs(exact - sigma).max() < 0.00051

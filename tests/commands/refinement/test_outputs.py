@@ -1,0 +1,124 @@
+"""Depths of an integer file: codes per metre, and what is clipped; the 3D view of a frame."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates
+
+from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.refinement.outputs import _rays, output_scale, within_range
+from pnpdepth_cli.dataset.frame_files import ScanOptions
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.sensors.lens import rays_of
+from pnpdepth_cli.sensors.point_cloud import kept_pixels
+from tests.commands.frames import FrameOnDisk, run
+
+PNG = {"depth": Path("depth.png")}
+
+
+def inputs_at(*depths: float, scale: float | None = None) -> Frame:
+    xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
+    points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
+    return Frame(rgb=None, points=points, depth_scale=scale)
+
+
+def refined_to(*depths: float, inputs: Frame) -> Refined:
+    depth = np.array([depths], np.float32)
+    return Refined(
+        before=depth,
+        after=depth,
+        used=inputs.points,
+        held_out=inputs.points.select(slice(0)),
+        losses=(0.0,),
+        step=0.0,
+        diverged=None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("depths", "scale", "expected"),
+    [
+        ((0.4, 80.0), None, 256),
+        ((0.4, 80.0), 1000.0, 1000),
+        ((5.0, 400.0), None, 100),
+        ((900.0, 3000.0), None, 10),
+        ((0.005, 0.02), None, 1_000_000),
+        ((0.005, 80.0), None, 256),
+    ],
+)
+def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points(
+    depths: tuple[float, ...], scale: float | None, expected: float
+) -> None:
+    assert output_scale(inputs_at(*depths, scale=scale)) == expected
+
+
+def test_depths_beyond_16_bits_are_clipped_and_counted() -> None:
+    inputs = inputs_at(10.0, 80.0)
+    frame = refined_to(0.0, 1e-9, 50.0, 800.0, inputs=inputs)
+    clipped = within_range(PNG, inputs, frame)
+    assert clipped.after.tolist() == [[0.0, 1 / 256, 50.0, 65534 / 256]]
+    assert " 2 of 4 pixels clipped" in clipped.notes[0]
+    assert within_range({"depth": Path("depth.exr")}, inputs, frame) is frame
+    plain = replace(frame, after=np.full((1, 4), 50, np.float32))
+    assert within_range(PNG, inputs, plain) is plain
+
+
+def test_a_refinement_beyond_the_format_is_written_with_a_note(frame: FrameOnDisk) -> None:
+    text = frame.model.read_text()
+    frame.model.write_text(text.replace("2 + 3 *", "400 + 3 *"))
+    record = run(frame, iterations=0)
+    assert any("pixels clipped" in note for note in record.notes)
+    written = read_depth(Path(record.outputs["depth"])).values
+    assert written.max() == np.float32(65.534)
+
+
+def unpack(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
+
+
+def test_depths_are_those_of_the_cloud_to_a_ten_thousandth_and_colours_the_images(
+    frame: FrameOnDisk,
+) -> None:
+    calib = frame.folder / "k.txt"
+    calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]")
+    run(frame, view_3d=True, scan=ScanOptions(calib=calib), format="npy", gt=frame.gt)
+    view = json.loads((frame.folder / "out" / "img_view.json").read_text())
+    width, height = view["size"]
+    near, far = view["range"]
+    for name, path in (("after", frame.folder / "out/img_depth.npy"), ("gt", frame.gt)):
+        codes = unpack(view["depths"][name], "<u2", (height, width)).astype(float)
+        depth = np.where(codes > 0, near * (far / near) ** ((codes - 1) / 65534), 0)
+        expected = read_depth(path).values
+        kept = kept_pixels(expected)
+        assert ((depth > 0) == kept).all()
+        assert depth[kept] == pytest.approx(expected[kept], rel=1e-4)
+    assert view["depths"]["before"] != view["depths"]["after"]
+    assert (view["stride"], view["whole"], view["farthest"]) == (1, view["size"], far)
+    assert view["spacing"] == pytest.approx(1 / 50)
+    colours = unpack(view["colours"], "|u1", (height, width, 3))
+    assert (colours == np.rint(read_rgb(frame.image).values * 255)).all()
+
+
+@pytest.mark.slow
+def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
+    focal_px, size = 400.0, (360, 480)
+    camera = Camera(
+        intrinsics=np.array([[focal_px, 0, 240], [0, focal_px, 180], [0, 0, 1]]),
+        distortion=(-0.2, 0.03, 0.001, 0.0),
+    )
+    nodes = _rays(camera, size)
+    y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
+    at = [y / (size[0] - 1) * (nodes.shape[0] - 1), x / (size[1] - 1) * (nodes.shape[1] - 1)]
+    rays = np.stack([map_coordinates(nodes[:, :, axis], at, order=1) for axis in (0, 1)], axis=1)
+    exact = rays_of(camera, np.column_stack([x, y]))
+    assert np.abs(rays - exact).max() * focal_px < 0.05
