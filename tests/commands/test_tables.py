@@ -40,17 +40,11 @@ def test_a_change_is_relative_and_coloured_by_whether_it_is_better(
     assert (cell, cell.style) == (text, style)
 
 
-def record_of(
-    *networks: str, weights: dict[str, float] | None = None, **fields: Any
-) -> FrameRecord:
+def record_of(*networks: str, **fields: Any) -> FrameRecord:
     """A record of "net", refined by the default method if networks are named."""
     kind: Literal["default", "fixed"] = "default" if networks else "fixed"
-    return FrameRecord(
-        model=ModelRecord(name="net", spec="net", checkpoint=None, checkpoint_sha256=None),
-        method=MethodRecord(kind=kind, reason="", networks=[*networks] or ["net"]),
-        weights=weights or {},
-        **fields,
-    )
+    method = MethodRecord(kind=kind, reason="", networks=[*networks] or ["net"])
+    return FrameRecord(model=ModelRecord(name="net", spec="net"), method=method, **fields)
 
 
 def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
@@ -126,25 +120,26 @@ def styled(table: Table) -> list[list[tuple[str, str]]]:
 
 
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
-    def gain(percent: float, p: float) -> Gain:
-        return Gain(
-            percent=percent, low_percent=nan, high_percent=1.0, p_value=nan,
-            p_adjusted=p,
-        )  # fmt: skip
-
-    gains: list[dict[str, Gain]] = [
-        {},
-        {"rmse": gain(50.0, 0.0009), "delta1": gain(-50.0, 0.01)},
-        {"rmse": gain(-50.0, 0.049), "delta1": gain(nan, nan)},
-    ]
-    means = [(2.0, 0.5), (1.0, 0.25), (3.0, None)]
-    runs = [
-        ComparedRun(
-            name=name, path=name, mean={"rmse": rmse, "delta1": delta},
-            before={}, varied={}, coverage=1.0, gains=of_first,
+    # percent and adjusted p of RMSE and δ1, after their means
+    numbers = {
+        "a": (2.0, 0.5, None, None),
+        "b": (1.0, 0.25, (50.0, 0.0009), (-50.0, 0.01)),
+        "c": (3.0, None, (-50.0, 0.049), (nan, nan)),
+    }
+    runs = []
+    for name, (rmse, delta, *found) in numbers.items():
+        gains = {
+            key: Gain(
+                percent=each[0], low_percent=nan, high_percent=1.0, p_value=nan, p_adjusted=each[1]
+            )
+            for key, each in zip(("rmse", "delta1"), found, strict=True)
+            if each is not None
+        }
+        mean, unused = (
+            {"rmse": rmse, "delta1": delta},
+            {"before": {}, "varied": {}, "coverage": 1.0},
         )
-        for name, (rmse, delta), of_first in zip("abc", means, gains, strict=True)
-    ]  # fmt: skip
+        runs.append(ComparedRun(name=name, path=name, mean=mean, gains=gains, **unused))
     comparison = Comparison(
         frames=("1", "2"),
         measures=tuple(measure for measure in MEASURES if measure.key in ("rmse", "delta1")),
