@@ -20,8 +20,10 @@ from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.pixels import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
+from tests.core.test_metrics import brute
 from tests.data_sets import touch
 
 
@@ -189,24 +191,6 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(
         evaluate(alone)
 
 
-def brute(p: np.ndarray, g: np.ndarray, counts: np.ndarray) -> dict[str, float]:
-    """Per image, plain numpy in double precision."""
-    both = counts & (g > 0) & (p > 0)
-    p, g = p[both].astype(float), g[both].astype(float)
-    return {
-        "rmse": float(np.sqrt(np.mean((p - g) ** 2))),
-        "mae": float(np.mean(abs(p - g))),
-        "mre": float(np.mean(abs(p - g) / g)),
-        "sq_rel": float(np.mean((p - g) ** 2 / g)),
-        "log10": float(np.mean(abs(np.log10(p / g)))),
-        "rmse_log": float(np.sqrt(np.mean(np.log(p / g) ** 2))),
-        "irmse": float(1000 * np.sqrt(np.mean((1 / p - 1 / g) ** 2))),
-        "imae": float(1000 * np.mean(abs(1 / p - 1 / g))),
-        "silog": float(100 * np.std(np.log(p / g))),
-        **{f"delta{k}": float(np.mean(np.maximum(p / g, g / p) < 1.25**k)) for k in (1, 2, 3)},
-    }
-
-
 PROTOCOLS: list[tuple[dict[str, Any], float, float, tuple[int, int, int, int]]] = [
     ({"protocol": "nyu-eigen"}, 1e-3, 10, (45, 471, 41, 601)),
     ({"protocol": "garg", "max_depth": 6.0}, 1e-3, 6, (195, 476, 23, 616)),
@@ -229,16 +213,18 @@ def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     prediction[rng.random(gt.shape) < 0.1] = 0
     for number in range(2):
         frame(tmp_path, prediction[number], gt[number], str(number))
-    inside, (top, bottom, left, right) = np.zeros((480, 640), bool), window
-    inside[top:bottom, left:right] = True
-    counts = inside & (gt > low) & (gt < high)
-    coverage = np.mean(prediction[counts] > 0)
+    top, bottom, left, right = window
+    truth = np.zeros_like(gt)
+    truth[:, top:bottom, left:right] = gt[:, top:bottom, left:right]
+    truth[(gt <= low) | (gt >= high)] = 0
+    coverage = np.mean(prediction[truth > 0] > 0)
     if "protocol" in options:
         prediction = np.clip(prediction, np.float32(low), high)  # empty ones too, as BTS does
-    rows = [brute(*each) for each in zip(prediction, gt, counts, strict=True)]
+    rows = [brute(*each) for each in zip(prediction, truth, strict=True)]
     result = scored(tmp_path, **options)
     assert result.mean == {
-        key: pytest.approx(np.mean([row[key] for row in rows]), rel=1e-9) for key in rows[0]
+        measure.key: pytest.approx(np.mean([row[measure.key] for row in rows]), rel=1e-9)
+        for measure in MEASURES
     }
     assert result.counts["coverage"] == pytest.approx(coverage)
 
