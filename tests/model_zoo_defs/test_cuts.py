@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import pytest
+import torch
+from torch import nn
 
+from pnpdepth_cli.core.refine import refine
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition
+from pnpdepth_cli.models.frame_map import FrameMap
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.registry import find_definition
-from tests.model_zoo_defs.cuts import assert_the_cut_changes_nothing_and_a_step_does, built
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import ClosedSettings
 
 CUTS = {
     "adnn": ("solve", (1, 32, 8, 12)),
@@ -17,17 +25,49 @@ CUTS = {
     "sparse2dense-tiny-kitti": ("bn2", (1, 64, 8, 29)),
     "sparseconv": ("sparse_convs.0[0]", (1, 16, 64, 96)),
 }
+POINTS = SparsePoints(
+    xy=torch.tensor([[12.0, 9.0], [42.0, 9.0], [24.0, 18.0], [48.0, 27.0]]),
+    depth=torch.tensor([1.0, 2.0, 3.0, 4.0]),
+    size=(30, 60),
+)
+
+
+def built(definition: ModelDefinition) -> Network:
+    """The network with random weights and random statistics of its normalisations."""
+    torch.manual_seed(0)
+    module = definition.build().eval().requires_grad_(False)
+    for layer in module.modules():
+        if isinstance(layer, nn.BatchNorm2d):
+            assert layer.running_mean is not None
+            assert layer.running_var is not None
+            layer.running_mean.normal_(std=0.1)
+            layer.running_var.uniform_(0.5, 1.5)
+    return Network(
+        definition=definition, module=module, device=torch.device("cpu"), checkpoint=None
+    )
 
 
 @pytest.mark.parametrize("name", CUTS)
 def test_every_layer_can_be_cut_at_and_z_is_where_the_paper_has_it(name: str) -> None:
     network = built(find_definition(name))
+    size = network.definition.size
+    height, width = (64, 96)
+    if isinstance(size, Fixed) and name != "fcrn-tiny":
+        height, width = size.height, size.width
+    elif not isinstance(size, Fixed):
+        height, width = (-(-side // size.of) * size.of for side in (64, 96))
+    frame = FrameMap.fit(Fixed(height, width), height, width)
+    arguments = network.synthetic_arguments(frame)
     assert network.definition.default_layer == CUTS[name][0]
     aligned = "auto" if name == "sfmlearner-tiny" else "none"
     assert network.definition.default_alignment == aligned
-    size = (64, 96) if name == "fcrn-tiny" else None
     for layer in network.definition.layers:
-        z = assert_the_cut_changes_nothing_and_a_step_does(network, layer, size)
+        with torch.no_grad(), Split(network.module, layer) as split:
+            z = split.front(*arguments)
+            assert torch.equal(split.rear(z), network.module(*arguments))
+            once = ClosedSettings(iterations=1)
+            refinement = refine(split, arguments, POINTS, once, depth_of=network.depth_of)
+        assert not torch.equal(refinement.before, refinement.after)
         if layer == CUTS[name][0]:
             assert z.shape == CUTS[name][1]
             # no non-linearity behind a normalisation

@@ -6,10 +6,7 @@ import pytest
 import torch
 
 from model_zoo_defs.latefusion import Encoder, definitions
-from pnpdepth_cli.frames.resolve import NORMALISATIONS
-from tests.model_zoo_defs.cuts import built
-
-TINY = definitions["latefusion-tiny"]
+from tests.model_zoo_defs.test_cuts import built
 
 
 def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
@@ -21,13 +18,9 @@ def test_an_encoder_has_as_many_values_as_nasnet_mobile() -> None:
     assert encoder.channels[-1] == 1056
 
 
-def test_images_are_in_minus_one_to_one() -> None:
-    assert {each.normalisation for each in definitions.values()} == {NORMALISATIONS["symmetric"]}
-
-
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 1.0])
 def test_depth_is_between_0_and_200_m_whatever_the_points(fraction: float) -> None:
-    network = built(TINY).module
+    network = built(definitions["latefusion-tiny"]).module
     for scale in (1.0, 1e3):
         sparse = scale * 80 * (torch.rand(1, 1, 32, 64) < fraction)
         with torch.no_grad():

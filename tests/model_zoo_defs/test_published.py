@@ -21,6 +21,7 @@ from model_zoo_defs.sparse2dense import SparseToDense
 from model_zoo_defs.sparseconv import SparseConvNet
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition
+from pnpdepth_cli.models.weights import load_checkpoint
 
 LAYOUTS = {
     "eigen": "feb3263c6005e44b",
@@ -115,6 +116,17 @@ def test_a_network_computes_what_its_published_tensors_say(
     )
     values = (output[0, 0][rows][:, columns] / output.std()).flatten()
     assert values.tolist() == pytest.approx(COMPUTED[name, height, width], rel=2e-3, abs=2e-3)
+
+
+def test_a_folder_with_eigens_two_published_files_loads_whole(tmp_path: Path) -> None:
+    network = NARROW["eigen"]()
+    state = by_formula(network.state_dict())
+    for part in ("coarse", "fine"):
+        own = {n.removeprefix(f"{part}."): t for n, t in state.items() if n.startswith(part)}
+        torch.save(own, tmp_path / f"{part}_model_12.pth")
+    (note,) = load_checkpoint(network, find_definition("eigen"), tmp_path)
+    assert "coarse_model_12.pth, fine_model_12.pth" in note
+    assert all(torch.equal(network.state_dict()[name], tensor) for name, tensor in state.items())
 
 
 @pytest.mark.parametrize("counters", [True, False], ids=["now", "before PyTorch 0.4.1"])

@@ -87,6 +87,3 @@ def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
     assert [row["step"] for row in rows] == ["4", "8"]
     assert float(rows[1]["loss"]) < float(rows[0]["loss"])
     assert {"mae", "rmse", "d1"} <= rows[1].keys()
-
-
-# the fully connected layers of eigen take one size only
