@@ -26,43 +26,32 @@ transformers = pytest.importorskip("transformers", reason="needs the extra [hf]"
 
 pytestmark = pytest.mark.slow
 
-DINO = {
-    "hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2, "image_size": 56,
-    "patch_size": 14, "out_indices": [1, 2, 3, 4], "reshape_hidden_states": False,
-    "apply_layernorm": True,
-}  # fmt: skip
 NECK = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8}
+VIT = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2}
+STAGES = {"out_indices": [1, 2, 3, 4], "reshape_hidden_states": False}
 
 
 def depth_anything() -> Any:
+    dino = transformers.Dinov2Config(
+        **VIT, **STAGES, image_size=56, patch_size=14, apply_layernorm=True
+    )
     config = transformers.DepthAnythingConfig(
-        backbone_config=transformers.Dinov2Config(**DINO), reassemble_hidden_size=24,
-        head_hidden_size=8, depth_estimation_type="relative", max_depth=20, patch_size=14, **NECK,
-    )  # fmt: skip
+        backbone_config=dino, reassemble_hidden_size=24, head_hidden_size=8, patch_size=14, **NECK
+    )
     return transformers.DepthAnythingForDepthEstimation(config)
-
-
-def lively(network: Any, deviation: float = 0.3) -> Any:
-    """As initialised, the output does not depend on the image."""
-    with torch.no_grad():
-        for parameter in network.parameters():
-            if parameter.ndim > 1:
-                parameter.normal_(std=deviation)
-    return network
 
 
 def dpt() -> Any:
     config = transformers.DPTConfig(
-        hidden_size=24, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32,
-        image_size=64, patch_size=16, backbone_out_indices=[0, 1, 2, 3], **NECK,
+        **VIT, intermediate_size=32, image_size=64, patch_size=16,
+        backbone_out_indices=[0, 1, 2, 3], **NECK,
     )  # fmt: skip
     return transformers.DPTForDepthEstimation(config)
 
 
 def zoedepth() -> Any:
     backbone = transformers.BeitConfig(
-        hidden_size=24, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32,
-        image_size=64, patch_size=16, out_indices=[1, 2, 3, 4], reshape_hidden_states=False,
+        **VIT, **STAGES, intermediate_size=32, image_size=64, patch_size=16,
         use_relative_position_bias=True,
     )  # fmt: skip
     config = transformers.ZoeDepthConfig(
@@ -71,7 +60,12 @@ def zoedepth() -> Any:
         bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10, "name": "nyu"}],
         **NECK,
     )  # fmt: skip
-    return lively(transformers.ZoeDepthForDepthEstimation(config))
+    network: Any = transformers.ZoeDepthForDepthEstimation(config)
+    with torch.no_grad():  # as initialised, the output does not depend on the image
+        for parameter in network.parameters():
+            if parameter.ndim > 1:
+                parameter.normal_(std=0.3)
+    return network
 
 
 def glpn() -> Any:
@@ -83,27 +77,18 @@ def glpn() -> Any:
 
 
 def depth_pro() -> Any:
-    dino = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2, "patch_size": 8,
-            "image_size": 32}  # fmt: skip
+    parts = ("image_model_config", "patch_model_config", "fov_model_config")
     config = transformers.DepthProConfig(
         patch_size=32, fusion_hidden_size=8, intermediate_hook_ids=[2, 1],
         intermediate_feature_dims=[8, 8], scaled_images_ratios=[0.5, 1.0],
         scaled_images_overlap_ratios=[0.0, 0.25], scaled_images_feature_dims=[8, 8],
         use_fov_model=False,
-        image_model_config=transformers.Dinov2Config(**dino),
-        patch_model_config=transformers.Dinov2Config(**dino),
-        fov_model_config=transformers.Dinov2Config(**dino),
+        **{part: transformers.Dinov2Config(**VIT, patch_size=8, image_size=32) for part in parts},
     )  # fmt: skip
     return transformers.DepthProForDepthEstimation(config)
 
 
-MAKERS = {
-    "depth_anything": depth_anything,
-    "dpt": dpt,
-    "zoedepth": zoedepth,
-    "glpn": glpn,
-    "depth_pro": depth_pro,
-}
+MAKERS = {each.__name__: each for each in (depth_anything, dpt, zoedepth, glpn, depth_pro)}
 
 
 def saved(folder: Path, name: str) -> Path:

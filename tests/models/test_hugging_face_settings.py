@@ -20,12 +20,7 @@ SQUARE = {"height": 56, "width": 56}
 PROCESSING: dict[str, dict[str, Any]] = {
     "depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
     "dpt": {**HALF, "size": {"height": 64, "width": 64}},
-    "zoedepth": {
-        **HALF,
-        **ASPECT,
-        "size": {"height": 64, "width": 96},
-        "ensure_multiple_of": 32,
-    },
+    "zoedepth": {**HALF, **ASPECT, "size": {"height": 64, "width": 96}, "ensure_multiple_of": 32},
     "glpn": {"size_divisor": 32, "do_rescale": True},
     "depth_pro": {**HALF, "size": {"height": 64, "width": 64}},
 }
@@ -58,9 +53,6 @@ def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_
     definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
     assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
     assert hf_definition(saved(tmp_path / "d", "dpt")).size == Fixed(64, 64)
-    folder = saved(tmp_path / "z", "zoedepth")
-    changed(folder, "preprocessor_config.json", {"ensure_multiple_of": 1 / 32})  # of the image
-    assert hf_definition(folder).size == Near(of=32, height=64, width=96)
     assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
     assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
     assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
@@ -69,7 +61,6 @@ def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_
 @pytest.mark.parametrize(
     ("processing", "size"),
     [
-        ({"size": 56}, Fixed(56, 56)),
         ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
         ({"size": {"height": 1, "width": 1 << 16}}, Fixed(1, 1 << 16)),
         ({"size": 56, "keep_aspect_ratio": True}, Near(of=32, height=56, width=56)),
@@ -89,7 +80,6 @@ def test_the_size_is_fixed_or_near_one_or_a_multiple(
     ("processing", "mean", "std"),
     [
         ({}, 0.0, 1.0),
-        ({"do_normalize": True}, 0.5, 0.5),
         ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
         ({"image_mean": [0.25] * 3, "image_std": [0.2] * 3}, 0.25, 0.2),
         ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
@@ -128,11 +118,8 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
     "change",
     [
         {"size_divisor": "x"},
-        {"rescale_factor": None},
         {"rescale_factor": 0},
-        {"do_normalize": True, "image_mean": {"r": 1}},
         {"do_normalize": True, "image_std": [10**400] * 3},
-        {"size": [1, 2]},
         {"size": {"height": "x", "width": 3}},
         *({"size": size} for size in (0, (1 << 16) + 1, 56.0)),
         *({"size_divisor": side} for side in (-1, (1 << 16) + 1, 1 / ((1 << 16) + 1), 1.0)),
@@ -141,10 +128,8 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
     change: dict[str, Any], folder: Path
 ) -> None:
-    (folder / "preprocessor_config.json").write_text(json.dumps({"size_divisor": 32} | change))
-    if "size" in change:
-        (folder / "preprocessor_config.json").write_text(json.dumps(change))
+    settings = change if "size" in change else {"size_divisor": 32} | change
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
     with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
         hf_definition(folder)
     assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 600

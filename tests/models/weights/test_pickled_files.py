@@ -1,23 +1,26 @@
-"""Real layouts are read to the bit, and nothing that a pickle says is done."""
+"""Torch and numpy files are read to the bit, and nothing that their pickles say is done."""
 
 from __future__ import annotations
 
 import argparse
+import base64
 import collections
 import io
 import pickle
 import struct
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from pnpdepth_cli.models.weights.pickled_files import read_torch_file
-from tests.models.weights.files import Hostile, hostile, little, refused
+from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file
+from tests.models.weights.files import Hostile, hostile, little, npy_of, pickled, refused
 
 both_layouts = pytest.mark.parametrize("new", [True, False], ids=["zip", "row of pickles"])
 
@@ -61,9 +64,8 @@ def test_a_published_layout_gives_the_modules_own_state(tmp_path: Path, new: boo
 @both_layouts
 def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, new: bool) -> None:
     base = torch.arange(24).reshape(4, 6)
-    kinds = [torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32]
-    kinds += [torch.int16, torch.int8, torch.uint8, torch.bool]
-    content = {str(kind): base.to(kind) for kind in kinds}
+    kinds = ("float32", "float64", "float16", "bfloat16", "int64", "int32", "int16", "int8")
+    content = {kind: base.to(getattr(torch, kind)) for kind in (*kinds, "uint8", "bool")}
     content |= {"view": base[1:3, ::2], "turned": base.T, "number": torch.tensor(2.5)}
     content["empty"] = torch.empty(0, 3)
     read, _ = read_torch_file(save(content, tmp_path / "x.pt", new))
@@ -72,18 +74,20 @@ def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, ne
         assert torch.equal(read[name], tensor)
 
 
-@pytest.mark.parametrize("how", ["zip", "row of pickles", "pickle alone"])
+@pytest.mark.parametrize("how", ["zip", "row of pickles", "pickle alone", "numpy"])
 @pytest.mark.parametrize("kind", hostile(Path("x")))
 def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path, kind: str, how: str) -> None:
-    marker, path = tmp_path / "ran", tmp_path / "bad.pt"
+    marker, path = tmp_path / "ran", tmp_path / ("bad.npy" if how == "numpy" else "bad.pt")
     content = {"w": torch.ones(2), "x": hostile(marker)[kind]}
-    if how == "pickle alone":
+    if how == "numpy":
+        npy_of(path, pickled({**content, "w": np.ones(2)}))
+    elif how == "pickle alone":
         path.write_bytes(pickle.dumps(content))
     else:
         save(content, path, how == "zip")
     before = set(sys.modules)
     refused(path)
-    if how != "pickle alone":
+    if how in ("zip", "row of pickles"):
         assert torch.equal(read_torch_file(path)[0]["w"], torch.ones(2))
     assert not marker.exists()
     assert set(sys.modules) == before
@@ -171,3 +175,101 @@ def test_a_tensor_of_an_unusual_kind_or_size_is_refused(tensor: Any, tmp_path: P
     torch.save({"state_dict": state}, tmp_path / "inside.pt")
     for name in ("w.pt", "inside.pt"):
         refused(tmp_path / name)
+
+
+# ------------------------------------------------------------------ numpy
+
+RING: dict[str, Any] = {}
+RING["again"] = RING
+PYTHON_2 = (
+    "c-rleOH0F05QUSpX={AdXMMlAiJO4n!i8AZUWgF9OOf0(dIL7?NhV6bLN}%6SNYTQHr0h&*B&^tnKOJaXJiC%)*Iwb"
+    "&`(0AmpxPDCyAe14@nsG<CKytAPd?oWyRgu7CO_$Ft{#InV{;yw3&YT9qLj(2rbmOaeIM!@jgMr!<@}3Tz`Y*y6(-V"
+    "QaM<MFfWRGEDW*8O+|b;!_pATHm|>i(UYVUO{vKew;~m5)x(-%+00;7Ws|Tj73uLD8&lGzhgM0t#MW<;M%Wg`-L<YM"
+    "jjsOvcVmaJD|k&rej29O`zdIDTF`-qLsbwn#yFC#f;ZH=JL>8K$AlA+r9Po8oG*8tqhA"
+)
+"""The pickle of an object array with a dict of dicts, as numpy wrote it under Python 2."""
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4])
+def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(protocol: int, tmp_path: Path) -> None:
+    layer = {"weights": np.ones((7, 7, 3, 4), np.float32), "mean": np.arange(300.0)}
+    layers = {"conv1": layer, "alone": np.arange(6, dtype=np.int64)}
+    read = read_numpy_file(npy_of(tmp_path / "x.npy", pickled(layers, protocol)))
+    assert list(read) == ["conv1.weights", "conv1.mean", "alone"]
+    for tensor, array in zip(read.values(), (*layer.values(), layers["alone"]), strict=True):
+        assert torch.equal(tensor, torch.from_numpy(array))
+        assert tensor.is_contiguous()
+
+
+def test_a_dict_of_arrays_that_python_2_wrote_is_read(tmp_path: Path) -> None:
+    path = npy_of(tmp_path / "x.npy", zlib.decompress(base64.b85decode(PYTHON_2)))
+    arrays = read_numpy_file(path)
+    assert torch.equal(arrays["conv1.weights"], torch.full((2, 4, 2, 5), 0.25))
+    assert torch.equal(arrays["conv1.biases"], torch.tensor([0.5, -1]))
+
+
+@pytest.mark.parametrize("code", ["<f2", "<f4", "<f8", ">f4", ">i2", "|i1", "|u1", "<i4", "|b1"])
+def test_every_type_order_and_shape_is_read(code: str, tmp_path: Path) -> None:
+    base = np.arange(24).reshape(2, 3, 4).astype(np.dtype(code))
+    arrays = {"c": base, "fortran": np.asfortranarray(base), "turned": base.T, "part": base[:, 1:]}
+    arrays |= {"number": np.array(base[1, 1, 1]), "empty": base[:0]}
+    read = read_numpy_file(npy_of(tmp_path / "x.npy", pickled(arrays)))
+    for name, array in arrays.items():
+        assert read[name].shape == array.shape
+        assert np.array_equal(read[name].numpy(), array)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [1, 2],
+        "text",
+        {"a": 1},
+        {"a": {"b": "text"}},
+        {"a": np.array(["x", "y"])},
+        {"a": np.array([1 + 2j])},
+        {"a": np.array([{}, 1], dtype=object)},
+        {"a": {"b": {"c": {"d": np.ones(1)}}}},
+        RING,
+        {"a": torch.nn.Identity()},
+    ],
+)
+def test_other_contents_are_named(content: Any, tmp_path: Path) -> None:
+    refused(npy_of(tmp_path / "x.npy", pickled(content)))
+
+
+def array_of(**replaced: Any) -> Any:
+    """An array of two float32, in whose pickle some parts are others."""
+    reconstruct, arguments, state = np.ones(2, dtype=np.float32).__reduce__()  # type: ignore[misc]
+    names = ("version", "shape", "dtype", "fortran", "data")
+    parts = dict(zip(names, state, strict=True)) | replaced
+
+    class Claims:
+        def __reduce__(self) -> Any:
+            return reconstruct, arguments, tuple(parts.values())
+
+    return Claims()
+
+
+ARRAY_BOMBS = {
+    "a shape beyond the data": {"a": array_of(shape=(10**9,))},
+    "a shape that overflows": {"a": array_of(shape=(2**40, 2**40))},
+    "a negative shape": {"a": array_of(shape=(-1,))},
+    "the same bytes as many arrays": {
+        str(n): array_of(shape=(10**6,), data=data)
+        for data in [b"\0" * 4 * 10**6]
+        for n in range(100)
+    },
+    "very many entries": {
+        str(n): layer
+        for layer in [dict.fromkeys(map(str, range(500)), array_of())]
+        for n in range(500)
+    },
+}
+
+
+@pytest.mark.parametrize("kind", ARRAY_BOMBS)
+def test_what_claims_to_be_larger_than_the_file_is_refused(kind: str, tmp_path: Path) -> None:
+    path = npy_of(tmp_path / "bomb.npy", pickled(ARRAY_BOMBS[kind]))
+    with little():
+        refused(path)
