@@ -1,4 +1,4 @@
-"""nconv and pncnn: their published weights give the published errors on real frames."""
+"""nconv, pncnn, sparseconv and latefusion: equations, published errors, sizes and ranges."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from benchmarks.frames import kitti_dc
+from model_zoo_defs.latefusion import Encoder
 from model_zoo_defs.nconv import NConv, NormalisedConv
 from model_zoo_defs.pncnn import Pncnn
+from model_zoo_defs.sparseconv import SparseConv
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.points import SparsePoints
+from tests.model_zoo_defs.test_cuts import built
 
 
 def test_a_constant_depth_stays_whatever_pixels_are_known() -> None:
@@ -57,3 +61,49 @@ def test_published_weights_give_about_the_published_errors_on_kitti(
     scores = score(fit.depth_to_image(network.depth_of(output)), torch.from_numpy(frame.gt))
     assert scores.mae == pytest.approx(mae, rel=0.1)
     assert scores.rmse == pytest.approx(rmse, rel=0.1)
+
+
+def looped(x: Tensor, mask: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A sparse convolution pixel by pixel: (c, h, w), (h, w) → (n, h, w)."""
+    (out, channels, kernel, _), (height, width) = weight.shape, mask.shape
+    result, reach = torch.zeros(out, height, width), kernel // 2
+    for i, j in np.ndindex(height, width):
+        total, count = torch.zeros(out), 0
+        for di, dj in np.ndindex(kernel, kernel):
+            a, b = i + di - reach, j + dj - reach
+            if 0 <= a < height and 0 <= b < width and mask[a, b]:
+                total += weight[:, :, di, dj] @ x[:, a, b]
+                count += channels
+        result[:, i, j] = total / max(count, 1) + bias
+    return result
+
+
+@pytest.mark.parametrize("kernel", [3, 5])
+def test_a_sparse_layer_is_the_sum_over_known_pixels_over_their_number(kernel: int) -> None:
+    torch.manual_seed(0)
+    layer = SparseConv(3, 4, kernel).requires_grad_(False)
+    layer.bias.normal_()
+    x, mask = torch.randn(1, 3, 9, 11), (torch.rand(1, 1, 9, 11) < 0.05).float()
+    features, grown = layer(x, mask)
+    expected = looped(x[0], mask[0, 0], layer.conv.weight, layer.bias)
+    torch.testing.assert_close(features[0], expected)
+    assert torch.equal(grown, nn.functional.max_pool2d(mask, kernel, 1, kernel // 2))
+    assert 0 < float(grown.mean()) < 1
+
+
+def test_an_encoder_of_latefusion_has_as_many_values_as_nasnet_mobile() -> None:
+    """Keras counts 4,232,978 without the classifier; the stem has a bias here, no batch norm."""
+    with torch.device("meta"):
+        encoder = Encoder(3, 44, 4)
+    assert sum(p.numel() for p in encoder.parameters()) == 4_232_978 - 2 * 32 + 32
+    assert encoder.channels[-1] == 1056
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 1.0])
+def test_depth_of_latefusion_is_between_0_and_200_m_whatever_the_points(fraction: float) -> None:
+    network = built(find_definition("latefusion-tiny")).module
+    for scale in (1.0, 1e3):
+        sparse = scale * 80 * (torch.rand(1, 1, 32, 64) < fraction)
+        with torch.no_grad():
+            depth = network(scale * torch.randn(1, 3, 32, 64), sparse)
+        assert 0 <= float(depth.min()) <= float(depth.max()) <= 200.01

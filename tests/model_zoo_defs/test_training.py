@@ -1,4 +1,4 @@
-"""Training of `compact`: the drawn points, the losses, and a run that stops and resumes."""
+"""Training of `compact` and of the tiny editions: a run learns, stops, and goes on."""
 
 from __future__ import annotations
 
@@ -8,39 +8,40 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+import torch
+from torch import nn
+
+from model_zoo_defs.training.learning import recipes
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 pytest.importorskip("safetensors")
+tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
 train = pytest.importorskip("model_zoo_defs.training.learning.train")
 
 pytestmark = pytest.mark.slow
 
-SHAPE = (48, 64)
-
-
-def room(seed: int) -> NDArray[np.float32]:
-    """A slope with a near box in it and a corner of unknown depth."""
-    rng = np.random.default_rng(seed)
-    rows, columns = np.indices(SHAPE)
-    depth = 4.0 + 0.02 * rows - 0.01 * columns
-    top, left = rng.integers(5, 25, 2)
-    depth[top : top + 15, left : left + 20] = rng.uniform(0.5, 3.0)
-    depth[:4, :6] = 0.0
-    return depth.astype(np.float32)
-
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Slopes from 1 to 5 m, unknown in one corner; brightness follows depth."""
     folder = tmp_path_factory.mktemp("shards")
+    rows, columns = np.indices((48, 64))
     for number in range(2):
-        depth = np.stack([room(10 * number + i) for i in range(3)])
-        # brightness follows depth, so that there is something to learn
-        rgb = np.repeat((depth * 50.0).astype(np.uint8)[..., None], 3, axis=-1)
-        np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth)
+        depth = np.stack([1 + 0.03 * rows + 0.04 * columns + 0.1 * (number + i) for i in range(3)])
+        depth[:, :4, :6] = 0.0
+        rgb = np.repeat((depth * 40.0).astype(np.uint8)[..., None], 3, axis=-1)
+        np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth.astype(np.float32))
     return folder
 
 
-def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
+def losses(folder: Path) -> list[float]:
+    with (folder / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["step"]) for row in rows] == [4, 8]
+    return [float(row["loss"]) for row in rows]
+
+
+def test_a_run_of_compact_learns_and_going_on_gives_the_same_bytes(
     shards: Path, tmp_path: Path
 ) -> None:
     whole = train.Settings(
@@ -48,22 +49,57 @@ def test_a_run_learns_and_going_on_gives_the_bytes_of_an_uninterrupted_run(
         size=(32, 64), save_every=4, pretrained=False, workers=0, lr=1e-2,
     )  # fmt: skip
     weights = train.train(whole).read_bytes()
+    # as a run killed right after step 4 leaves its folder
     broken = replace(whole, out=tmp_path / "broken")
-    stop_at(broken, step=4)
-    assert train.train(replace(broken, resume=True)).read_bytes() == weights
-    with (tmp_path / "whole" / "log.csv").open() as file:
-        losses = [float(row["loss"]) for row in csv.DictReader(file)]
-    assert len(losses) == 2
-    assert losses[1] < losses[0]
-    assert (tmp_path / "whole" / "val.csv").exists()
-
-
-def stop_at(settings_: train.Settings, step: int) -> None:
-    """Leaves the run folder as a run killed right after `step` would."""
-    settings_.out.mkdir()
-    run = train.Run(settings_)
-    for sample in train._loader(settings_, 0):
+    broken.out.mkdir()
+    run = train.Run(broken)
+    for sample in train._loader(broken, 0):
         run.learn(sample)
-        if run.step == step:
+        if run.step == 4:
             run.save()
-            return
+            break
+    assert train.train(replace(broken, resume=True)).read_bytes() == weights
+    first, second = losses(whole.out)
+    assert second < first
+    assert (whole.out / "val.csv").exists()
+
+
+class Toy(nn.Module):
+    """Depth in metres from an image, by one layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm, self.conv = nn.BatchNorm2d(3), nn.Conv2d(3, 1, 3, padding=1)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.conv(self.norm(rgb))  # type: ignore[no-any-return]
+
+
+TOY = ModelDefinition(name="toy-tiny", input_kind="rgb", size=Multiple(1), build=Toy)
+RECIPE = recipes.Recipe(
+    loss=recipes.log_error, batch=2, lr=3e-2, half_precision=False, flat={"conv": 0.5},
+    stages=(
+        recipes.Stage(window=(32, 48), shown=(16, 24), until=0.5),
+        recipes.Stage(window=(32, 48)),
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_a_run_of_a_tiny_edition_learns_and_going_on_gives_the_same_bytes(
+    lanes: int, shards: Path, tmp_path: Path
+) -> None:
+    whole = tiny.Settings(
+        network="toy-tiny", data=(shards,), val=(shards,), out=tmp_path / "whole", steps=8,
+        save_every=4, lanes=lanes,
+    )  # fmt: skip
+    weights = tiny.train(TOY, RECIPE, whole).read_bytes()
+    broken = replace(whole, out=tmp_path / "broken")
+    broken.out.mkdir()
+    run = tiny.TinyRun(TOY, RECIPE, broken)
+    for number in range(4):
+        run.learn(run.batch(number))
+    run.save()
+    assert tiny.train(TOY, RECIPE, replace(broken, resume=True)).read_bytes() == weights
+    first, second = losses(whole.out)
+    assert second < first
