@@ -23,13 +23,17 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Slopes from 1 to 5 m, unknown in one corner; brightness follows depth."""
+    """Slopes with a near box and a corner of unknown depth; brightness follows depth."""
     folder = tmp_path_factory.mktemp("shards")
     rows, columns = np.indices((48, 64))
     for number in range(2):
-        depth = np.stack([1 + 0.03 * rows + 0.04 * columns + 0.1 * (number + i) for i in range(3)])
+        depth = np.stack([4.0 + 0.02 * rows - 0.01 * columns] * 3)
+        for i, each in enumerate(depth):
+            rng = np.random.default_rng(10 * number + i)
+            top, left = rng.integers(5, 25, 2)
+            each[top : top + 15, left : left + 20] = rng.uniform(0.5, 3.0)
         depth[:, :4, :6] = 0.0
-        rgb = np.repeat((depth * 40.0).astype(np.uint8)[..., None], 3, axis=-1)
+        rgb = np.repeat((depth * 50.0).astype(np.uint8)[..., None], 3, axis=-1)
         np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth.astype(np.float32))
     return folder
 
@@ -77,7 +81,7 @@ class Toy(nn.Module):
 
 TOY = ModelDefinition(name="toy-tiny", input_kind="rgb", size=Multiple(1), build=Toy)
 RECIPE = recipes.Recipe(
-    loss=recipes.log_error, batch=2, lr=3e-2, half_precision=False, flat={"conv": 0.5},
+    loss=recipes.log_error, batch=2, lr=0.3, half_precision=False, flat={"conv": 0.5},
     stages=(
         recipes.Stage(window=(32, 48), shown=(16, 24), until=0.5),
         recipes.Stage(window=(32, 48)),

@@ -1,9 +1,8 @@
-"""Hugging Face folders, saved by save_pretrained with random weights, load, list and refine."""
+"""Hugging Face folders: what their settings say, and how they load and refine."""
 
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,139 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
+from pnpdepth_cli.models.definition import Fixed, Near
 from pnpdepth_cli.models.frame_map import FrameMap
+from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
-from tests.models.test_hugging_face_settings import PROCESSING, changed
 from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
-pytestmark = pytest.mark.slow
+IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+HALF = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
+ASPECT = {"keep_aspect_ratio": True, "do_resize": True}
+SQUARE = {"height": 56, "width": 56}
+PROCESSING: dict[str, dict[str, Any]] = {
+    "depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
+    "dpt": {**HALF, "size": {"height": 64, "width": 64}},
+    "zoedepth": {**HALF, **ASPECT, "size": {"height": 64, "width": 96}, "ensure_multiple_of": 32},
+    "glpn": {"size_divisor": 32, "do_rescale": True},
+    "depth_pro": {**HALF, "size": {"height": 64, "width": 64}},
+}
+"""A preprocessor_config.json by the type of the network."""
+
+
+def described(folder: Path, name: str) -> Path:
+    """A folder without weights, which are read when the network is built."""
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({"model_type": name}))
+    (folder / "preprocessor_config.json").write_text(json.dumps(PROCESSING[name]))
+    (folder / "model.safetensors").touch()
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return described(tmp_path / "net", "glpn")
+
+
+def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
+    settings = json.loads((folder / name).read_text())
+    (folder / name).write_text(json.dumps(settings | change))
+    return folder
+
+
+def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_path: Path) -> None:
+    folder = described(tmp_path / "a", "depth_anything")
+    assert hf_definition(folder).size == Near(of=14, height=56, width=56)
+    definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
+    assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
+    assert hf_definition(described(tmp_path / "d", "dpt")).size == Fixed(64, 64)
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
+    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
+
+
+@pytest.mark.parametrize(
+    ("processing", "size"),
+    [
+        ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
+        ({"size": {"height": 1, "width": 1 << 16}}, Fixed(1, 1 << 16)),
+        ({"size": 56, "keep_aspect_ratio": True}, Near(of=32, height=56, width=56)),
+        ({**ASPECT, "size": 9, "ensure_multiple_of": 1 / 64}, Near(of=64, height=9, width=9)),
+        ({"do_resize": False, "size": 56}, Near(of=32)),
+        ({"size_divisor": 1 << 16}, Near(of=1 << 16)),
+    ],
+)
+def test_the_size_is_fixed_or_near_one_or_a_multiple(
+    processing: dict[str, Any], size: Fixed | Near, folder: Path
+) -> None:
+    (folder / "preprocessor_config.json").write_text(json.dumps(processing))
+    assert hf_definition(folder).size == size
+
+
+@pytest.mark.parametrize(
+    ("processing", "mean", "std"),
+    [
+        ({}, 0.0, 1.0),
+        ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
+        ({"image_mean": [0.25] * 3, "image_std": [0.2] * 3}, 0.25, 0.2),
+        ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
+        ({"image_mean": [51] * 3, "image_std": [102] * 3, "do_rescale": False}, 0.2, 0.4),
+    ],
+)
+def test_normalisation_is_that_of_an_image_from_0_to_1(
+    processing: dict[str, Any], mean: float, std: float, folder: Path
+) -> None:
+    text = json.dumps({"size_divisor": 32} | processing)
+    (folder / "preprocessor_config.json").write_text(text)
+    normalisation = hf_definition(folder).normalisation
+    assert normalisation is not None
+    assert normalisation.mean == pytest.approx((mean,) * 3)
+    assert normalisation.std == pytest.approx((std,) * 3)
+
+
+def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    with pytest.raises(CheckpointError, match="save_pretrained"):
+        hf_definition(folder)
+    (folder / "preprocessor_config.json").unlink()
+    with pytest.raises(ModelError, match=r"preprocessor_config\.json"):
+        hf_definition(folder)
+    nested = '{"a":' + "[" * 100_000 + "]" * 100_000 + "}"
+    for text in ('{"model_type": "bert"}', "{", "[]", nested):
+        (folder / "config.json").write_text(text)
+        with pytest.raises(ModelError, match=str(folder)):
+            hf_definition(folder)
+    (folder / "config.json").unlink()
+    with pytest.raises(ModelError):
+        hf_definition(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"size_divisor": "x"},
+        {"rescale_factor": 0},
+        {"do_normalize": True, "image_std": [10**400] * 3},
+        {"size": {"height": "x", "width": 3}},
+        *({"size": size} for size in (0, (1 << 16) + 1, 56.0)),
+        *({"size_divisor": side} for side in (-1, (1 << 16) + 1, 1 / ((1 << 16) + 1), 1.0)),
+    ],
+)
+def test_settings_that_are_no_numbers_are_refused_in_one_line(
+    change: dict[str, Any], folder: Path
+) -> None:
+    settings = change if "size" in change else {"size_divisor": 32} | change
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
+        hf_definition(folder)
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------ with weights
 
 NECK = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8}
 VIT = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2}
@@ -98,20 +220,13 @@ def saved(folder: Path, name: str) -> Path:
     return folder
 
 
-@pytest.fixture
-def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any, **__: Any) -> Any:
-        raise AssertionError("a network connection is tried")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(socket, "getaddrinfo", refuse)
-
-
-@pytest.mark.usefixtures("no_network")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_folder_loads_lists_layers_and_refines_without_network_access(
-    tmp_path: Path, name: str
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for owner, function in ((socket.socket, "connect"), (socket, "getaddrinfo")):
+        monkeypatch.setattr(owner, function, None)  # a call raises
     network = load_network(str(saved(tmp_path / name, name)), None)
     definition = network.definition
     assert definition.layers
@@ -138,17 +253,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
     assert bool((result.after > 0).all())
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return saved(tmp_path_factory.mktemp("original") / "net", "glpn")
-
-
-@pytest.fixture
-def folder(original: Path, tmp_path: Path) -> Path:
-    """A folder of a GLPN."""
-    return Path(shutil.copytree(original, tmp_path / "net"))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -162,8 +267,9 @@ def folder(original: Path, tmp_path: Path) -> Path:
     ],
 )
 def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
-    change: dict[str, Any], message: str, folder: Path
+    change: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
+    folder = saved(tmp_path / "net", "glpn")
     changed(folder, "config.json", change)
     with (
         little(megabytes=900, seconds=30),
@@ -172,8 +278,9 @@ def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
         load_network(str(folder), None)
 
 
-def test_code_in_a_folder_is_never_run(folder: Path, tmp_path: Path) -> None:
-    marker = tmp_path / "ran"
+@pytest.mark.slow
+def test_code_in_a_folder_is_never_run(tmp_path: Path) -> None:
+    marker, folder = tmp_path / "ran", saved(tmp_path / "net", "glpn")
     (folder / "code.py").write_text(f"open({str(marker)!r}, 'w')")
     code = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
     load_network(str(changed(folder, "config.json", {"auto_map": code})), None)

@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError
+from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
@@ -71,6 +72,24 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
         network().depth_of({"a": depth, "b": [depth]})
     chosen = network(output=lambda output: output["b"][0] * 2)
     assert torch.equal(chosen.depth_of({"a": depth, "b": [depth]}), depth * 2)
+
+
+@pytest.mark.parametrize(
+    ("of_depth", "of_noise", "count", "said"),
+    [(0.0, 1.0, 200, True), (0.3, 0.0, 200, False), (0.3, 0.5, 200, False), (0.0, 1.0, 10, False)],
+)
+def test_a_network_that_is_no_better_than_the_median_depth_is_named(
+    of_depth: float, of_noise: float, count: int, said: bool
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.exp(torch.rand(1, 1, 40, 40, generator=generator) * 2)
+    unrelated = torch.rand(1, 1, 40, 40, generator=generator)
+    xy = torch.randint(0, 40, (count, 2), generator=generator)
+    at = depth[0, 0, xy[:, 1], xy[:, 0]]
+    points = SparsePoints(xy=xy.float(), depth=at, size=(40, 40))
+    reader = AlignedDepth(network(output_scale="affine"), points, "auto")
+    reader(of_depth * depth + of_noise * unrelated)
+    assert any("network 'mine' says nothing about" in note for note in reader.notes) == said
 
 
 # ------------------------------------------------------------------ loading
