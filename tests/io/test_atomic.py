@@ -121,18 +121,16 @@ def test_shards_run_together_but_not_twice_nor_beside_a_whole_run(tmp_path: Path
 
 
 def test_in_turn_one_waits_for_the_other(tmp_path: Path) -> None:
-    order, inside = list[str](), threading.Event()
+    order = list[str]()
 
-    def first() -> None:
+    def second() -> None:
         with in_turn(tmp_path):
-            inside.set()
-            time.sleep(0.05)
-            order.append("first")
+            order.append("second")
 
-    thread = threading.Thread(target=first)
-    thread.start()
-    inside.wait()
+    thread = threading.Thread(target=second)
     with in_turn(tmp_path):
-        order.append("second")
+        thread.start()
+        time.sleep(0.05)
+        order.append("first")
     thread.join()
     assert order == ["first", "second"]

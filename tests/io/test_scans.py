@@ -129,16 +129,13 @@ def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, cont
     assert "\n" not in str(error.value)
 
 
-def nuscenes_bytes(points: NDArray[np.float32]) -> bytes:
-    """x, y, z, intensity 0 to 255, and the index of one of 32 lasers."""
-    numbers = np.arange(len(points))
-    return np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
-
-
 def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_its_content(tmp_path: Path) -> None:
     points, path = np.resize(POINTS, (40, 3)), tmp_path / "scan.bin"
-    for source, encoded in {"KITTI scan": bin_bytes, "nuScenes scan": nuscenes_bytes}.items():
-        path.write_bytes(encoded(points))
+    numbers = np.arange(40)
+    # intensity 0 to 255, and the index of one of 32 lasers
+    nuscenes = np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
+    for source, encoded in {"KITTI scan": bin_bytes(points), "nuScenes scan": nuscenes}.items():
+        path.write_bytes(encoded)
         got, read_as = read_scan(path)
         assert np.array_equal(got, points)
         assert read_as == source
@@ -150,9 +147,9 @@ def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_its_content(tmp_path: Path)
 @pytest.mark.parametrize("coloured", [False, True])
 def test_the_parts_of_a_cloud_are_the_rows_of_a_ply(tmp_path: Path, coloured: bool) -> None:
     normals = (POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)).astype(np.float32)
-    colours = np.arange(POINTS.size, dtype=np.uint8).reshape(POINTS.shape) if coloured else None
+    colours = np.arange(POINTS.size, dtype=np.uint8).reshape(POINTS.shape)
     parts = [
-        (POINTS[part], normals[part], None if colours is None else colours[part])
+        (POINTS[part], normals[part], colours[part] if coloured else None)
         for part in (slice(20), slice(20, None))
     ]
     assert write_cloud(tmp_path / "a.ply", parts) == len(POINTS)
@@ -162,4 +159,4 @@ def test_the_parts_of_a_cloud_are_the_rows_of_a_ply(tmp_path: Path, coloured: bo
     assert names == ["x", "y", "z", "nx", "ny", "nz", *(["red", "green", "blue"] * coloured)]
     rows = np.frombuffer(body, np.uint8).reshape(len(POINTS), -1)
     assert np.array_equal(rows[:, :24].copy().view("<f4"), np.hstack([POINTS, normals]))
-    assert colours is None or np.array_equal(rows[:, 24:], colours)
+    assert not coloured or np.array_equal(rows[:, 24:], colours)
