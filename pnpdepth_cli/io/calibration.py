@@ -10,9 +10,10 @@ separate, and a value may continue over several lines:
     lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
-Bare numbers are K alone: 9, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy [width height]. Record3D's
-metadata.json has K by columns. YAML is OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain;
-a matrix T_camera_lidar there is the pose of the scanner. A folder is KITTI's raw data or KITTI-360.
+K has 9 numbers, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy. Bare numbers are K alone, or
+fx fy cx cy width height. Record3D's metadata.json has K by columns. YAML is OpenCV's FileStorage,
+ROS camera_info, or Kalibr's camchain; a matrix T_camera_lidar there is the pose of the scanner. A
+folder is KITTI's raw data or KITTI-360.
 """
 
 from __future__ import annotations
@@ -213,11 +214,7 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
 def _kitti(
     fields: _Fields, camera: int | None, kind: str, scanner: Extrinsics | None
 ) -> Calibration:
-    """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset.
-
-    Of KITTI's object set (R0_rect), tracking set (R_rect), odometry set (already rectified, its
-    pose is named Tr), raw data and KITTI-360 (R_rect_00: camera 0's rectification is that of all).
-    """
+    """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
     # The number of the camera.
     number, path = CAMERA if camera is None else camera, fields.path
     matches = (re.fullmatch(r"P(?:_rect_0)?(\d)", name) for name in fields.values)
@@ -225,7 +222,8 @@ def _kitti(
     if number not in present:
         listing = ", ".join(map(str, present)) or "none"
         raise UsageError(f"{path} has no camera {number}; --camera can be one of: {listing}")
-    # Its intrinsics, and the rotation and offset that rectify it.
+    # Its intrinsics, and the rotation and offset that rectify it. Odometry's pose is already
+    # rectified; of raw data and KITTI-360, camera 0's rectification is that of all.
     projection = fields.matrix(fields.first((f"P{number}",)) or f"P_rect_0{number}", 3, 4)
     turn = fields.first(("R_rect", "R_rect_00")) or "R0_rect"
     rectify = np.eye(3) if "Tr" in fields.values else fields.matrix(turn, 3, 3)

@@ -176,10 +176,7 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
 
 
 def read_sparse(
-    path: Path,
-    *,
-    size: tuple[int, int] | None = None,
-    scale: float | None = None,
+    path: Path, *, size: tuple[int, int] | None = None, scale: float | None = None
 ) -> tuple[Points, Reading]:
     """Returns the points with known depth of a depth image or a point list, and how it was read.
 

@@ -14,12 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import (
-    check_pixel_count,
-    damaged,
-    read_bytes,
-    size_of_regular_file,
-)
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.images import (
     IMAGE_ERRORS,

@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import (
-    fingerprint,
-    is_unchanged,
-    read_json,
-    sha256_of,
-    write_json,
-)
+from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, read_json, sha256_of, write_json
 
 
 @dataclass

@@ -165,7 +165,7 @@ def test_several_parts_and_a_crop_of_the_display_are_refused(tmp_path: Path) -> 
 DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)
 
 
-def save_valid(path: Path) -> None:
+def valid_file(path: Path) -> Path:
     """A file of `DEPTH`, of the kind that its name says."""
     stem, codes = path.stem, Image.fromarray((DEPTH * 256).astype(np.uint16))
     if stem == "depth":
@@ -173,26 +173,23 @@ def save_valid(path: Path) -> None:
     elif path.suffix == ".tif":
         codes.save(path, compression=stem)
     elif stem == "tiles":
-        tiles = OpenEXR.TileDescription()
-        write_exr(path, {"Z": DEPTH}, type=OpenEXR.tiledimage, tiles=tiles)
+        header = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+        write_exr(path, {"Z": DEPTH}, **header)
     elif path.suffix == ".exr":
         write_exr(path, {"Z": DEPTH}, compression=getattr(OpenEXR, f"{stem}_COMPRESSION"))
     else:
         path.write_bytes(b"Pf\n53 40\n1.0\n" + DEPTH[::-1].astype(">f4").tobytes())
+    return path
 
 
-NAMES = [
-    *(f"depth{suffix}" for suffix in DEPTH_SUFFIXES),
-    *("raw.tif", "tiff_lzw.tif", "big-endian.pfm", "PIZ.exr", "DWAA.exr", "tiles.exr"),
-]
+KINDS = ("raw.tif", "tiff_lzw.tif", "big-endian.pfm", "PIZ.exr", "DWAA.exr", "tiles.exr")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), *KINDS])
 def test_the_file_is_read_and_every_truncation_is_refused_in_one_line(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / name
-    save_valid(path)
+    path = valid_file(tmp_path / name)
     assert read_depth(path).values == pytest.approx(DEPTH, rel=0.01, abs=0.002)
     content = path.read_bytes()
     for length in [*range(0, len(content), max(1, len(content) // 60)), len(content) - 1]:

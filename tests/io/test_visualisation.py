@@ -9,12 +9,7 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.visualisation import (
-    UNKNOWN,
-    depth_scale,
-    improvement,
-    preview,
-)
+from pnpdepth_cli.io.visualisation import UNKNOWN, depth_scale, improvement, preview
 
 BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
 
@@ -27,22 +22,16 @@ def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
     return {title: pixels[y : y + h, x : x + w] for title, (x, y, w, h) in content.panels.items()}
 
 
-def scene(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """rgb, depth 2..8 m, and xy of nine pixels."""
-    rng = np.random.default_rng(0)
-    rgb = rng.random((height, width, 3), dtype=np.float32)
-    depth = np.linspace(2, 8, height * width, dtype=np.float32).reshape(height, width)
-    xy = np.stack([rng.integers(0, width, 9), rng.integers(0, height, 9)], axis=1)
-    return rgb, depth, xy.astype(np.float32)
-
-
 @pytest.mark.parametrize(("height", "width", "columns"), [(60, 80, 2), (37, 124, 1), (10, 1700, 1)])
 def test_a_preview_has_its_panels_in_columns_and_depth_in_the_colours_of_one_scale(
     tmp_path: Path, height: int, width: int, columns: int
 ) -> None:
-    rgb, depth, xy = scene(height, width)
-    columns_of, rows_of = xy.astype(int).T
-    path, before, sparse = tmp_path / "p.png", depth * 1.2, depth[rows_of, columns_of]
+    rng, path = np.random.default_rng(0), tmp_path / "p.png"
+    depth = np.linspace(2, 8, height * width, dtype=np.float32).reshape(height, width)
+    columns_of, rows_of = rng.integers(0, width, 9), rng.integers(0, height, 9)
+    xy = np.stack([columns_of, rows_of], axis=1).astype(np.float32)
+    before, sparse = depth * 1.2, depth[rows_of, columns_of]
+    rgb = rng.random((height, width, 3), dtype=np.float32)
     content = preview(rgb, xy, sparse, before, depth, path)
     panels, scale = panels_of(path, content), depth_scale(sparse, before, depth)
     assert content.size[0] <= 1600
