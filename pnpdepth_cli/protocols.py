@@ -134,27 +134,16 @@ class Protocol:
     max_depth: float | None = None
     """Ground truth is scored below this depth, metres."""
     clip: bool = False
-    """Whether predictions are clipped to these bounds."""
+    """Whether predictions are clipped to these bounds, empty ones too."""
     crop: str = "none"
     """The rectangle of the part that is scored."""
-    delta: float = 1.25
-    """δ1 to δ3 count ratios below it, its square and its cube."""
-    missing: str = "skip"
-    """Empty predictions: "skip", or "min", scored as the lower bound."""
     exclude_sparse: bool = False
     """Whether pixels with a sparse point are not scored."""
-
-    @property
-    def thresholds(self) -> tuple[float, float, float]:
-        """The thresholds of δ1 to δ3."""
-        return self.delta, self.delta**2, self.delta**3
 
 
 # The reference codes (monodepth2's evaluate_depth.py, BTS's eval) clamp predictions with
 # `pred[pred < min_depth] = min_depth`, which scores empty ones (0, NaN) as the lower bound.
-_EIGEN = Protocol(
-    name="eigen", part=WHOLE, crop="eigen", min_depth=1e-3, max_depth=80.0, clip=True, missing="min"
-)
+_EIGEN = Protocol(name="eigen", part=WHOLE, crop="eigen", min_depth=1e-3, max_depth=80.0, clip=True)
 _NOT_FOUND = "which pixels the paper draws, with which seed, size and bounds, was not found"
 _RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands import statistics
-from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, scoring_of
+from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.statistics import Clusters, find_clusters
 from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of, some_names
@@ -23,13 +23,13 @@ from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
-from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
 Means = dict[str, float | None]
 """Means by the key of their measure; None where no frame has it."""
 ALPHA = 0.05
 _SUMMARY = "summary.json"
+_PAPER = EvalRequest(prediction=Path(), ground_truth=Path())  # as batches score
 _STARS = (0.05, 0.01, 0.001)
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
@@ -278,7 +278,7 @@ def _read_run(text: str) -> Run:
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
             measures=[m for m in measures if all(m.key in own for own in scores.values())],
-            scoring=dict(content.get("scoring") or scoring_of(find_protocol("paper"))),
+            scoring=dict(content.get("scoring") or _PAPER.scoring),
             scores=scores,
             before={name: frame.errors[GT].get(BEFORE, {}) for name, frame in frames.items()},
             groups={name: frame.group for name, frame in frames.items()},

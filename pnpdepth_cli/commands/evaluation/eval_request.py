@@ -15,6 +15,7 @@ from pnpdepth_cli.settings import option
 
 WITHOUT_SPARSE = "; without the pixels of sparse points"
 """What titles of tables say where the pixels of input points are excluded."""
+_DELTA = 1.25
 _IN_MILLIMETRES = tuple(
     replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
     for m in MEASURES
@@ -35,10 +36,11 @@ class EvalRequest:
     """A depth file, a folder of them, or a data set of a known layout."""
     protocol: str = option("paper", "Preset of the rules.", choices=choices.PROTOCOLS)
     max_depth: float | None = option(None, "Score ground truth below M metres.", metavar="M")
-    delta: float | None = option(
-        None,
-        "Thresholds of δ1…δ3 are D, D², D³. The paper's KITTI rows use 1.01.  [default: 1.25]",
+    delta: float = option(
+        _DELTA,
+        "Thresholds of δ1…δ3 are D, D², D³. The paper's KITTI rows use 1.01.",
         metavar="D",
+        show_default=True,
     )
     scale_by: str = option(
         "none",
@@ -81,7 +83,7 @@ class EvalRequest:
         near, far = self.depth_limits or (1.0, 2.0)
         if not (0 < near < far and math.isfinite(far)):
             raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")
-        if self.is_devkit and (self.delta or self.depth_limits):
+        if self.is_devkit and (self.delta != _DELTA or self.depth_limits):
             raise UsageError(
                 f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"
             )
@@ -95,7 +97,6 @@ class EvalRequest:
             own,
             max_depth=own.max_depth if self.max_depth is None else self.max_depth,
             exclude_sparse=own.exclude_sparse or self.exclude_sparse,
-            delta=own.delta if self.delta is None else self.delta,
         )
 
     @property
@@ -124,19 +125,25 @@ class EvalRequest:
         """
         return choose_measures((*self.measures, *OF_SIGMA), self.columns)
 
+    @property
+    def scoring(self) -> dict[str, object]:
+        """The rules that decide figures, by their names."""
+        rules = self.rules
+        return {
+            "min_depth": rules.min_depth,
+            "max_depth": rules.max_depth,
+            "clip": rules.clip,
+            "crop": rules.crop,
+            "missing": "min" if rules.clip else "skip",
+            "exclude_sparse": rules.exclude_sparse,
+            "thresholds": [self.delta, self.delta**2, self.delta**3],
+            "scale_by": self.scale_by,
+            "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
+        }
+
     def describe(self) -> str:
         """Returns one line, such as `eigen: min_depth 0.001, max_depth 80, crop eigen, …`."""
-        changed = "" if self.rules == find_protocol(self.protocol) else " (changed)"
-        rules = scoring_of(self.rules, self.scale_by).items()
+        changed = self.rules != find_protocol(self.protocol) or self.delta != _DELTA
+        rules = self.scoring.items()
         texts = (f"{name} {value}" for name, value in rules if value not in (None, False, "none"))
-        return f"{self.protocol}{changed}: {', '.join(texts)}; mean over the images"
-
-
-def scoring_of(rules: Protocol, scale_by: str = "none") -> dict[str, object]:
-    """Returns the rules that decide figures, by their names."""
-    names = ("min_depth", "max_depth", "clip", "crop", "missing", "exclude_sparse")
-    return {name: getattr(rules, name) for name in names} | {
-        "thresholds": list(rules.thresholds),
-        "scale_by": scale_by,
-        "definitions": KITTI_DEVKIT if rules.name == KITTI_DEVKIT else "usual",
-    }
+        return f"{self.protocol}{' (changed)' * changed}: {', '.join(texts)}; mean over the images"

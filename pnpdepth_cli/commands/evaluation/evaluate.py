@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest, scoring_of
+from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
 from pnpdepth_cli.commands.pipeline import THREADS, in_order, versions
@@ -69,7 +69,7 @@ class Evaluation:
             "prediction": str(request.prediction),
             "truth": str(request.ground_truth),
             "protocol": request.protocol,
-            "scoring": scoring_of(request.rules, request.scale_by),
+            "scoring": request.scoring,
             "measures": [measure.to_json() for measure in self.measures],
             "counts": plain(self.counts),
             "mean": plain(self.mean),

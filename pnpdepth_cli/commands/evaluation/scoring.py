@@ -93,10 +93,7 @@ def _score(
     values, of_prediction = _read_prediction(result.depth, truth.shape, request)
     depth, fit = scale_prediction(values, truth, request.scale_by)
     if rules.clip:
-        clipped = np.clip(depth, rules.min_depth, rules.max_depth)
-        depth = np.where(depth > 0, clipped, 0).astype(np.float32)
-    if rules.missing == "min":
-        depth = np.where(depth > 0, depth, np.float32(rules.min_depth))
+        depth = np.clip(depth, rules.min_depth, rules.max_depth).astype(np.float32)
     both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
     if not both.any() and not request.is_devkit:
         raise InputError(f"{result.depth} holds no valid depth where the truth is known")
@@ -128,7 +125,8 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}
     depths = torch.from_numpy(depth), torch.from_numpy(truth)
-    pixels = scored_pixels(*depths, request.rules.thresholds)
+    thresholds = request.delta, request.delta**2, request.delta**3
+    pixels = scored_pixels(*depths, thresholds)
     values: Scores = {**measure_pixels(pixels, request.measures)}
     return values | {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest, scoring_of
+from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.scoring import crop_window
 from pnpdepth_cli.errors import SizeError, UsageError
 from pnpdepth_cli.protocols import find_protocol
@@ -61,11 +61,8 @@ def test_a_setting_without_sense_is_refused(name: str, changes: dict[str, Any], 
 
 
 def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
-    def scoring(name: str, **changes: Any) -> dict[str, object]:
-        asked = request(name, **changes)
-        return scoring_of(asked.rules, asked.scale_by)
-
-    assert scoring_of(find_protocol("paper")) == scoring("kitti", resize=True)
-    rules = [scoring(name) for name in ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")]
-    rules += [scoring("paper", exclude_sparse=True), scoring("paper", scale_by="median")]
+    assert request("paper").scoring == request("kitti", resize=True).scoring
+    kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
+    asked = [*map(request, kinds), request("paper", exclude_sparse=True)]
+    rules = [each.scoring for each in (*asked, request("paper", scale_by="median"))]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
