@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import nearest_points
@@ -50,3 +52,18 @@ def test_neighbouring_scan_lines_are_in_different_folds() -> None:
     assert bool((fold == fold[:, :1]).all())
     assert bool((fold[1:, 0] != fold[:-1, 0]).all())
     assert len(fold[:, 0].unique()) == 4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_clustered_points_whole_cells_are_held_out_as_far_off_as_pixels_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform((10, 10), (290, 150), (60, 1, 2)) + rng.normal(0, 1.5, (60, 15, 2))
+    xy = xy.reshape(-1, 2).astype(np.float32)
+    held = spatial_folds(points_at(torch.from_numpy(xy)), 5, seed=seed).numpy() == 0
+    pixels = rng.uniform(*np.quantile(xy, (0.02, 0.98), axis=0), (9000, 2))
+    of_pixels, apart = (
+        np.median(cKDTree(known).query(asked)[0])
+        for known, asked in ((xy, pixels), (xy[~held], xy[held]))
+    )
+    assert 0.85 * of_pixels < apart < 2.8 * of_pixels
+    assert held.sum() == pytest.approx(180, abs=20)

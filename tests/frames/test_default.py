@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
-from pnpdepth_cli.frames.frame import Frame, Prediction, Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.fuse import (
     FOLDS,
     MIN_POINTS,
@@ -26,7 +28,7 @@ from pnpdepth_cli.frames.fuse import (
     weighted_mean,
 )
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.resolve import resolve_member
+from pnpdepth_cli.frames.resolve import resolve_layer, resolve_member
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings, Settings
@@ -45,6 +47,13 @@ UPDATES = ClosedSettings(iterations=3, lr="5%", update="sign", align="scale")
 ALIGNED = ClosedSettings(iterations=0, align="affine")
 
 
+class Exact(Nearest):
+    """The scene's own depth."""
+
+    def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        return self.layer(depth_of_scene()[None, None] + 0 * sparse)
+
+
 class Noise(Brightness):
     """Depth that has nothing to do with the image."""
 
@@ -57,12 +66,6 @@ def refined(frame: Frame, *members: OpenNetwork, seed: int = 0) -> Refined:
     """The frame by the default method with these networks."""
     with opened(*members) as networks:
         return refine_default(networks, frame, seed=seed)
-
-
-def predicted_by(own: OpenNetwork, frame: Frame) -> Prediction:
-    """What the network alone gives for the frame."""
-    with own as network:
-        return network.refine(frame)
 
 
 def with_gt(frame: Frame) -> Frame:
@@ -156,8 +159,7 @@ def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise:
     x = 0.3 * y + noise * 0.3 * rng.normal(size=known)
     predicted = torch.zeros(SIZE, dtype=torch.float64)
     predicted[pixels] = torch.from_numpy(x).exp()
-    shown = replace(predicted_by(member(Brightness), frame), before=predicted)
-    one = replace(expert("net", torch.ones(60)), whole=shown)
+    one = replace(expert("net", torch.ones(60)), whole=SimpleNamespace(before=predicted))
     split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
     press = total = 0.0
     for left_out in range(known):
@@ -263,20 +265,13 @@ def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_err
     assert not any(note.startswith("warning: the image") for note in stated.notes)
 
 
-def test_a_completion_network_of_the_scanner_has_most_of_the_result(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frame, own = scan_frame(), member(Nearest)
-    poor = refined(frame, own, compact())
+def test_a_completion_network_of_the_scanner_has_most_of_the_result() -> None:
+    frame = scan_frame()
+    poor, good = (refined(frame, member(each), compact()) for each in (Nearest, Exact))
     assert poor.weights["nearest"] == 0
-    monkeypatch.setattr(
-        Nearest,
-        "forward",
-        lambda self, rgb, _: self.layer(depth_of_scene()[None, None] + 0 * rgb[:, :1]),
-    )
-    result = refined(frame, own, compact())
-    assert result.weights["nearest"] == pytest.approx(OWN_SCANNER)
-    assert sum(result.weights.values()) == pytest.approx(1)
+    assert good.weights["exact"] == pytest.approx(OWN_SCANNER)
+    assert sum(good.weights.values()) == pytest.approx(1)
+    assert np.abs(good.after - depth_of_scene().numpy()).max() < 0.25
 
 
 def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> None:
@@ -416,3 +411,13 @@ def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone(
     asked, network = Settings(iterations=9, align="none", layer="layer"), member(build).network
     found = resolve_member(network, frame_in_memory(), asked, is_default=is_default).settings
     assert (found.iterations, found.align) == expected
+
+
+def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> None:
+    definition = replace(member(Brightness).network.definition, layers=tuple("abcde"))
+    asked = (None, "0", "0.12", "0.13", "0.87", "1", "x.y")
+    assert [resolve_layer(definition, each) for each in asked] == [*"aaabd", "e", "x.y"]
+    nothing = replace(definition, layers=())
+    for unlisted, layer in ((nothing, None), (nothing, "0"), (definition, "1.01")):
+        with pytest.raises(UsageError):
+            resolve_layer(unlisted, layer)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.errors import DivergedError, ModelError, NoPointsError
+from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import refine_fixed
 from pnpdepth_cli.frames.open_network import prepare
@@ -36,12 +36,6 @@ def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
     outside = SparsePoints(xy=xy, depth=torch.ones(1), size=frame.size)
     with pytest.raises(NoPointsError):
         refined(Brightness, frame.with_points(outside), size=Fixed(32, 32, fit="crop"))
-
-
-def test_a_frame_whose_prediction_is_not_finite_is_an_error() -> None:
-    frame = frame_in_memory()
-    with pytest.raises(ModelError):
-        refined(Brightness, replace(frame, rgb=torch.full_like(frame.rgb, torch.nan)))
 
 
 @pytest.mark.parametrize(
