@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import refine_fixed
@@ -71,6 +72,22 @@ def test_a_divergence_comes_with_its_last_good_depth() -> None:
     result = refined(Brightness, frame_in_memory(), settings)
     assert isinstance(result.diverged, DivergedError)
     np.testing.assert_array_equal(result.after, result.before)
+
+
+def test_a_validated_frame_is_refined_again_without_its_validation_points() -> None:
+    frame, settings = frame_in_memory(60), replace(SETTINGS, propagate="local")
+    with opened(member(Brightness, settings=settings)) as (network,):
+        checked = refine_fixed(network, frame, validated=True).validation
+        assert checked is not None
+        assert (len(checked.points), len(checked.kept)) == (12, 48)
+        again = refine_fixed(network, frame.with_points(checked.kept))
+        assert refine_fixed(network, frame_in_memory(4), validated=True).validation is None
+    assert again.validation is None
+    for stage, depth in (("before", again.before), ("after", again.after)):
+        expected = checked.points.sample(torch.from_numpy(depth))
+        assert torch.allclose(checked.predicted[stage], expected, rtol=1e-5)
+    expected = linear(checked.kept, checked.points.xy)
+    assert torch.equal(checked.predicted["linear"], expected)
 
 
 @pytest.mark.parametrize("weighs_points", [True, False])
