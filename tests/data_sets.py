@@ -40,7 +40,7 @@ TREES = {
     "pairs": ("rgb/{a,b}.png sparse/{a,b}.png gt/a.exr calib/a.json", ["a", "b"]),
     "image-depth": ("images/x/{a,b}.jpg depth/x/{a,b}.png", ["x/a", "x/b"]),
     "kitti-object": (
-        "training/image_2/00000{0,1}.png training/velodyne/00000{0,1}.bin"
+        "training/image_2/00000{0.png,1.PNG} training/velodyne/00000{0,1}.bin"
         " training/calib/00000{0,1}.txt",
         ["training_000000", "training_000001"],
     ),

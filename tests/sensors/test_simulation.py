@@ -43,6 +43,7 @@ def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_sam
 def test_a_lidar_of_ones_own_has_evenly_spaced_beams() -> None:
     assert ideal_lidar(5, 15, -25).elevations_deg == (15, 5, -5, -15, -25)
     assert ideal_lidar(1, 3, 3).elevations_deg == (3,)
+    assert len(ideal_lidar(5, 15, -25).directions(np.random.default_rng(0))) == 5 * 1800
     for beams, top, bottom in ((5, -25, 15), (5, 3, 3), (5, np.nan, 0), (2, 91, 0)):
         with pytest.raises(UsageError):
             ideal_lidar(beams, top, bottom)
