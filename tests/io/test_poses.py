@@ -85,29 +85,24 @@ def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
 
 def test_poses_of_other_kinds_are_the_same_cameras(tmp_path: Path) -> None:
     """A camera at (1, 2, 3), turned by a quarter about z, as each kind writes it."""
-    path = tmp_path / "poses.txt"
     rows = {
-        "camera-to-world": "0 -1 0 1 1 0 0 2 0 0 1 3",
-        "world-to-camera": "0 1 0 -2 -1 0 0 1 0 0 1 -3",  # x of the world is -y of the camera
-        "opengl": "0 1 0 1 1 0 0 2 0 0 -1 3",  # its y and z axes are the negative ones
+        "camera-to-world": ("0 -1 0 1 1 0 0 2 0 0 1 3", "from camera"),
+        # x of the world is -y of the camera
+        "world-to-camera": ("0 1 0 -2 -1 0 0 1 0 0 1 -3", "from world"),
+        "opengl": ("0 1 0 1 1 0 0 2 0 0 -1 3", "OpenGL"),  # its y and z axes are the negative ones
     }
-    for kind, row in rows.items():
-        path.write_text(row)
-        (pose,), how = poses_of_frames(path, ["a"], kind)
+    for kind, (row, words) in rows.items():
+        (tmp_path / "poses.txt").write_text(row)
+        (pose,), how = poses_of_frames(tmp_path / "poses.txt", ["a"], kind)
         assert pose.tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-        assert {"world-to-camera": "from world", "opengl": "OpenGL"}.get(kind, "from camera") in how
+        assert words in how
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "# nothing\n",
-        "1 2 3\n",
-        "2 0 0 0 0 1 0 0 0 0 1 0\n",
-        "-1 0 0 0 0 1 0 0 0 0 1 0\n",
-        "1 0 0 nan 0 1 0 0 0 0 1 0\n",
-        "0 0 0 0 0 0 0 0\n",
-        kitti_row(0) + tum_row(0, 0),
+        *("# nothing\n", "1 2 3\n", "2 0 0 0 0 1 0 0 0 0 1 0\n", "-1 0 0 0 0 1 0 0 0 0 1 0\n"),
+        *("1 0 0 nan 0 1 0 0 0 0 1 0\n", "0 0 0 0 0 0 0 0\n", kitti_row(0) + tum_row(0, 0)),
     ],
 )
 def test_a_broken_row_is_refused(tmp_path: Path, text: str) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.errors import OutputError, StorageError
-from pnpdepth_cli.io import atomic
 from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, results
 from tests.io.test_atomic import no_room_on_disk
 
@@ -43,9 +42,8 @@ def test_a_disk_that_is_full_stops_it_and_with_room_it_goes_on(tmp_path: Path) -
 
 
 def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(atomic, "_TRIED_S", 0.05)
     root = pairs_on_disk(tmp_path / "drive", NAMES[:2])
     inner = RecordingListener()
 
