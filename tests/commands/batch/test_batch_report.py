@@ -93,22 +93,6 @@ def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what
     assert frames["b"]["values"]["rmse_change"] is not None
 
 
-def test_without_ground_truth_changes_are_those_at_held_out_points_and_settings_are_stated(
-    root: Path, report: Path
-) -> None:
-    shutil.rmtree(root / "gt")
-    batch(root, html=report, refine={"holdout": 0.3, "propagate": "gp"})
-    facts = dict(page_data(report)["facts"])
-    assert (facts["iterations"], facts["layer"], facts["lr"]) == ("5", "middle", "0.01")
-    assert (facts["update"], facts["loss"], facts["align"]) == ("sign", "l1", "none")
-    assert (facts["propagate"], facts["holdout"]) == ("gp", "0.3")
-    frame = frames_of(report)["a"]
-    assert frame["values"]["rmse_change"] is not None
-    assert any("at held-out points" in note for note in frame["notes"])
-    (table,) = page_data(report)["tables"]
-    assert table["title"] == "means: errors at held-out points, 4 frames"
-
-
 def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
     root: Path, report: Path
 ) -> None:
@@ -121,21 +105,32 @@ def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
     assert f"{largest} {weights[largest]:.0%}" in notes
 
 
-def test_with_neither_ground_truth_nor_held_out_points_there_is_no_change(
+def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_there_are_none(
     root: Path, report: Path
 ) -> None:
     shutil.rmtree(root / "gt")
     batch(root, html=report)
-    data = page_data(report)
+    data, frame = page_data(report), frames_of(report)["a"]
     assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
     assert "proves nothing" in data["tables"][0]["title"]
     assert {row[3] for row in data["tables"][0]["rows"]} == {"–"}  # no change
     assert "no error is measured" in data["notes"][0]
-    frame = frames_of(report)["a"]
     assert any("proves nothing" in note for note in frame["notes"])
     assert {*frame["views"]} == {"first", "second", "image", "sparse"}  # no map of gains
     assert (frame["map"], (root / "out/a_improvement.png").exists()) == (None, False)
+
+    changes = {"holdout": 0.3, "propagate": "gp", "overwrite": True}
+    batch(root, output=root / "other", html=report, refine=changes)
+    data, frame = page_data(report), frames_of(report)["a"]
+    names = ("iterations", "layer", "lr", "update", "loss", "align", "propagate", "holdout")
+    settings = ["5", "middle", "0.01", "sign", "l1", "none", "gp", "0.3"]
+    assert [dict(data["facts"])[name] for name in names] == settings
+    assert frame["values"]["rmse_change"] is not None
+    assert any("at held-out points" in note for note in frame["notes"])
+    assert [each["title"] for each in data["tables"]] == [
+        "means: errors at held-out points, 4 frames"
+    ]
 
 
 def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
