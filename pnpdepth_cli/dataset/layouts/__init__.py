@@ -184,6 +184,7 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
         if found := {path: name for path, name in layouts.items() if name is not None}:
             return found
     raise InputError(
-        f"{root} does not look like {', '.join(names)}; put images into rgb/ and their sparse"
-        " depth into sparse/, with equal names, or give a CSV list with columns image and sparse"
+        f"{root} does not look like {', '.join(names)}, whose folders docs/guides/many-frames.md"
+        " lists; put images into rgb/ and their sparse depth into sparse/, with equal names, or"
+        " give a CSV list with columns image and sparse"
     )
