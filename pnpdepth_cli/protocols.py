@@ -147,8 +147,6 @@ _EIGEN = Protocol(name="eigen", part=WHOLE, crop="eigen", min_depth=1e-3, max_de
 _NOT_FOUND = "which pixels the paper draws, with which seed, size and bounds, was not found"
 _RESAMPLED = "the paper halves frames by interpolation; here every second pixel is taken"
 
-_EXCLUDED = Protocol(name="", part=WHOLE, seed=0, exclude_sparse=True)
-
 PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
@@ -197,23 +195,24 @@ PROTOCOLS = {
             note="the paper names no seed of its points, and interpolates images, which are"
             " averaged here; it has other numbers and patterns of points too",
         ),
-        replace(
-            _EXCLUDED,
-            name="capa-100",
-            sample="100",
-            note=f"100 points on ScanNet and 7-Scenes; {_NOT_FOUND}",
-        ),
-        replace(
-            _EXCLUDED,
-            name="streamtto-rings",
-            sample="lines:8",
-            note=f"the 8 rings are evenly spaced rows of the image here; {_NOT_FOUND}",
-        ),
-        replace(
-            _EXCLUDED,
-            name="streamtto-pixels",
-            sample="10%",
-            note=f"10 % of the pixels with ground truth; {_NOT_FOUND}",
+        *(
+            Protocol(
+                name=name,
+                part=WHOLE,
+                sample=sample,
+                seed=0,
+                exclude_sparse=True,
+                note=f"{note}; {_NOT_FOUND}",
+            )
+            for name, sample, note in (
+                ("capa-100", "100", "100 points on ScanNet and 7-Scenes"),
+                (
+                    "streamtto-rings",
+                    "lines:8",
+                    "here the 8 rings are evenly spaced rows of an image",
+                ),
+                ("streamtto-pixels", "10%", "10 % of the pixels with ground truth"),
+            )
         ),
     )
 }
