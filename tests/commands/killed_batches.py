@@ -15,7 +15,6 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -44,24 +43,9 @@ def finish(child: int) -> None:
     assert os.waitstatus_to_exitcode(status) == 0
 
 
-def recorded() -> set[str]:
+def recorded() -> tuple[str, ...]:
     """The names of the frames that have a record."""
-    return {name for name in NAMES if (OUT / f"{name}.json").exists()}
-
-
-def done_times() -> dict[str, int]:
-    """When the results of the frames were written that have a record."""
-    done = tuple(f"{name}{end}" for name in recorded() for end in ("_", ".json"))
-    return {name: when for name, when in times(OUT).items() if name.startswith(done)}
-
-
-def visible() -> dict[str, Any]:
-    """The results that are there; hidden files are those that were being written."""
-    return {
-        name: content
-        for name, content in results(OUT).items()
-        if not Path(name).name.startswith(".")
-    }
+    return tuple(name for name in NAMES if (OUT / f"{name}.json").exists())
 
 
 def main(folder: Path, kills: int) -> None:
@@ -78,7 +62,9 @@ def main(folder: Path, kills: int) -> None:
     moments = random.Random(0)
     killed = interrupted = 0
     while killed < kills:
-        before = done_times() if OUT.exists() else {}
+        # What is done must not be done again.
+        done, before = recorded(), times(OUT)
+        kept = {name: when for name, when in before.items() if name.startswith(done)}
         child = fork_batch()
         time.sleep(moments.uniform(0, longest))
         os.kill(child, signal.SIGKILL)
@@ -86,21 +72,25 @@ def main(folder: Path, kills: int) -> None:
         if not OUT.exists():
             longest *= 1.1  # nothing had begun: the machine is busier than at the start
             continue
-        there = visible()
+        # What is there must be whole, but for hidden files, which were being written.
+        there = {
+            name: content
+            for name, content in results(OUT).items()
+            if not Path(name).name.startswith(".")
+        }
         assert there.items() <= undisturbed.items(), "a file is half-written or wrong"
         now = times(OUT)
-        assert all(now[name] == when for name, when in before.items()), "done work was done again"
+        assert kept.items() <= now.items(), "done work was done again"
         if os.WIFSIGNALED(status):
             killed += 1
             depths = {name.partition("_")[0] for name in there if name.endswith("_depth.png")}
-            interrupted += bool(depths - recorded()) or len(now) > len(there)
+            interrupted += bool(depths - {*recorded()}) or len(now) > len(there)
         else:
             shutil.rmtree(OUT)
     finish(fork_batch())
     assert results(OUT) == undisturbed, "the resumed run gave something else, or leftovers"
-    assert recorded() == set(NAMES)
-    report = {"kills": killed, "interrupted": interrupted}
-    sys.stdout.write(json.dumps(report))
+    assert recorded() == NAMES
+    sys.stdout.write(json.dumps({"kills": killed, "interrupted": interrupted}))
 
 
 if __name__ == "__main__":

@@ -12,25 +12,25 @@ from pnpdepth_cli.commands.refinement.refine_image import read_requested
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io.depth import read_depth, write_depth
-from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.settings import Settings
 from tests.commands.batches import batch
 from tests.commands.frames import FrameOnDisk, run
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 
 
-def write_frame(folder: Path, seed: int, count: int) -> dict[str, Path]:
-    """Writes a frame that is not registered; returns its image and sparse depth."""
+def write_frame(root: Path, seed: int, count: int) -> dict[str, Path]:
+    """Writes a frame that is not registered into rgb/ and sparse/; returns its files."""
     rgb, points = frame(seed, UNREGISTERED, count)
-    folder.mkdir(parents=True, exist_ok=True)
-    image, sparse = folder / f"{seed:03}_rgb.png", folder / f"{seed:03}_sparse.png"
-    cv2.imwrite(str(image), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
+    files = {"image": root / f"rgb/{seed:03}.png", "sparse": root / f"sparse/{seed:03}.png"}
+    for path in files.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(files["image"]), np.rint(rgb[..., ::-1] * 255).astype(np.uint8))
     depth = np.zeros(SIZE, np.float32)
     column, row = points.xy.numpy().astype(int).T
     depth[row, column] = points.depth.numpy()
-    write_depth(sparse, depth, scale=1000)
-    return {"image": image, "sparse": sparse}
+    write_depth(files["sparse"], depth, scale=1000)
+    return files
 
 
 def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> FrameRecord:
@@ -62,19 +62,15 @@ def test_off_and_the_papers_method_leave_the_image_and_numbers_are_recorded(
 def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
-    refined(tmp_path / "a", frame, registration=(1.0, -4.0, 3.0))
-    rgb = read_rgb(write_frame(tmp_path / "b", 0, 500)["image"]).values
+    refined(tmp_path, frame, registration=(1.0, -4.0, 3.0), output=tmp_path / "a.npy")
+    files = write_frame(tmp_path, 0, 500)
+    image = cv2.imread(str(files["image"]))
     rows = (np.arange(SIZE[0]) + 3).clip(0, SIZE[0] - 1)
     columns = (np.arange(SIZE[1]) - 4).clip(0, SIZE[1] - 1)
-    moved = np.rint(rgb[rows][:, columns] * 255).astype(np.uint8)
-    other = tmp_path / "b" / "moved.png"
-    cv2.imwrite(str(other), moved[..., ::-1])
-    refined(tmp_path / "b", frame, image=other, registration="off")
-    depths = [
-        read_depth(tmp_path / path).values
-        for path in ("a/out/000_rgb_depth.png", "b/out/moved_depth.png")
-    ]
-    assert np.array_equal(*depths)
+    cv2.imwrite(str(tmp_path / "moved.png"), image[rows][:, columns])
+    changes: dict[str, Any] = {"image": tmp_path / "moved.png", "registration": "off"}
+    refined(tmp_path, frame, output=tmp_path / "b.npy", **changes)
+    assert np.array_equal(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"))
 
 
 def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
@@ -97,10 +93,7 @@ def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
 ) -> None:
     assert refined(tmp_path / "alone", frame, count=80).registration is None
     for seed in range(8):
-        for kind, path in write_frame(tmp_path / "in", seed, 80).items():
-            target = tmp_path / "in" / {"image": "rgb", "sparse": "sparse"}[kind] / f"{seed:03}.png"
-            target.parent.mkdir(exist_ok=True)
-            path.rename(target)
+        write_frame(tmp_path / "in", seed, 80)
     network = {"model": str(frame.model), "checkpoint": frame.checkpoint}
     batch(tmp_path, source=tmp_path / "in", refine=network)
     records = (tmp_path / "out").glob("0*.json")
