@@ -14,7 +14,6 @@ import numpy as np
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.records import BatchSummary
 from pnpdepth_cli.commands.batch.run_batch import run_batch
-from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.frames import frame_on_disk
@@ -50,27 +49,23 @@ class RecordingListener:
         return [record.name for record in self.records]
 
 
-def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES, gt: bool = True) -> Path:
+def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES) -> Path:
     """rgb/ sparse/ gt/ with these frames, all a little different, and net/ with a network."""
-    net = root / "net"
-    net.mkdir(parents=True)
-    frame = frame_on_disk(net)
-    image = cv2.imread(str(frame.image))
+    (root / "net").mkdir(parents=True)
+    image = cv2.imread(str(frame_on_disk(root / "net").image))
     for number, name in enumerate(names):
-        add_frame(root, name, np.roll(image, number, axis=1), gt=gt)
+        add_frame(root, name, np.roll(image, number, axis=1))
     return root
 
 
-def add_frame(root: Path, name: str, image: Any = None, gt: bool = True) -> None:
+def add_frame(root: Path, name: str, image: Any = None) -> None:
     """One more frame, with the image of the network by default."""
-    net = root / "net"
-    for part, file in (("rgb", "img"), ("sparse", "s"), *([("gt", "gt")] if gt else [])):
+    for part, file in (("rgb", "img"), ("sparse", "s"), ("gt", "gt")):
         target = root / part / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(net / f"{file}.png", target)
+        shutil.copy(root / "net" / f"{file}.png", target)
     if image is not None:
-        data = cv2.imencode(".png", image)[1]
-        (root / "rgb" / f"{name}.png").write_bytes(data.tobytes())
+        (root / "rgb" / f"{name}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 def refinement(root: Path, **changes: Any) -> RefineRequest:
@@ -106,14 +101,6 @@ def done(root: Path, listener: RecordingListener | None = None, **changes: Any) 
     return listener.names
 
 
-def refine_one_by_one(root: Path, names: tuple[str, ...], **changes: Any) -> None:
-    """Each of these frames refined by itself, into out/."""
-    for name in names:
-        parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
-        files = {part: root / folder / f"{name}.png" for part, folder in parts}
-        refine_image(refinement(root, output=root / "out", **files, **changes))
-
-
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
     """Every result below a folder: bytes, and records without times and what a batch adds.
 
@@ -133,11 +120,6 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         else:
             contents[name] = path.read_bytes()
     return contents
-
-
-def depths(root: Path) -> dict[str, bytes]:
-    """The depth files of a batch."""
-    return {path.name: path.read_bytes() for path in sorted((root / "out").glob("*_depth.png"))}
 
 
 def times(folder: Path) -> dict[str, int]:

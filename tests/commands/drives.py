@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import cv2
@@ -45,8 +44,3 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
         rows.append(f"1 0 0 0 0 1 0 0 0 0 1 {STEP_M * number}")
     (root / "poses.txt").write_text("\n".join(rows) + "\n")
     return root
-
-
-def without_results(root: Path) -> None:
-    """Removes what a batch of the drive wrote."""
-    shutil.rmtree(root / "out", ignore_errors=True)

@@ -20,8 +20,8 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.scans import read_scan
-from tests.commands.batches import RecordingListener, batch, depths, done
-from tests.commands.drives import STEP_M, drive_on_disk, without_results
+from tests.commands.batches import RecordingListener, batch, done, results
+from tests.commands.drives import STEP_M, drive_on_disk
 from tests.commands.frames import frame_on_disk
 
 DRIVE = Path(__file__).parents[3] / "samples/drive"
@@ -49,7 +49,7 @@ def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_be
         "drive_000.png",
         "drive_002.png",
     ]
-    without_results(root)
+    shutil.rmtree(root / "out")
     batch(root, refine=refine)
     alone = record_of(root, "drive_001")
     assert second["points"]["held_out"] == alone["points"]["held_out"] == 30
@@ -60,12 +60,11 @@ def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_be
 def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path)
     accumulating(root)
-    whole = depths(root)
-    without_results(root)
+    whole = results(root / "out")
+    shutil.rmtree(root / "out")
     for number in (1, 2, 3):
         accumulating(root, shard=(number, 3))
-    assert len(whole) == 4
-    assert depths(root) == whole
+    assert results(root / "out") == whole
 
 
 def test_a_frame_is_done_again_when_a_neighbours_points_or_poses_change(tmp_path: Path) -> None:
@@ -116,24 +115,21 @@ def test_neighbours_need_images_or_poses(tmp_path: Path) -> None:
         linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"])
 
 
-def rendered_drive(root: Path) -> Path:
+@pytest.fixture
+def rendered(tmp_path: Path) -> Path:
     """The drive of `samples/` without its poses, and net/ with a network."""
     for part in ("rgb", "sparse", "calib"):
-        shutil.copytree(DRIVE / part, root / part)
-    (root / "net").mkdir()
-    frame_on_disk(root / "net")
-    return root
+        shutil.copytree(DRIVE / part, tmp_path / part)
+    (tmp_path / "net").mkdir()
+    frame_on_disk(tmp_path / "net")
+    return tmp_path
 
 
-def without_poses(root: Path, **changes: Any) -> list[str]:
-    return accumulating(root, limit=1, poses=None, **changes)
-
-
-def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> None:
-    root, listener = rendered_drive(tmp_path), RecordingListener()
-    without_poses(root, listener=listener)
+def test_without_poses_the_motion_is_estimated_and_recorded(rendered: Path) -> None:
+    listener = RecordingListener()
+    accumulating(rendered, limit=1, poses=None, listener=listener)
     assert "poses: estimated from the images" in listener.messages
-    record = record_of(root, "drive_000")
+    record = record_of(rendered, "drive_000")
     (neighbour,) = record["neighbours"]
     assert neighbour["poses"].startswith("estimated from the images: ")
     assert neighbour["poses"].endswith("matches of the images")
@@ -143,14 +139,14 @@ def test_without_poses_the_motion_is_estimated_and_recorded(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(("metres", "turned"), [(0.6, 0.0), (0.3, 0.02)])
 def test_poses_that_the_images_contradict_get_a_warning(
-    metres: float, turned: float, tmp_path: Path
+    metres: float, turned: float, rendered: Path
 ) -> None:
-    root, listener = rendered_drive(tmp_path), RecordingListener()
+    listener = RecordingListener()
     turn = Rotation.from_rotvec([0, turned, 0]).as_matrix()
     rows = [np.eye(3, 4), *2 * [np.column_stack([turn, [0, 0, metres]])]]
-    np.savetxt(root / "poses.txt", np.reshape(rows, (3, 12)))
-    accumulating(root, listener=listener, limit=1)
-    (neighbour,) = record_of(root, "drive_000")["neighbours"]
+    np.savetxt(rendered / "poses.txt", np.reshape(rows, (3, 12)))
+    accumulating(rendered, listener=listener, limit=1)
+    (neighbour,) = record_of(rendered, "drive_000")["neighbours"]
     assert neighbour.get("contradicts_images", False) == (turned > 0)
     assert any("contradict the images" in text for text in listener.messages) == (turned > 0)
 
@@ -173,16 +169,6 @@ def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
     record = record_of(root, "drive_000")
     assert record["points"]["moved"] > 20
     assert record["neighbours"][0]["path"].endswith("gt/drive_001.png")
-
-
-def test_poses_that_lie_beside_the_frames_are_used(tmp_path: Path) -> None:
-    root, out = shutil.copytree(DRIVE, tmp_path / "drive"), tmp_path / "out"
-    request = BatchRequest(source=root, output=out, refine=RefineRequest(), accumulate=1)
-    (first, *_) = find_frames(request).frames[0].neighbours
-    assert first.motion is not None
-    (root / "poses.txt").unlink()
-    (first, *_) = find_frames(request).frames[0].neighbours
-    assert first.motion is None
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:

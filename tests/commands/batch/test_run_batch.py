@@ -19,6 +19,7 @@ from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.records import summarise
+from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
@@ -31,7 +32,6 @@ from tests.commands.batches import (
     batch,
     done,
     pairs_on_disk,
-    refine_one_by_one,
     refinement,
     results,
     times,
@@ -64,7 +64,10 @@ def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> 
     batch(root, refine={"holdout": 0.3, "seed": 5})
     together = results(root / "out")
     shutil.rmtree(root / "out")
-    refine_one_by_one(root, NAMES, holdout=0.3, seed=5)
+    for name in NAMES:
+        parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
+        files = {part: root / folder / f"{name}.png" for part, folder in parts}
+        refine_image(refinement(root, output=root / "out", **files, holdout=0.3, seed=5))
     assert len(together) == 4 * len(NAMES)
     assert together == results(root / "out")
 
