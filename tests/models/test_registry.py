@@ -6,12 +6,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import model_zoo_defs
 from pnpdepth_cli import choices
 from pnpdepth_cli.commands import networks
 from pnpdepth_cli.commands.networks import list_models
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import all_definitions, find_definition
 
 
@@ -90,10 +92,16 @@ def test_a_package_that_cannot_be_loaded_is_reported_only_when_it_is_named(
 ) -> None:
     install(open_list, entry_point)
     assert "compact" in all_definitions()
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match=reason):
         find_definition("theirs")
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="fcrn-tiny"):
         find_definition("fcrn-tyni")
+
+
+@pytest.mark.parametrize("name", ["script.pt", "w.safetensors", "w.pth.tar"])
+def test_weights_and_programs_that_are_not_run_are_no_network(name: str) -> None:
+    with pytest.raises(ModelError, match=r"TorchScript.*checkpoint.*ONNX"):
+        find_definition(name)
 
 
 # ------------------------------------------------------------------ a Python file
@@ -106,9 +114,12 @@ from beside import WIDTH
 definition = ModelDefinition(
     name="mine", input_kind="rgb", size=Multiple(8), build=lambda: nn.Conv2d(3, WIDTH, 1)
 )
-other = ModelDefinition(name="other", input_kind="rgb", size=Multiple(8), build=nn.Identity)
-"""
 
+class Bare(nn.Sequential):
+    def __init__(self):
+        block = nn.Sequential(nn.Conv2d(4, 4, 3, 2, 1), nn.Softplus())
+        super().__init__(nn.Conv2d(3, 4, 3, 2, 1), block, nn.PixelShuffle(2))
+"""
 INVALID = """from pnpdepth_cli.models.definition import ModelDefinition
 definition = ModelDefinition(name="mine", input_kind="rgb", size=32, build=int)
 """
@@ -120,25 +131,29 @@ def written(folder: Path, text: str, name: str = "mine.py") -> Path:
     return file
 
 
-def test_a_file_gives_its_definition_and_may_import_what_is_beside_it(tmp_path: Path) -> None:
+def test_a_file_gives_its_definition_or_a_class_and_may_import_what_is_beside_it(
+    tmp_path: Path,
+) -> None:
     written(tmp_path, "WIDTH = 7", "beside.py")
     file = written(tmp_path, GOOD)
     assert find_definition(str(file)).name == "mine"
-    assert find_definition(f"{file}:other").name == "other"
     assert find_definition(str(file)).build().out_channels == 7
+    torch.save(find_definition(f"{file}:Bare").build().state_dict(), tmp_path / "w.pt")
+    network = load_network(f"{file}:Bare", tmp_path / "w.pt")
+    assert network.definition.layers[0] == "1"
+    assert network.definition.default_alignment == "auto"
+    assert "assumed: one rgb image in" in network.notes[0]
 
 
 @pytest.mark.parametrize(
     ("text", "place"),
     [
         ("x = 1\n\nraise ValueError('a\\nb')\n", "line 3"),
-        ("def f():\n    return 1 / 0\n\nf()\n", "line 2"),
         ("def (:\n", "line 1"),
         ("import sys\nsys.exit(0)\n", "line 2"),
         (INVALID, "line 2"),
         ("x = 1\n", "mine.py"),
         ("definition = 'text'\n", "mine.py"),
-        ("definition = None\n", "mine.py"),
     ],
 )
 def test_an_error_in_a_model_file_names_its_line(

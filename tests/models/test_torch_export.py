@@ -1,4 +1,4 @@
-"""torch.export archives and bare Python classes as networks."""
+"""torch.export archives as networks; graphs of sparse depth and intrinsics, also of ONNX."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch.export import Dim
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import CheckpointError, ModelError, UsageError
+from pnpdepth_cli.errors import ModelError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import prepare
 from pnpdepth_cli.models.definition import Fixed, Multiple
@@ -30,34 +30,46 @@ from tests.models.weights.files import Hostile, little
 
 
 class Net(nn.Module):
+    """Layers in place, an equation, attention, constants, parts and infinite numbers."""
+
     def __init__(self) -> None:
         super().__init__()
-        self.encode = nn.Sequential(
-            nn.Conv2d(3, 8, 3, 2, 1), nn.BatchNorm2d(8), nn.ReLU(inplace=True)
-        )
-        self.middle, self.decode = nn.Conv2d(8, 8, 3, 2, 1), nn.Conv2d(8, 1, 3, 1, 1)
+        torch.manual_seed(0)
+        layers = nn.Conv2d(3, 8, 3, 2, 1), nn.BatchNorm2d(8), nn.ReLU(inplace=True)
+        self.encode, self.out = nn.Sequential(*layers), nn.Conv2d(8, 1, 1)
+        self.levels = torch.arange(1, 9)
 
-    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-        z = torch.relu(self.middle(self.encode(rgb)))
-        up = nn.functional.interpolate(self.decode(z), scale_factor=4.0, mode="bilinear")
-        return 1 + 2 * torch.sigmoid(up)
+    def forward(self, rgb: Tensor) -> Tensor:
+        z = torch.einsum("bchw,c->bchw", self.encode(rgb), self.levels.float())
+        rows = z.flatten(2).transpose(1, 2)
+        z = z + nn.functional.scaled_dot_product_attention(rows, rows, rows).mean()
+        left, right = torch.split(self.out(z), [8, z.shape[3] - 8], dim=3)
+        y = torch.cat([left, right.clamp(min=-float("inf"))], dim=3)
+        y = nn.functional.interpolate(y, size=tuple(rgb.shape[2:]), mode="bilinear")
+        return torch.ones(1, layout=torch.strided) + torch.sigmoid(torch.relu(y)) + rgb.mean()
 
 
-def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    net, x = Net().eval(), torch.rand(1, 3, 32, 48)
-    torch.export.save(torch.export.export(net, (x,)), tmp_path / "net.pt2")
-    network = load_network(str(tmp_path / "net.pt2"), None)
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("archive") / "net.pt2"
+    torch.export.save(torch.export.export(Net().eval(), (torch.rand(1, 3, 32, 48),)), path)
+    return path
+
+
+def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(archive: Path) -> None:
+    network, net = load_network(str(archive), None), Net().eval()
+    rgb = torch.rand(1, 3, 32, 48, requires_grad=True)
     assert network.definition.size == Fixed(32, 48)
-    assert network.definition.layers[0] == "relu"
+    depth, expected = network.raw_of(network.module(rgb)), net(rgb)
+    assert torch.equal(depth, expected)
+    ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
+    torch.testing.assert_close(ours, theirs)
+    names = [name for name, _ in network.module.named_children()]
+    assert {"conv2d", "batch_norm", "relu", "relu_", "sigmoid"} <= set(names)
     with torch.no_grad():
-        whole = net(x)
-        assert torch.equal(network.raw_of(network.module(x)), whole)
-        names = [name for name, _ in network.module.named_children()]
-        assert {"conv2d", "batch_norm", "relu_", "sigmoid"} <= set(names)
-        for name in names:
+        for name in {*names} - {"split_with_sizes"}:  # which gives several
             with Split(network.module, name) as split:
-                assert torch.equal(network.raw_of(split.rear(split.front(x))), whole), name
+                assert torch.equal(network.raw_of(split.rear(split.front(rgb))), expected), name
 
 
 class WithPointsAndCamera(nn.Module):
@@ -65,8 +77,8 @@ class WithPointsAndCamera(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.encode = nn.Conv2d(4, 8, 3, 1, 1)
-        self.decode = nn.Conv2d(8, 1, 3, 1, 1)
+        torch.manual_seed(0)
+        self.encode, self.decode = nn.Conv2d(4, 8, 3, 1, 1), nn.Conv2d(8, 1, 3, 1, 1)
 
     def forward(self, rgb: Tensor, sparse: Tensor, intrinsics: Tensor) -> Tensor:
         z = self.encode(torch.cat([rgb, sparse], dim=1)).relu()
@@ -87,17 +99,13 @@ definition = {function}(
 
 @pytest.mark.parametrize(
     ("suffix", "module", "function"),
-    [
-        (".onnx", "onnx", "onnx_definition"),
-        (".pt2", "torch_export", "exported_definition"),
-    ],
+    [(".onnx", "onnx", "onnx_definition"), (".pt2", "torch_export", "exported_definition")],
 )
 def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
     tmp_path: Path, suffix: str, module: str, function: str, pytestconfig: pytest.Config
 ) -> None:
     if suffix == ".onnx" and pytestconfig.getoption("--rounding"):
         pytest.skip("torch's exporter would trace the other roundings")
-    torch.manual_seed(0)
     net, rgb = WithPointsAndCamera().eval(), torch.rand(3, 20, 30)
     given = (rgb[None], torch.zeros(1, 1, 20, 30), torch.eye(3)[None])
     if suffix == ".onnx":
@@ -121,54 +129,28 @@ def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
     with torch.no_grad():
         right = net(arguments[0], sparse, intrinsics)
         torch.testing.assert_close(network.raw_of(network.module(*arguments)), right)
-    if suffix == ".onnx":
-        assert "agrees with onnxruntime" in network.verify(arguments)[0]
+    assert suffix == ".pt2" or "agrees with onnxruntime" in network.verify(arguments)[0]
     with pytest.raises(UsageError):
         prepare(network, frame)
     with pytest.raises(ModelError):
         load_network(str(tmp_path / f"net{suffix}"), None)
 
 
-class Various(nn.Module):
-    """An equation, attention, constants, parts and infinite numbers."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.inward, self.out = nn.Conv2d(3, 8, 3, 2, 1), nn.Conv2d(8, 1, 1)
-        self.levels = torch.arange(1, 9)
-
-    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-        height, width = rgb.shape[2:]
-        z = torch.einsum("bchw,c->bchw", self.inward(rgb).relu(), self.levels.float())
-        rows = z.flatten(2).transpose(1, 2)
-        z = z + nn.functional.scaled_dot_product_attention(rows, rows, rows).mean()
-        left, right = torch.split(self.out(z), [8, z.shape[3] - 8], dim=3)
-        y = torch.cat([left, right.clamp(min=-float("inf"))], dim=3)
-        y = nn.functional.interpolate(y, size=(height, width), mode="bilinear")
-        return torch.ones(1, layout=torch.strided) + torch.sigmoid(y) + rgb.mean()
+def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
+    rgb = (torch.rand(1, 3, 64, 96),)
+    for name, net in (("plain", nn.Conv2d(3, 1, 3, 1, 1)), ("computing", Net().eval())):
+        program = torch.export.export(net, rgb, dynamic_shapes=(sides,))
+        torch.export.save(program, tmp_path / f"{name}.pt2")
+    assert find_definition(str(tmp_path / "plain.pt2")).size == Multiple(32)
+    with pytest.raises(ModelError, match="fixed sizes"):
+        find_definition(str(tmp_path / "computing.pt2"))
 
 
-@pytest.fixture(scope="module")
-def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("archive")
-    torch.manual_seed(0)
-    program = torch.export.export(Various().eval(), (torch.rand(1, 3, 64, 96),))
-    torch.export.save(program, folder / "net.pt2")
-    return folder / "net.pt2"
+# ------------------------------------------------------------------ archives that mean harm
 
-
-def test_a_program_gives_what_the_network_gives_and_its_gradients(
-    archive: Path,
-) -> None:
-    network = load_network(str(archive), None)
-    torch.manual_seed(0)
-    net, rgb = Various().eval(), torch.rand(1, 3, 64, 96, requires_grad=True)
-    depth, expected = network.raw_of(network.module(rgb)), net(rgb)
-    assert torch.equal(depth, expected)
-    ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
-    torch.testing.assert_close(ours, theirs)
-
-
+MODEL = "models/model.json"
+WEIGHTS = "data/weights/model_weights_config.json"
 Change = Callable[[bytes], bytes]
 
 
@@ -196,9 +178,8 @@ def edited(change: Callable[[Any], object]) -> Change:
     return on
 
 
-def call(target: str) -> Change:
-    """The first operator is another one."""
-    return edited(lambda p: p["graph_module"]["graph"]["nodes"][0].update(target=target))
+def first_node(**stated: object) -> Change:
+    return edited(lambda p: p["graph_module"]["graph"]["nodes"][0].update(stated))
 
 
 def first_weight(**stated: Any) -> Change:
@@ -210,11 +191,9 @@ def first_weight(**stated: Any) -> Change:
     return edited(change)
 
 
-MODEL = "models/model.json"
-WEIGHTS = "data/weights/model_weights_config.json"
 HOSTILE: dict[str, tuple[str, Change, str]] = {
     **{
-        target: (MODEL, call(target), f"it calls '{target}'")
+        target: (MODEL, first_node(target=target), f"it calls '{target}'")
         for target in (
             "torch.os.system", "torch.ops.load_library", "torch.ops.aten.from_file.default",
             "_operator.methodcaller", "math.ceil",
@@ -242,39 +221,20 @@ def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, k
 
 
 def test_a_small_archive_makes_nothing_far_larger_than_its_image(archive: Path) -> None:
-    def change(program: Any) -> None:
-        nodes = program["graph_module"]["graph"]["nodes"]
-        given = ({"as_tensor": {"name": "rgb"}}, {"as_ints": [1, 9, 999, 999]})
-        nodes[0]["inputs"] = [{"name": "x", "arg": one, "kind": 1} for one in given]
-        nodes[0]["target"] = "torch.ops.aten.repeat.default"
-
+    given = ({"as_tensor": {"name": "rgb"}}, {"as_ints": [1, 9, 999, 999]})
+    inputs = [{"name": "x", "arg": one, "kind": 1} for one in given]
+    change = first_node(target="torch.ops.aten.repeat.default", inputs=inputs)
     with little():
-        definition = find_definition(str(rewritten(archive, MODEL, edited(change))))
+        definition = find_definition(str(rewritten(archive, MODEL, change)))
         with pytest.raises(ModelError), torch.no_grad():
-            definition.build()(torch.rand(1, 3, 64, 96))
-
-
-def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path) -> None:
-    sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
-    for net in (Net(), Various()):
-        program = torch.export.export(
-            net.eval(), (torch.rand(1, 3, 64, 96),), dynamic_shapes=(sides,)
-        )
-        torch.export.save(program, tmp_path / f"{type(net).__name__}.pt2")
-    assert find_definition(str(tmp_path / "Net.pt2")).size == Multiple(32)
-    with pytest.raises(ModelError, match="fixed sizes"):
-        find_definition(str(tmp_path / "Various.pt2"))
+            definition.build()(torch.rand(1, 3, 32, 48))
 
 
 def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.pt2").write_bytes(b"no archive")
     packed = rewritten(archive, "data/x", lambda _: b"\0" * 10**7, zipfile.ZIP_DEFLATED)
-    for path, message in (
-        (tmp_path / "absent.pt2", "does not exist"),
-        (tmp_path / "bad.pt2", r"torch\.export\.save"),
-        (packed, "compressed"),
-    ):
-        with pytest.raises(ModelError, match=message):
+    for path in (tmp_path / "absent.pt2", tmp_path / "bad.pt2", packed):
+        with pytest.raises(ModelError, match=path.name):
             find_definition(str(path))
 
 
@@ -292,46 +252,10 @@ def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
         for value in program["graph_module"]["graph"]["sym_int_values"].values():
             value["as_expr"]["expr_str"] = code
 
-    hostile = rewritten(archive, "data/sample_inputs/model.pt", lambda _: pickled.getvalue())
-    hostile = rewritten(hostile, "data/constants/custom_obj_0", lambda _: pickled.getvalue())
-    hostile = rewritten(hostile, "data/aotinductor/model/m.so", lambda _: b"x")
-    hostile = rewritten(hostile, MODEL, edited(with_code))
+    hostile = rewritten(archive, MODEL, edited(with_code))
+    for entry in ("sample_inputs/model.pt", "constants/custom_obj_0", "aotinductor/model/m.so"):
+        hostile = rewritten(hostile, f"data/{entry}", lambda _: pickled.getvalue())
     network = load_network(str(hostile), None)
-    rgb = torch.rand(1, 3, 64, 96)
+    rgb = torch.rand(1, 3, 32, 48)
     assert torch.equal(network.module(rgb), load_network(str(archive), None).module(rgb))
     assert not trap.exists()
-
-
-@pytest.mark.parametrize("name", ["script.pt", "module.pth", "w.safetensors", "w.pth.tar"])
-def test_weights_and_programs_that_are_not_run_are_no_network(name: str) -> None:
-    with pytest.raises(ModelError, match=r"TorchScript.*checkpoint.*ONNX"):
-        find_definition(name)
-
-
-BARE = """
-from torch import nn
-
-class Net(nn.Sequential):
-    def __init__(self):
-        block = nn.Sequential(nn.Conv2d(4, 4, 3, 2, 1), nn.Softplus())
-        super().__init__(nn.Conv2d(3, 4, 3, 2, 1), block, nn.PixelShuffle(2))
-
-def needs(width):
-    return Net()
-"""
-
-
-def test_a_class_of_a_file_is_a_network_and_its_assumptions_are_printed(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "bare.py").write_text(BARE)
-    spec = f"{tmp_path}/bare.py:Net"
-    with pytest.raises(CheckpointError, match="checkpoint"):
-        load_network(spec, None)
-    torch.save(find_definition(spec).build().state_dict(), tmp_path / "w.pt")
-    network = load_network(spec, tmp_path / "w.pt")
-    assert network.definition.layers[0] == "1"
-    assert network.definition.default_alignment == "auto"
-    assert "assumed: one rgb image in" in network.notes[0]
-    with pytest.raises(ModelError):
-        load_network(spec.replace(":Net", ":needs"), tmp_path / "w.pt")
