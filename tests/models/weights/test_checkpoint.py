@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +39,12 @@ def weights() -> dict[str, Tensor]:
     return Net().state_dict()
 
 
-def loaded(path: Path) -> tuple[dict[str, Tensor], list[str]]:
+def loads(path: Path, expected: Mapping[str, Tensor]) -> list[str]:
+    """Loads a file with these weights; returns the notes."""
     network = Net()
     notes = load_checkpoint(network, DEFINITION, path)
-    return network.state_dict(), notes
-
-
-def equal(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
-    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+    assert all(torch.equal(network.state_dict()[name], t) for name, t in expected.items())
+    return notes
 
 
 def save_older(content: Any, path: Path) -> None:
@@ -57,32 +55,18 @@ def save_arrays(state: Mapping[str, Tensor], path: Path) -> None:
     npy_of(path, pickled({name: tensor.numpy() for name, tensor in state.items()}))
 
 
-def save_beside(key: str) -> Callable[[Any, Path], None]:
+def save_beside(state: Any, path: Path) -> None:
     optimiser = torch.optim.Adam(Net().parameters()).state_dict()
-    rest = {"epoch": 3, "loss": 0.5, "optimizer": optimiser}
-    return lambda state, path: torch.save({**rest, key: OrderedDict(state)}, path)
+    torch.save({"epoch": 3, "optimizer": optimiser, "state_dict": OrderedDict(state)}, path)
 
 
-# ------------------------------------------------------------------ good files
+SAVES = {".safetensors": save_file, ".pth": torch.save, ".pth.tar": save_older, ".npy": save_arrays}
 
 
-@pytest.mark.parametrize(
-    ("save", "suffix"),
-    [
-        (save_file, ".safetensors"),
-        *((torch.save, suffix) for suffix in (".pth", ".pth.tar", "")),
-        (save_older, ".pth"),
-        (save_arrays, ".npy"),
-        *((save_beside(key), ".pth") for key in ("state_dict", "net")),
-    ],
-)
-def test_every_format_and_layout_gives_the_same_weights(
-    save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
-) -> None:
-    save(weights(), tmp_path / f"w{suffix}")
-    state, notes = loaded(tmp_path / f"w{suffix}")
-    assert equal(state, weights())
-    assert notes == []
+@pytest.mark.parametrize("suffix", [*SAVES, "", ".ckpt"])
+def test_every_format_and_layout_gives_the_same_weights(suffix: str, tmp_path: Path) -> None:
+    SAVES.get(suffix, save_beside)(weights(), tmp_path / f"w{suffix}")
+    assert loads(tmp_path / f"w{suffix}", weights()) == []
 
 
 @pytest.mark.parametrize("prefix", ["module.", "module.module.", "_orig_mod.", "model._orig_mod."])
@@ -92,8 +76,7 @@ def test_prefixes_of_parallel_compiled_and_lightning_modules_are_stripped(
     torch.save(
         {"state_dict": {f"{prefix}{k}": v for k, v in weights().items()}}, tmp_path / "w.ckpt"
     )
-    state, (note,) = loaded(tmp_path / "w.ckpt")
-    assert equal(state, weights())
+    (note,) = loads(tmp_path / "w.ckpt", weights())
     assert all(repr(f"{part}.") in note for part in prefix.split(".")[:-1])
 
 
@@ -104,18 +87,15 @@ def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
     averaged = {name: 2 * tensor for name, tensor in weights().items()}
     states = {"model": weights(), "ema": averaged, "epoch": 7}
     torch.save(dict(list(states.items())[::order]), tmp_path / "w.pth")
-    state, (note,) = loaded(tmp_path / "w.pth")
-    assert equal(state, weights())
+    (note,) = loads(tmp_path / "w.pth", weights())
     assert "'model' is read, not 'ema'" in note
-    state, (note,) = loaded(tmp_path / "w.pth:ema")
-    assert equal(state, averaged)
+    (note,) = loads(tmp_path / "w.pth:ema", averaged)
     assert "'ema' is read, not 'model'" in note
     with pytest.raises(CheckpointError, match="'teacher'"):
-        loaded(tmp_path / "w.pth:teacher")
+        loads(tmp_path / "w.pth:teacher", {})
     torch.save({"ema": {"state_dict": weights(), "decay": 0.9}, "epoch": 7}, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError):
-        loaded(tmp_path / "w.pth")
-    assert equal(loaded(tmp_path / "w.pth:ema")[0], weights())
+    refused(tmp_path / "w.pth")
+    loads(tmp_path / "w.pth:ema", weights())
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -123,22 +103,19 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         state = weights()
         state["conv.weight"][0, 0, 0, 0] = value
         torch.save(state, tmp_path / "w.pth")
-        message = r"1 of its weights are NaN or infinite \(conv.weight"
-        with pytest.raises(CheckpointError, match=message):
-            loaded(tmp_path / "w.pth")
+        with pytest.raises(CheckpointError, match=r"conv\.weight"):
+            loads(tmp_path / "w.pth", {})
     state = {name: tensor.half() for name, tensor in weights().items()}
     state["conv.weight"][:] = 60000.0  # whose sum is infinite in half precision
     torch.save(state, tmp_path / "w.pth")
-    assert loaded(tmp_path / "w.pth")[0]["conv.weight"].max() == 60000.0
+    loads(tmp_path / "w.pth", {"conv.weight": torch.full((4, 3, 3, 3), 60000.0)})
 
 
 def test_the_tensors_of_a_whole_module_are_extracted_and_reported(tmp_path: Path) -> None:
     torch.manual_seed(3)
     torch.save(Net(), tmp_path / "w.pth")
-    state, (note,) = loaded(tmp_path / "w.pth")
-    assert equal(state, weights())
+    (note,) = loads(tmp_path / "w.pth", weights())
     assert note.startswith("checkpoint w.pth: its pickle names tests.models.weights")
-    assert note.endswith("was run")
 
 
 # ------------------------------------------------------------------ files that do not fit
@@ -160,8 +137,7 @@ def test_every_kind_of_misfit_is_listed_and_nothing_is_loaded(tmp_path: Path) ->
         " 5 unexpected (extra0, extra1, extra2, extra3 and 1 more); 1 of another shape (conv.bias"
         " (7,) for (4,))"
     )
-    assert error.value.exit_code == 4
-    assert equal(network.state_dict(), before)
+    assert all(torch.equal(network.state_dict()[name], tensor) for name, tensor in before.items())
 
 
 @pytest.mark.parametrize(
@@ -182,28 +158,12 @@ def test_a_file_without_named_tensors_is_refused(content: Any, tmp_path: Path) -
     refused(tmp_path / "w.pth")
 
 
-# ------------------------------------------------------------------ broken files
-
-
-def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
-    refused(tmp_path / "absent.pth")
+@pytest.mark.parametrize("suffix", SAVES)
+def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
     refused(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("save", "suffix"),
-    [
-        (torch.save, ".pth"),
-        (save_older, ".pth"),
-        (save_file, ".safetensors"),
-        (save_arrays, ".npy"),
-    ],
-)
-def test_a_file_cut_anywhere_is_refused(
-    save: Callable[[Any, Path], None], suffix: str, tmp_path: Path
-) -> None:
     path = tmp_path / f"w{suffix}"
-    save(weights(), path)
+    refused(path)
+    SAVES[suffix](weights(), path)
     whole = path.read_bytes()
     for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
         path.write_bytes(whole[:length])
