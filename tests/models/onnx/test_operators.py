@@ -134,7 +134,8 @@ X = normal(1, 4, 7, 6)
 STATISTICS = [normal(4), normal(4), np.abs(normal(4)) + 0.1]
 
 
-CASES = [
+W, V, TWICE = normal(6, 4, 3, 3), normal(4, 5, 3, 3), {"strides": [2, 2]}
+CASES: list[tuple[str, int, list[np.ndarray | None], dict[str, Any]]] = [
     ("Clip", 6, [X], {"min": 0.0, "max": 6.0}),
     ("Softmax", 11, [X], {"axis": 2}),
     ("BatchNormalization", 7, [X, np.abs(normal(4)), *STATISTICS], {}),
@@ -145,6 +146,17 @@ CASES = [
     ("Slice", 9, [X], {"starts": [1, 0], "ends": [3, -1], "axes": [2, 3]}),
     ("Cast", 17, [X], {"to": TensorProto.INT64}),
     ("Conv", 17, [normal(1, 2, 4, 5, 6), normal(3, 2, 3, 3, 3)], {}),
+    ("Conv", 17, [X, W, normal(6)], {"pads": [0, 1, 2, 1], "dilations": [2, 2]}),
+    ("Conv", 17, [X, normal(4, 1, 3, 3)], {"auto_pad": "SAME_LOWER", "group": 4} | TWICE),
+    ("Conv", 17, [X, W], {"auto_pad": "SAME_UPPER"} | TWICE),
+    ("ConvTranspose", 17, [X, V], {"pads": [1, 1, 1, 1], "output_padding": [1, 1]} | TWICE),
+    ("ConvTranspose", 17, [X, V, normal(5)], {"pads": [0, 0, 1, 1]} | TWICE),
+    ("ConvTranspose", 17, [X, V], {"auto_pad": "SAME_LOWER"} | TWICE),
+    ("ConvTranspose", 17, [X, V], {"auto_pad": "SAME_UPPER", "output_shape": [13, 12]} | TWICE),
+    ("ConvTranspose", 17, [X, normal(4, 2, 4, 4)], {"group": 2, "dilations": [2, 1]}),
+    *(("Resize", 10, [X, np.array([1, 1, f, f], F32)], {"mode": "linear"}) for f in (2, 1.5)),
+    ("Upsample", 9, [X, np.array([1, 1, 1.5, 2], F32)], {"mode": "nearest"}),
+    ("Upsample", 7, [X], {"mode": "linear", "scales": [1.0, 1.0, 2.0, 2.0]}),
     ("Pad", 10, [X], {"mode": "reflect", "pads": [0, 0, 2, 1, 0, 0, 1, 3]}),
     ("Pad", 13, [X, np.array([0, 0, -1, 0, 0, 0, 0, -2])], {}),
     *((op, 11, [np.abs(X) + 0.1], {}) for op in sorted(OPERATORS) if op.startswith("Reduce")),
@@ -157,45 +169,6 @@ def test_an_operator_gives_what_onnxruntime_gives(
     op: str, opset: int, inputs: list[np.ndarray | None], more: dict[str, Any]
 ) -> None:
     check(op, inputs, opset, **more)
-
-
-PADS = [
-    {"pads": [1, 1, 1, 1]}, {"pads": [0, 1, 2, 1]}, {"pads": [0, 0, 1, 2]}, {},
-    {"auto_pad": "SAME_UPPER"}, {"auto_pad": "SAME_LOWER"}, {"auto_pad": "VALID"},
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("pads", PADS, ids=str)
-@pytest.mark.parametrize("stride", [1, 2])
-def test_convolutions_with_every_kind_of_padding(pads: dict[str, Any], stride: int) -> None:
-    weight, bias = normal(6, 4, 3, 3), normal(6)
-    check("Conv", [X, weight, bias], strides=[stride, stride], **pads)
-    check("Conv", [X, normal(4, 1, 3, 3)], group=4, strides=[stride, stride], **pads)
-    if "auto_pad" not in pads:
-        check("Conv", [X, weight], dilations=[2, 2], strides=[stride, stride], **pads)
-
-
-TRANSPOSED = [
-    {"strides": [2, 2], "pads": [1, 1, 1, 1], "output_padding": [1, 1]},
-    {"strides": [2, 2], "pads": [0, 0, 1, 1]}, {"strides": [2, 2], "auto_pad": "SAME_LOWER"},
-    {"strides": [2, 2], "output_shape": [13, 12], "auto_pad": "SAME_UPPER"},
-    {"strides": [2, 1], "dilations": [2, 1]},
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("attributes", TRANSPOSED, ids=str)
-def test_transposed_convolutions(attributes: dict[str, Any]) -> None:
-    check("ConvTranspose", [X, normal(4, 5, 3, 3), normal(5)], **attributes)
-    check("ConvTranspose", [X, normal(4, 2, 4, 4)], group=2, **attributes)
-
-
-@pytest.mark.parametrize("mode", ["nearest", "linear"])
-@pytest.mark.parametrize("scales", [(2, 2), (1.5, 1.5)])
-def test_upsample_and_the_first_resize(mode: str, scales: tuple[float, float]) -> None:
-    factors = np.array([1, 1, *scales], F32)
-    check("Resize", [X, factors], opset=10, mode=mode)
-    check("Upsample", [X, factors], opset=9, mode=mode)
-    check("Upsample", [X], opset=7, mode=mode, scales=factors.tolist())
 
 
 @pytest.mark.parametrize(
