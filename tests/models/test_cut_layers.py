@@ -46,17 +46,9 @@ class Net(nn.Module):
         return self.head(self.up(self.relu(self.middle(self.squash(z)))))
 
 
-def without(mode: Any) -> Callable[[Any], Any]:
-    def run(part: Callable[[], Any]) -> Any:
-        with mode():
-            return part()
-
-    return run
-
-
-CUTS = {
-    "no_grad": without(torch.no_grad),
-    "inference_mode": without(torch.inference_mode),
+CUTS: dict[str, Callable[[Any], Any]] = {
+    "no_grad": lambda run: torch.no_grad()(run)(),
+    "inference_mode": lambda run: torch.inference_mode()(run)(),
     "numpy": lambda run: torch.from_numpy(run().detach().numpy()),
 }
 
@@ -77,39 +69,25 @@ def test_a_front_without_gradient_is_reported_and_no_hook_stays(how: str) -> Non
     assert not any(part._forward_hooks for part in network.modules())
 
 
-def test_a_layer_that_runs_twice_is_not_listed() -> None:
+def test_a_layer_that_runs_twice_or_gives_no_map_is_not_listed() -> None:
     network = Net()
     network.relu = network.squash = nn.ReLU(inplace=True)
     assert layers_of(network) == ("middle", "up")
-
-
-def test_what_gives_no_maps_has_no_layers_and_is_no_fault() -> None:
     assert layers_of(nn.Identity()) == ()
 
 
 # ------------------------------------------------------------------ for the points
 
 
-class Deep(nn.Module):
-    """A layer at stride 16, and one at full size."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.deep = nn.Conv2d(3, 4, 16, stride=16)
-        self.up = nn.ConvTranspose2d(4, 4, 16, stride=16)
-        self.late = nn.Conv2d(4, 4, 3, padding=1)
-        self.head = nn.Conv2d(4, 1, 1)
-
-    def forward(self, rgb: Tensor) -> Tensor:
-        return self.head(self.late(self.up(self.deep(rgb)))) + 5  # type: ignore[no-any-return]
-
-
 @pytest.fixture
 def network() -> Network:
+    """A layer at stride 16, and one at full size."""
+    torch.manual_seed(0)
+    late = nn.ConvTranspose2d(4, 4, 16, stride=16), nn.Conv2d(4, 4, 3, padding=1)
+    module = nn.Sequential(nn.Conv2d(3, 4, 16, stride=16), *late, nn.Conv2d(4, 1, 1))
     definition = ModelDefinition(
-        name="net", input_kind="rgb", size=Multiple(16), build=Deep, complete=True,
-        layers=("deep", "late"),
+        name="net", input_kind="rgb", size=Multiple(16), build=lambda: module, complete=True,
+        layers=("0", "2"),
     )  # fmt: skip
     return load_network(definition, None)
 
@@ -124,12 +102,12 @@ def test_few_points_want_a_deep_layer_and_many_a_late_one(
 ) -> None:
     monkeypatch.setattr(cut_layers, "LEAST_FRACTION", 0.0)
     image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
-    assert best_layer(network, (image,), (64, 96), 20) == "deep"
-    assert best_layer(network, (image,), (1, 1), 36) == "late"
+    assert best_layer(network, (image,), (64, 96), 20) == "0"
+    assert best_layer(network, (image,), (1, 1), 36) == "2"
     assert best_layer(network, (image,), (64, 96), 0) is None
 
 
 def test_the_default_is_the_definitions_layer_else_the_best_one(network: Network) -> None:
-    assert default_layer(network, (160, 192), 50) == "deep"
-    named = replace(network.definition, defaults=Settings(layer="late"))
-    assert default_layer(replace(network, definition=named), (160, 192), 50) == "late"
+    assert default_layer(network, (160, 192), 50) == "0"
+    named = replace(network.definition, defaults=Settings(layer="2"))
+    assert default_layer(replace(network, definition=named), (160, 192), 50) == "2"

@@ -147,12 +147,8 @@ def test_a_build_that_raises_or_returns_no_module_is_refused(attribute: str, fil
     assert sys.path == before
 
 
-# ------------------------------------------------------------------ the device
-
-
-@pytest.mark.parametrize("name", ["cuda:99", "meta", "nonsense", "", "hpu"])
-def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
+@pytest.mark.parametrize("name", ["cuda:99", "meta", "nonsense", ""])
+def test_a_missing_device_is_refused_in_one_line(name: str) -> None:
     with pytest.raises(DeviceError) as error:
         find_device(name)
-    assert error.value.exit_code == 6
     assert "\n" not in str(error.value)
