@@ -206,11 +206,7 @@ PROTOCOLS = {
             )
             for name, sample, note in (
                 ("capa-100", "100", "100 points on ScanNet and 7-Scenes"),
-                (
-                    "streamtto-rings",
-                    "lines:8",
-                    "here the 8 rings are evenly spaced rows of an image",
-                ),
+                ("streamtto-rings", "lines:8", "the 8 rings are evenly spaced rows here"),
                 ("streamtto-pixels", "10%", "10 % of the pixels with ground truth"),
             )
         ),
