@@ -21,19 +21,6 @@ def test_results_come_in_order_and_few_items_are_taken_ahead() -> None:
     assert next(taken) <= 25
 
 
-def test_the_next_item_is_worked_on_while_a_result_is_in_use() -> None:
-    second = threading.Event()
-
-    def work(number: int) -> None:
-        time.sleep(0.02)
-        if number == 1:
-            second.set()
-
-    results = in_order(work, range(3), 1)
-    next(results)
-    assert second.wait(60)
-
-
 def test_an_error_comes_out_and_ends_the_work() -> None:
     done: list[int] = []
 

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.run_batch import run_batch
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.frames import adapt as adapting
+from tests.commands import batches
 from tests.commands.batches import RecordingListener
 from tests.commands.drives import drive_on_disk
 
@@ -65,15 +63,10 @@ def test_a_network_without_points_cannot_be_adapted(
 
 
 def test_learning_can_be_stopped(drive: Path) -> None:
-    request = BatchRequest(
-        source=drive,
-        output=drive.parent / "out",
-        refine=RefineRequest().with_fields(model="sparse2dense-tiny", iterations=0),
-        adapt=True,
-    )
+    network = {"model": "sparse2dense-tiny", "checkpoint": None, "iterations": 0}
     with pytest.raises(KeyboardInterrupt):
-        run_batch(request, RecordingListener(lambda: True))
-    assert not (drive.parent / "out/adapted").exists()
+        batches.batch(drive, RecordingListener(lambda: True), adapt=True, refine=network)
+    assert not (drive / "out/adapted").exists()
 
 
 def test_a_frame_that_cannot_be_read_leaves_the_networks_own_weights(drive: Path) -> None:

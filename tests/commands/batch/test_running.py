@@ -1,4 +1,4 @@
-"""Batches on a real Ray cluster of three nodes, and what is wrong with one."""
+"""Batches on a real Ray cluster of three nodes; the frames that decide what is left open."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ import pytest
 
 from pnpdepth_cli.commands.batch.batch_request import parse_address
 from pnpdepth_cli.commands.batch.records import remove_all_leftovers
+from pnpdepth_cli.commands.batch.running import spread
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
+from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
@@ -135,3 +138,18 @@ def test_addresses_of_clusters_and_what_is_none(root: Path) -> None:
             parse_address(text)
     with pytest.raises(UsageError, match="--device"):
         batch(root, ray="auto", refine={"device": "cuda:1"})
+
+
+def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path) -> None:
+    root = pairs_on_disk(tmp_path / "drive")
+    model = root / "net" / "my_net.py"
+    model.write_text(model.read_text().replace("build=Net", "build=Net, normalisation=None"))
+    batch(root)
+    record = FrameRecord.read(root / "out" / "a.json")
+    assert record.settings["normalise"] in NORMALISATIONS
+    assert any("mean of 3 frames" in note for note in record.notes)
+
+
+def test_the_frames_that_decide_are_spread_from_the_first_to_the_last() -> None:
+    assert spread(37) == [0, 2, 4, 7, 9, 12, 14, 16, 19, 21, 24, 26, 28, 31, 33, 36]
+    assert [spread(count) for count in (1, 3)] == [[0], [0, 1, 2]]
