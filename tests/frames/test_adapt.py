@@ -16,7 +16,6 @@ import pnpdepth_cli as pnp
 from pnpdepth_cli.frames import adapt
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import prepare
-from tests.core.networks import Net, conv
 from tests.frames.scenes import SIZE, frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)
@@ -168,22 +167,3 @@ def test_a_loss_that_is_not_finite_ends_the_learning(
     monkeypatch.setattr(adapt, "LR", 1e30)
     with pytest.raises(pnp.DivergedError):
         adapt.learn(network, named(range(8)))
-
-
-def test_points_where_the_network_is_infinite_teach_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def infinite_above(net: Net, rgb: torch.Tensor, sparse: torch.Tensor) -> torch.Tensor:
-        depth = 3 + net.layer(torch.cat([rgb, sparse], dim=1))
-        sky = torch.arange(depth.shape[-2])[:, None] < depth.shape[-2] // 4
-        return torch.where(sky, torch.inf, depth)
-
-    monkeypatch.setattr(adapt, "STEPS", 12)
-    module = Net(infinite_above, layer=conv(4, 1))
-    definition = pnp.ModelDefinition(
-        name="no-sky", input_kind="rgb+sparse", size=pnp.Multiple(4), build=lambda: module
-    )
-    network = pnp.load_network(module, definition=definition)
-    learnt = adapt.learn(network, named(range(8)))
-    assert np.isfinite(learnt.before).all()
-    assert learnt.after.mean() < learnt.before.mean()
