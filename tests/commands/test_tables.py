@@ -1,4 +1,4 @@
-"""Tables of errors and of compared runs, cell by cell, from the numbers they show."""
+"""Tables of errors, cell by cell, from the numbers they show."""
 
 from __future__ import annotations
 
@@ -6,17 +6,8 @@ from dataclasses import replace
 from math import nan
 from typing import Any, Literal
 
-import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.compare import (
-    ComparedRun,
-    Comparison,
-    Gain,
-    comparison_table,
-    methods_table,
-)
-from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import (
     Table,
     change,
@@ -50,6 +41,10 @@ def record_of(*networks: str, **fields: Any) -> FrameRecord:
 def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
     """The MAE of each stage at as many points."""
     return {stage: {"mae": mae, "points": count} for stage, mae in maes.items()}
+
+
+def styled(table: Table) -> list[list[tuple[str, str]]]:
+    return [[(cell, getattr(cell, "style", "")) for cell in row] for row in table.rows]
 
 
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
@@ -113,52 +108,6 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
 def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:
     table = Table(columns=["name", MEASURES[0]], rows=[["a,b", -1.5], ["c", None]])
     assert table.csv() == 'name,rmse\n"a,b",-1.5\nc,\n'
-
-
-def styled(table: Table) -> list[list[tuple[str, str]]]:
-    return [[(cell, getattr(cell, "style", "")) for cell in row] for row in table.rows]
-
-
-def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values() -> None:
-    # percent and adjusted p of RMSE and δ1, after their means
-    numbers = {
-        "a": (2.0, 0.5, None, None),
-        "b": (1.0, 0.25, (50.0, 0.0009), (-50.0, 0.01)),
-        "c": (3.0, None, (-50.0, 0.049), (nan, nan)),
-    }
-    runs = []
-    for name, (rmse, delta, *found) in numbers.items():
-        gains = {
-            key: Gain(
-                percent=each[0], low_percent=nan, high_percent=1.0, p_value=nan, p_adjusted=each[1]
-            )
-            for key, each in zip(("rmse", "delta1"), found, strict=True)
-            if each is not None
-        }
-        mean, unused = (
-            {"rmse": rmse, "delta1": delta},
-            {"before": {}, "varied": {}, "coverage": 1.0},
-        )
-        runs.append(ComparedRun(name=name, path=name, mean=mean, gains=gains, **unused))
-    comparison = Comparison(
-        frames=("1", "2"),
-        measures=tuple(measure for measure in MEASURES if measure.key in ("rmse", "delta1")),
-        scoring={"exclude_sparse": True},
-        runs=tuple(runs),
-        clusters=find_clusters(["1", "2"], np.zeros((2, 1))),
-        notes=[],
-    )
-    assert styled(methods_table(comparison)) == [
-        [("a", ""), ("2.0000", ""), ("50.00%", "bold")],
-        [("b", ""), ("1.0000***", "bold"), ("25.00%*", "")],
-        [("c", ""), ("3.0000*", ""), ("–", "")],
-    ]
-    shown = [row[3] for row in styled(comparison_table(comparison))]
-    plain, better, worse = ("–", ""), ("+50.00", "good"), ("-50.00", "bad")
-    assert shown == [plain, better, worse, plain, worse, ("–", "dim")]
-    assert comparison_table(comparison).rows[1][4:] == ["–", "+1.00", "0.0009"]
-    for table in (comparison_table(comparison), methods_table(comparison)):
-        assert table.title.endswith("; without the pixels of sparse points")
 
 
 def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:

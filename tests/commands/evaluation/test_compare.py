@@ -10,7 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.compare import compare, plot_comparison
+from pnpdepth_cli.commands.evaluation.compare import (
+    compare,
+    comparison_table,
+    methods_table,
+    plot_comparison,
+)
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -18,6 +23,7 @@ from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageE
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.measures import MEASURES
+from tests.commands.test_tables import styled
 
 
 def run(root: Path, name: str, errors: dict[str, list[float]], **options: Any) -> str:
@@ -44,7 +50,7 @@ def test_a_lower_error_is_a_positive_gain_and_a_run_is_no_better_than_itself(
     gain = comparison.runs[1].gains["mae"]
     assert gain.percent == pytest.approx(100 * 2.5 / 7)
     assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
-    assert np.isnan([gain.low_percent, gain.high_percent]).all()  # three frames are too few
+    assert comparison_table(comparison).rows[1][4:6] == ["–", "–"]  # three frames are too few
     assert [(each.name, each.gains == {}) for each in comparison.runs] == [
         ("one", True),
         ("two", False),
@@ -82,6 +88,34 @@ def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path:
         assert other.gains["mae"].p_adjusted >= gain.p_adjusted > gain.p_value
     chosen = compare(paths, columns=("delta1", "silog")).measures
     assert [measure.key for measure in chosen] == ["delta1", "silog"]
+
+
+def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values(
+    tmp_path: Path,
+) -> None:
+    errors, paths = np.random.default_rng(0).uniform(0.5, 1, 12), []
+    for name, factor in (("a", 1.0), ("b", 0.5), ("c", 2.0)):
+        each = {f"{n}": [error] for n, error in enumerate(factor * errors)}
+        path = Path(run(tmp_path, name, each))
+        path.write_text(
+            path.read_text().replace('"exclude_sparse": false', '"exclude_sparse": true')
+        )
+        paths.append(str(path))
+    comparison = compare(paths, columns=("mae", "delta1"))
+    methods, gains = methods_table(comparison), comparison_table(comparison)
+    a, b, c = (f"{factor * errors.mean():.4f}" for factor in (1, 0.5, 2))
+    # all got better, or worse: two of 2^12 swaps, times four tests
+    assert styled(methods) == [
+        [("a", ""), (a, ""), ("100.00%", "bold")],
+        [("b", ""), (f"{b}**", "bold"), ("100.00%", "bold")],
+        [("c", ""), (f"{c}**", ""), ("100.00%", "bold")],
+    ]
+    shown = [row[3] for row in styled(gains)]
+    assert shown[:3] == [("–", ""), ("+50.00", "good"), ("-100.00", "bad")]
+    assert shown[3:] == [("–", ""), ("+0.00", "dim"), ("+0.00", "dim")]
+    assert gains.rows[1][4:] == ["+50.00", "+50.00", "0.0020"]
+    for table in (methods, gains):
+        assert table.title.endswith("; without the pixels of sparse points")
 
 
 def test_what_not_all_runs_have_is_left_out_and_reported(tmp_path: Path) -> None:
