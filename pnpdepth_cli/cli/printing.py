@@ -112,7 +112,7 @@ def print_refinement(record: FrameRecord) -> None:
 def print_batch(summary: BatchSummary) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     counts = summary.counts
-    for table in means_tables(summary.errors, summary.unit, summary.columns):
+    for table in means_tables(summary.errors, summary.unit, summary.titles, summary.columns):
         print_table(table, err=True)
     print_notes(summary.notes)
     # Counts of frames.

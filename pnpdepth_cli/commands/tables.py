@@ -38,17 +38,14 @@ Errors = Mapping[str, Mapping[str, Scores]]
 
 _LINEAR = "linear interpolation of all points"
 _ROWS = {
-    BEFORE: ("{name}, aligned with the points", "before"),
-    UPDATED: ("{name}, z updated", "z updated"),
-    PROPAGATED: ("{name}, residual propagated", "residual propagated"),
-    ALONE: ("{fusing} alone", "included network alone"),
-    AFTER: ("fused ({weights})", "after"),
-    LINEAR: (_LINEAR, _LINEAR),
+    BEFORE: "{name}, aligned with the points",
+    UPDATED: "{name}, z updated",
+    PROPAGATED: "{name}, residual propagated",
+    ALONE: "{fusing} alone",
+    AFTER: "fused ({weights})",
+    LINEAR: _LINEAR,
 }
-"""What the row of a stage is called: of a frame of the default method, and of a batch."""
-_OF_BATCH = {stage: row for stage, (_, row) in _ROWS.items()} | {
-    name: name for name in BASELINES if name != LINEAR
-}
+"""What the row of a stage of the default method is called."""
 _LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -151,10 +148,12 @@ def bases_of(errors: Errors) -> list[str]:
     return [basis for basis in found if basis in (GT, HELD_OUT)] or found[:1]
 
 
-def means_tables(errors: Errors, unit: str, keys: Sequence[str] | None = None) -> list[Table]:
+def means_tables(
+    errors: Errors, unit: str, titles: Mapping[str, str], keys: Sequence[str] | None = None
+) -> list[Table]:
     """Returns the mean errors of a batch on each basis; its measures have these keys."""
-    bases = bases_of(errors)
-    return [_table("means", basis, errors[basis], unit, _OF_BATCH, keys) for basis in bases]
+    rows = {**titles, **{name: name for name in BASELINES if name not in titles}}
+    return [_table("means", basis, errors[basis], unit, rows, keys) for basis in bases_of(errors)]
 
 
 def refinement_tables(record: FrameRecord) -> list[Table]:
@@ -171,7 +170,7 @@ def refinement_tables(record: FrameRecord) -> list[Table]:
         # The result is no stage of its own where one expert, the network, has all the weight.
         if of_one and PROPAGATED in stages and ALONE not in stages:
             del stages[AFTER]
-        tables.append(_table(title, basis, stages, record.unit, _titles(record)))
+        tables.append(_table(title, basis, stages, record.unit, stage_titles(record)))
     return tables
 
 
@@ -211,14 +210,14 @@ def _table(
     )
 
 
-def _titles(record: FrameRecord) -> dict[str, str]:
-    """The rows of a frame, by stage."""
+def stage_titles(record: FrameRecord) -> dict[str, str]:
+    """Returns what each stage of a frame is, in words."""
     assert record.method is not None
     assert record.model is not None
     if record.method.kind == "default":
         names = record.method.networks
         of = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
-        return {stage: title.format(**of) for stage, (title, _) in _ROWS.items()}
+        return {stage: title.format(**of) for stage, title in _ROWS.items()}
     name, settings = record.model.name, record.settings
     before = f"{name}, aligned with the points" if settings["align"] != "none" else name
     steps = [f"{settings['iterations']} updates of z"] if settings["iterations"] else []
@@ -229,7 +228,7 @@ def _titles(record: FrameRecord) -> dict[str, str]:
 def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
     assert record.method is not None
-    titles, name = _titles(record), record.method.networks[0]
+    titles, name = stage_titles(record), record.method.networks[0]
     alone = all(weight == 0 for expert, weight in record.weights.items() if expert != name)
     return titles[BEFORE], titles[PROPAGATED if alone and PROPAGATED in titles else AFTER]
 

@@ -14,6 +14,7 @@ from pnpdepth_cli.commands.tables import (
     means_tables,
     names_of_depths,
     refinement_tables,
+    stage_titles,
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
@@ -93,16 +94,20 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         "linear": {"mae": None, "frames": 3},
         "nearest": {"mae": 3.0, "rmse": 4.0, "frames": 3},
     }
-    (table,) = means_tables({"ground_truth": stages, "used": stages}, "m", ("mae", "rmse"))
+    errors, titles = (
+        {"ground_truth": stages, "used": stages},
+        stage_titles(record_of("net", weights={"net": 1.0})),
+    )
+    (table,) = means_tables(errors, "m", titles, ("mae", "rmse"))
     assert table.title == "means: errors against ground truth, 3 frames"
     assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
     assert [row[:3] for row in table.rows] == [
-        ["before", "2.0000 m", "3.0000 m"],
-        ["after", "1.0000 m", "–"],
+        ["net, aligned with the points", "2.0000 m", "3.0000 m"],
+        ["fused (net 100%)", "1.0000 m", "–"],
         ["linear interpolation of all points", "–", "–"],
         ["nearest", "3.0000 m", "4.0000 m"],
     ]
-    assert means_tables({}, "m") == []
+    assert means_tables({}, "m", {}) == []
 
 
 def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:

@@ -80,7 +80,7 @@ def write_batch_report(
         title=summary.output,
         facts=_facts(summary, results),
         notes=notes,
-        tables=means_tables(summary.errors, summary.unit, summary.columns),
+        tables=means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
         without=[(record.name, record.message or "") for record in records if not record.outputs],
         columns=columns,
         signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],

@@ -14,7 +14,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from pnpdepth_cli.commands.batch.find_frames import (
 )
 from pnpdepth_cli.commands.refinement.refine_request import GROUPS, Outputs, RefineRequest
 from pnpdepth_cli.commands.statistics import find_clusters
-from pnpdepth_cli.commands.tables import Table, write_text
+from pnpdepth_cli.commands.tables import Table, stage_titles, write_text
 from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_by_name
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError
@@ -234,6 +234,8 @@ class BatchSummary:
     notes: list[str]
     errors: dict[str, dict[str, Scores]]
     """Means over the frames that have the value, by basis and stage, with their number."""
+    titles: dict[str, str]
+    """What each stage is, in words."""
     weights: dict[str, dict[str, float]]
     """Mean, least and largest weight of each expert of the default method, by name."""
     frame_notes: dict[str, list[str]]
@@ -268,6 +270,7 @@ def summarise(
     for record in results:
         for name, weight in record.weights.items():
             weights[name].append(weight)
+    means = {name: sum(of_frames) / len(of_frames) for name, of_frames in weights.items()}
     return BatchSummary(
         source=str(request.source),
         output=str(request.output),
@@ -279,8 +282,9 @@ def summarise(
         columns=request.columns,
         notes=_notes([record for record in results if GT in record.errors]),
         errors=_means(results),
+        titles=stage_titles(replace(results[0], weights=means)) if results else {},
         weights={
-            name: {"mean": sum(all_) / len(all_), "least": min(all_), "largest": max(all_)}
+            name: {"mean": means[name], "least": min(all_), "largest": max(all_)}
             for name, all_ in weights.items()
         },
         frame_notes=_frame_notes(results),

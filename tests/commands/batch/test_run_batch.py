@@ -20,7 +20,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.records import summarise
 from pnpdepth_cli.commands.refinement.refine_image import refine_image
-from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import read_depth
@@ -305,6 +305,8 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
             name=f"{'ab'[number % 2]}/{number:04}", weights={"net": weight},
             errors={"ground_truth": {"before": unknown, "after": after}},
             notes=[*(kind.format(number) for kind in kinds), "gt: 5 pixels"],
+            model=ModelRecord(name="net", spec="net"),
+            method=MethodRecord(kind="default", reason="default", networks=["net", "compact"]),
         )
         for number, weight in enumerate((0.1, 0.4, 0.1, 0.2))
     ]  # fmt: skip
@@ -312,6 +314,8 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
     told = summarise(request, find_frames(request), {}, records)
     assert told.errors["ground_truth"]["before"]["rmse"] is None
     assert told.errors["ground_truth"]["after"]["rmse"] == 1
+    assert told.titles["after"] == "fused (net 20%)"
+    assert told.titles["alone"] == "compact alone"
     assert told.weights == {"net": {"mean": pytest.approx(0.2), "least": 0.1, "largest": 0.4}}
     names = [record.name for record in records]
     of_first = f" (numbers of {names[0]})"
