@@ -113,10 +113,11 @@ def describe(error: BaseException, file: Path | None = None) -> str:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the exception is one of those by which torch and Python report exhausted memory."""
-    messages = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
+    """Whether torch, Python or the loader of libraries report exhausted memory by the exception."""
+    messages = ("out of memory", "allocate memory", "ALLOC_FAILED", "bad_alloc", "map segment")
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(message in str(error) for message in messages)
+        isinstance(error, RuntimeError | ImportError)
+        and any(message in str(error) for message in messages)
     )
 
 

@@ -63,3 +63,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder drive/ with two frames, in the current folder."""
+    from tests.commands.batches import pairs_on_disk
+
+    monkeypatch.chdir(tmp_path)
+    return pairs_on_disk(tmp_path / "drive", ("a", "b"))

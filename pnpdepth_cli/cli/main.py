@@ -16,15 +16,18 @@ import click
 from pnpdepth_cli import __version__
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.cli.terminal import INTERRUPTED, printable, say
-from pnpdepth_cli.errors import DeviceError, InputError, OutputError, PnpDepthError
+from pnpdepth_cli.errors import (
+    DeviceError,
+    InputError,
+    OutputError,
+    PnpDepthError,
+    is_out_of_memory,
+)
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 input file · 4 network,
 layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
 130 interrupted. Networks in .py files are code and are run."""
-
-_MEMORY_MESSAGES = ("allocate memory", "failed to map segment", "bad_alloc")
-"""Parts of the messages of torch and of the loader when memory is exhausted."""
 
 _LONGEST = 2000
 """Most characters of a message; a longer one loses its middle."""
@@ -110,8 +113,7 @@ def run(arguments: list[str]) -> int:
         named = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _end(named + reason, (OutputError if full else InputError).exit_code)
     except Exception as error:
-        exhausted = any(text in str(error) for text in _MEMORY_MESSAGES)
-        if exhausted or isinstance(error, MemoryError):
+        if is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", DeviceError.exit_code)
         traceback.print_exception(error)
         fact = f"internal error ({type(error).__name__}: {error})"
