@@ -107,6 +107,10 @@ def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
     rows = [row.split(",") for row in Path("table.csv").read_text().splitlines()]
     assert [row[3] for row in rows if "MAE" in row[0]][1] == "+0.00"
 
+    Path("k.txt").write_text("554 0 320 0 554 240 0 0 1")
+    told = output(capsys, "cloud out/indoor_depth.png --calib k.txt -o cloud.ply")
+    assert "307,200 points, coloured" in told
+
 
 @pytest.mark.parametrize(
     ("line", "count"),
