@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import (
     check_pixel_count,
     damaged,
     numbered_lines,
-    one_line,
     read_bytes,
     size_of_regular_file,
 )
@@ -163,28 +162,21 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
     )
 
 
-def _damaged(path: Path, fact: str) -> FileFormatError:
-    return damaged(path, "COLMAP model", fact)
-
-
-def _parameter_count(path: Path, name: str) -> int:
+def _parameter_count(name: str) -> int:
     if name not in MODELS:
-        raise FileFormatError(
-            f"{path}: camera model {one_line(name)[:40]!r} is not one of {', '.join(MODELS)};"
-            " `colmap image_undistorter` writes images and a model of pinhole cameras"
-        )
+        hint = "`colmap image_undistorter` writes pinhole cameras"
+        raise ValueError(f"camera model {name[:40]!r} is unknown; {hint}")
     _, focals, _, coefficients = MODELS[name]
     return focals + 2 + coefficients
 
 
-def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
+def _camera(name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
     """The camera of a model with its parameters in COLMAP's order."""
     _, focals, lens, _ = MODELS[name]
-    check_pixel_count(path, size[1], size[0])
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy = parameters[focals : focals + 2]
     if not (np.abs(parameters) < _LARGEST).all() or min(fx, fy) <= 0:
-        raise _damaged(path, f"has a {name} camera with parameters {list(parameters)}")
+        raise ValueError(f"a {name} camera with parameters {list(parameters)}")
     distortion = tuple(parameters[focals + 2 :])
     if lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
@@ -198,27 +190,25 @@ def _camera(path: Path, name: str, size: tuple[int, int], parameters: Sequence[f
     )
 
 
-def _pose(path: Path, name: str, numbers: Sequence[float]) -> Extrinsics:
+def _pose(numbers: Sequence[float]) -> Extrinsics:
     """The pose of qw qx qy qz tx ty tz."""
     values = np.array(numbers, np.float64)
     if not np.isfinite(values).all() or not 1e-6 < np.linalg.norm(values[:4]) < 1e6:
-        raise _damaged(path, f"has no pose of finite numbers for {name!r}")
+        raise ValueError("a pose that is not made of finite numbers")
     return Extrinsics(rotation_of(values[:4]), values[4:])
 
 
-def _read_records(
-    path: Path, stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1
-) -> NDArray[_Kind]:
+def _records(stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1) -> NDArray[_Kind]:
     """The next `count` records of a file, which must hold them."""
     begin, size = stream.tell(), count * layout.itemsize
     data = stream.read(min(size, sys.maxsize))
     if len(data) < size:
-        raise _damaged(path, f"is cut short at byte {begin:,}")
+        raise ValueError(f"it is cut short at byte {begin:,}")
     return np.frombuffer(data, layout)
 
 
-def _read_count(path: Path, stream: io.BytesIO) -> int:
-    return int(_read_records(path, stream, _COUNT).item())
+def _count(stream: io.BytesIO) -> int:
+    return int(_records(stream, _COUNT).item())
 
 
 Registered = tuple[str, int, Extrinsics, Integers]
@@ -227,41 +217,42 @@ Registered = tuple[str, int, Extrinsics, Integers]
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     stream = io.BytesIO(read_bytes(path))
-    for _ in range(_read_count(path, stream)):
-        number, model, width, height = _read_records(path, stream, _CAMERA).item()
+    for _ in range(_count(stream)):
+        number, model, width, height = _records(stream, _CAMERA).item()
         name = _NAMES.get(model, f"number {model}")
-        parameters = _read_records(path, stream, _NUMBER, _parameter_count(path, name)).tolist()
-        yield number, _camera(path, name, (height, width), parameters)
+        parameters = _records(stream, _NUMBER, _parameter_count(name)).tolist()
+        check_pixel_count(path, width, height)
+        yield number, _camera(name, (height, width), parameters)
 
 
 def _binary_images(path: Path) -> Iterator[Registered]:
     data = read_bytes(path)
     stream = io.BytesIO(data)
-    for _ in range(_read_count(path, stream)):
-        _, pose, camera = _read_records(path, stream, _IMAGE)[0]
+    for _ in range(_count(stream)):
+        _, pose, camera = _records(stream, _IMAGE)[0]
         end = data.find(b"\0", stream.tell())
         length = (len(data) if end < 0 else end) - stream.tell()
-        name = _read_records(path, stream, _BYTE, length + 1)[:-1].tobytes()
-        observations = _read_records(path, stream, _OBSERVATION, _read_count(path, stream))
-        text = name.decode("utf-8", "replace")
-        yield text, int(camera), _pose(path, text, pose), observations["point"]
+        name = _records(stream, _BYTE, length + 1)[:-1].tobytes().decode("utf-8", "replace")
+        observations = _records(stream, _OBSERVATION, _count(stream))
+        yield name, int(camera), _pose(pose), observations["point"]
 
 
 def _binary_points(path: Path) -> NDArray[np.void]:
     stream, points = io.BytesIO(read_bytes(path)), [np.empty(0, POINT)]
-    for _ in range(_read_count(path, stream)):
-        points.append(_read_records(path, stream, POINT))
-        _read_records(path, stream, _TRACK_ENTRY, int(points[-1]["track"].item()))
+    for _ in range(_count(stream)):
+        points.append(_records(stream, POINT))
+        _records(stream, _TRACK_ENTRY, int(points[-1]["track"].item()))
     return np.concatenate(points)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for _, text in numbered_lines(read_bytes(path)):
         number, name, width, height, *parameters = text.split()
-        if len(parameters) != _parameter_count(path, name):
+        if len(parameters) != _parameter_count(name):
             raise ValueError(f"a {name} camera has other parameters")
         size = int(height), int(width)
-        yield int(number), _camera(path, name, size, [float(word) for word in parameters])
+        check_pixel_count(path, size[1], size[0])
+        yield int(number), _camera(name, size, [float(word) for word in parameters])
 
 
 def _text_images(path: Path) -> Iterator[Registered]:
@@ -276,7 +267,7 @@ def _text_images(path: Path) -> Iterator[Registered]:
         if len(pose) != 7 or len(keypoints) % 3:
             raise ValueError("a pose has 7 numbers, and each keypoint 3")
         seen = np.array([int(word) for word in keypoints[2::3]], np.int64)
-        yield name, int(camera), _pose(path, name, [float(word) for word in pose]), seen
+        yield name, int(camera), _pose([float(word) for word in pose]), seen
 
 
 def _text_points(path: Path) -> NDArray[np.void]:
@@ -296,4 +287,4 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OverflowError) as error:
-        raise _damaged(path, f"holds what is wrong: {error}") from error
+        raise damaged(path, "COLMAP model", f"holds what is wrong: {error}") from error

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import FileFormatError
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import damaged, one_line, read_bytes, read_rows
+from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.array_files import parse_npy
 
@@ -125,38 +125,40 @@ Column = tuple[str, str, int]
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of a PCD, ASCII, binary or compressed."""
-    header, body = _header(path, data, "PCD", b"DATA")
-    entries = {words[0].upper(): words[1:] for words in header}
     try:
+        header, body = _header(data, b"DATA")
+        entries = {words[0].upper(): words[1:] for words in header}
+        # The fields, and how they are stored.
         names, kinds, sizes = (entries[entry] for entry in ("FIELDS", "TYPE", "SIZE"))
         fields = zip(names, kinds, sizes, entries.get("COUNT", ["1"] * len(names)), strict=True)
         columns = [(name, _PCD_TYPES[kind + size], int(n)) for name, kind, size, n in fields]
         number, stored = int(entries["POINTS"][0]), entries["DATA"][0].lower()
         order = {"ascii": None, "binary": "<", "binary_compressed": "<"}[stored]
+        # The rows.
+        if stored == "binary_compressed":
+            body = _decompress_rows(columns, number, body)
+        return _xyz(columns, number, body, order), f"{stored} PCD"
     except (LookupError, ValueError) as error:
-        raise damaged(path, "PCD", f"has a wrong header ({error})") from error
-    if stored == "binary_compressed":
-        body = _decompress_rows(path, columns, number, body)
-    return _xyz(path, "PCD", columns, number, body, order), f"{stored} PCD"
+        raise damaged(path, "PCD", f"cannot be read ({error})") from error
 
 
-def _decompress_rows(path: Path, columns: list[Column], number: int, body: bytes) -> bytes:
+def _decompress_rows(columns: list[Column], number: int, body: bytes) -> bytes:
     """The rows of a compressed PCD: two sizes, then all numbers of each field, compressed."""
     sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns]
     packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
     is_whole = claimed == number * sum(sizes) and packed <= len(body) - 8
     if not is_whole or min(sizes, default=-1) < 0 or claimed > _MOST_COMPRESSED * (packed + 1):
-        raise damaged(path, "PCD", "is cut short, or no compressed one")
+        raise ValueError("it is cut short, or no compressed one")
     data = _lzf(body[8 : 8 + packed])
-    if data is None or len(data) != claimed:
-        raise damaged(path, "PCD", "cannot be decompressed")
+    if len(data) != claimed:
+        raise ValueError("it cannot be decompressed")
     parts = np.split(np.frombuffer(data, np.uint8), number * np.cumsum(sizes[:-1]))
     fields = [part.reshape(number, size) for part, size in zip(parts, sizes, strict=True)]
     return np.concatenate(fields, axis=1).tobytes()
 
 
-def _lzf(packed: bytes) -> bytes | None:
-    """Decompresses LZF: literals, and copies of what is already there; None for other bytes."""
+def _lzf(packed: bytes) -> bytes:
+    """Decompresses LZF: literals, and copies of what is already there."""
     out, rest = bytearray(), iter(packed)
     for control in rest:
         # A byte below 32 is followed by that many literals and one.
@@ -170,7 +172,7 @@ def _lzf(packed: bytes) -> bytes | None:
             length += next(rest, 0)
         start = len(out) - ((control & 31) << 8) - next(rest, 0) - 1
         if start < 0:
-            return None
+            raise ValueError("it cannot be decompressed")
         copied = out[start : start + length]  # shorter where a copy repeats itself
         out += (copied * length)[:length]
     return bytes(out)
@@ -178,21 +180,21 @@ def _lzf(packed: bytes) -> bytes | None:
 
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of the vertices of a PLY, ASCII or binary."""
-    header, body = _header(path, data, "PLY", b"end_header")
     try:
+        header, body = _header(data, b"end_header")
         marks = [i for i, words in enumerate(header) if words[0] in ("element", "end_header")]
         (_, element, number), stored = header[marks[0]], header[1][1]
+        if (header[0], header[1][0], element) != (["ply"], "format", "vertex"):
+            raise ValueError("its first element is not vertex; save points first")
         properties = [each for each in header[marks[0] : marks[1]] if each[0] == "property"]
         columns = [(name, _PLY_KINDS[kind], 1) for _, kind, name in properties]
-        points = _xyz(path, "PLY", columns, int(number), body, _PLY_ORDERS[stored])
+        points = _xyz(columns, int(number), body, _PLY_ORDERS[stored])
     except (LookupError, ValueError) as error:
-        raise damaged(path, "PLY", f"has a wrong header ({error})") from error
-    if (header[0], header[1][0], element) != (["ply"], "format", "vertex"):
-        raise FileFormatError(f"{path} is no PLY whose first element is vertex; save points first")
+        raise damaged(path, "PLY", f"cannot be read ({error})") from error
     return points, "ascii PLY" if stored == "ascii" else "binary PLY"
 
 
-def _header(path: Path, data: bytes, kind: str, last: bytes) -> tuple[list[list[str]], bytes]:
+def _header(data: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
     """The words of each header line up to the one that begins with `last`, and what follows."""
     lines: list[list[str]] = []
     stream = io.BytesIO(data)
@@ -203,34 +205,28 @@ def _header(path: Path, data: bytes, kind: str, last: bytes) -> tuple[list[list[
             lines.append(words)
         if line.lstrip().startswith(last):
             return lines, data[stream.tell() :]
-    raise damaged(path, kind, f"has no header that ends with {last.decode()}")
+    raise ValueError(f"no header that ends with {last.decode()}")
 
 
-def _xyz(
-    path: Path, kind: str, columns: list[Column], number: int, body: bytes, order: str | None
-) -> Points:
+def _xyz(columns: list[Column], number: int, body: bytes, order: str | None) -> Points:
     """x y z of rows of these columns, in bytes of this order, or in text where it is None."""
     names = [name.lower() for name, _, _ in columns]
     counts = [count for _, _, count in columns]
     for name in "xyz":
         if names.count(name) != 1 or counts[names.index(name)] != 1:
-            listing = one_line(", ".join(names))
-            raise FileFormatError(f"{path}: a {kind} without one {name} ({listing}); add it")
+            raise ValueError(f"there is not one {name} among {', '.join(names)}")
     if not number:
         return np.empty((0, 3), np.float32)
     if not 0 <= number * sum(counts) <= len(body):  # each number has a byte at least
-        raise damaged(path, kind, f"claims {number:,} points in {len(body):,} bytes")
+        raise ValueError(f"it claims {number:,} points in {len(body):,} bytes")
     fields = [(f"f{i}", order + t if order else "f8", (n,)) for i, (_, t, n) in enumerate(columns)]
-    try:
-        layout = np.dtype(fields)
-        if order is None:  # a PLY may continue with faces
-            rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=number)
-        else:
-            rows = np.frombuffer(body, layout, min(number, len(body) // layout.itemsize))
-    except (TypeError, ValueError) as error:
-        raise damaged(path, kind, f"cannot be read ({error})") from error
+    layout = np.dtype(fields)
+    if order is None:  # a PLY may continue with faces
+        rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=number)
+    else:
+        rows = np.frombuffer(body, layout, min(number, len(body) // layout.itemsize))
     if len(rows) < number:
-        raise damaged(path, kind, f"is cut short: {len(rows):,} of {number:,} points")
+        raise ValueError(f"it is cut short: {len(rows):,} of {number:,} points")
     return _first_columns(np.hstack([rows[f"f{names.index(name)}"] for name in "xyz"]))
 
 
