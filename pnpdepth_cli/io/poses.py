@@ -215,19 +215,18 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
 
 def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join."""
+    from scipy.spatial import KDTree
+
     rows, poses = _rows(path)
     dotted = [_BAG_TIME.sub(r"\1.\2", name) for name in names]
     times, numbers = _last_numbers(dotted), _last_numbers(names)
     # Names that are times take the row of the nearest time.
-    if len(times) == len(names) and rows.shape[1] == _TUM_COLUMNS:
-        order = np.argsort(rows[:, 0])
-        after = np.searchsorted(rows[order, 0], times).clip(1, max(1, len(rows) - 1))
-        pair = order[np.stack([after - 1, np.minimum(after, len(rows) - 1)])]
-        gaps = np.abs(rows[pair, 0] - times)
-        nearest = np.where(gaps[0] <= gaps[1], *pair)
+    are_rows = rows.shape[1] == _TUM_COLUMNS and np.isfinite(rows[:, 0]).all()
+    if len(times) == len(names) and are_rows:
+        gaps, nearest = KDTree(rows[:, :1]).query(times[:, None])
         # frames 1_000001 and 1_000002 may be of sequence 1 as well
         are_times = dotted == list(names) or len({*nearest}) == len({*times})
-        if are_times and (largest := float(gaps.min(axis=0).max())) <= LONGEST_GAP_S:
+        if are_times and (largest := float(gaps.max())) <= LONGEST_GAP_S:
             return poses[nearest], f"joined by time, at most {1000 * largest:.0f} ms apart"
     # Else there is a row for each, or they are numbers of rows.
     if len(rows) == len(names):

@@ -170,7 +170,10 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
         FileFormatError: It is damaged, beyond the budget, or holds no single image.
     """
     channels = read_exr_channels(path, data)
-    names, grey = ["R", "G", "B"], [name for name in channels if name != "A"]
+    reds = [name for name in channels if name.rpartition(".")[2] == "R"]
+    layer = reds[0][:-1] if len(reds) == 1 else ""
+    names = [layer + letter for letter in "RGB"]
+    grey = [name for name in channels if name != "A"]
     if len(grey) == 1:
         names = grey * 3
     if not channels.keys() >= {*names}:

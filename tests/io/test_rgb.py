@@ -111,7 +111,8 @@ def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(
 
 def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Path) -> None:
     linear = np.array([[0.0, 0.001, 0.2140411], [0.5, 1.0, 0.0031308]], np.float32)
-    write_exr(tmp_path / "a.exr", {"R": linear, "G": linear, "B": np.zeros_like(linear)})
+    layer = {"V.Combined.R": linear, "V.Combined.G": linear, "V.Combined.B": 0 * linear}
+    write_exr(tmp_path / "a.exr", {**layer, "V.Depth.Z": linear})
     values = read_rgb(tmp_path / "a.exr").values
     assert np.array_equal(values[:, :, 0], srgb_from_linear(linear))
     assert values[0, 2].tolist() == pytest.approx([0.5, 0.5, 0], abs=1e-6)
