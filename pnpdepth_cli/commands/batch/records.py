@@ -246,13 +246,13 @@ class BatchSummary:
     """Options that `--vary` varies, with their values."""
 
 
-def summarise(
+def write_summary(
     request: BatchRequest,
     found: BatchFrames,
     settings: Mapping[str, object],
     records: Sequence[FrameRecord],
 ) -> BatchSummary:
-    """Returns the summary of a batch, from the record of each frame that has one."""
+    """Writes `summary.json`, with the records as its `frames`, `summary.csv` and the report."""
     # Counts of frames.
     results = [record for record in records if record.status != "failed"]
     statuses = Counter[str](record.status for record in records)
@@ -271,7 +271,7 @@ def summarise(
         for name, weight in record.weights.items():
             weights[name].append(weight)
     means = {name: sum(of_frames) / len(of_frames) for name, of_frames in weights.items()}
-    return BatchSummary(
+    summary = BatchSummary(
         source=str(request.source),
         output=str(request.output),
         layout=found.layout,
@@ -291,6 +291,15 @@ def summarise(
         unmatched=[str(each) for each in found.unmatched],
         varied=dict(request.varied),
     )
+    # The files.
+    frames = [record.to_json() for record in records]
+    write_json(request.output / JSON, {**asdict(summary), "frames": frames})
+    write_text(request.output / CSV, _table(summary, records).csv())
+    if request.html is not None:
+        from pnpdepth_cli.commands.batch.batch_report import write_batch_report
+
+        write_batch_report(request, request.html, summary, records)
+    return summary
 
 
 def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
@@ -335,24 +344,6 @@ def _notes(records: Sequence[FrameRecord]) -> list[str]:
     groups = [each.group or name or each.name for each, name in zip(records, by_name, strict=True)]
     errors = [[each.errors[GT][AFTER].get(key) for key in _MAIN] for each in records]
     return find_clusters(groups, np.array(errors, np.float64)).notes()
-
-
-def write_summary(
-    request: BatchRequest,
-    found: BatchFrames,
-    settings: Mapping[str, object],
-    records: Sequence[FrameRecord],
-) -> BatchSummary:
-    """Writes `summary.json`, with the records as its `frames`, `summary.csv` and the report."""
-    summary = summarise(request, found, settings, records)
-    frames = [record.to_json() for record in records]
-    write_json(request.output / JSON, {**asdict(summary), "frames": frames})
-    write_text(request.output / CSV, _table(summary, records).csv())
-    if request.html is not None:
-        from pnpdepth_cli.commands.batch.batch_report import write_batch_report
-
-        write_batch_report(request, request.html, summary, records)
-    return summary
 
 
 def _table(summary: BatchSummary, records: Iterable[FrameRecord]) -> Table:

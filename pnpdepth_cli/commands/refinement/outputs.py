@@ -63,10 +63,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
                 f"--uncertainty writes a second file; name a folder, not {output}, with -o"
             )
         outputs: Outputs = {"depth": output}
-    elif suffix[1:].isalpha() and not output.is_dir():
-        raise OutputError(f"{output}: depth is written as {formats}, or into a folder")
-    elif output.is_file():
-        raise OutputError(f"{output} is a file; name a folder, or a depth file ({formats})")
+    elif output.is_file() or (suffix[1:].isalpha() and not output.is_dir()):
+        raise OutputError(f"{output} is no folder; name one, or a depth file ({formats})")
     else:
         outputs = request.outputs_in(output, inputs[0].stem, with_gt=files.gt is not None)
     # No input is replaced, and no result unless it may be.

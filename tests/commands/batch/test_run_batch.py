@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.records import summarise
+from pnpdepth_cli.commands.batch.records import write_summary
 from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
@@ -310,8 +310,9 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
         )
         for number, weight in enumerate((0.1, 0.4, 0.1, 0.2))
     ]  # fmt: skip
+    (root / "out").mkdir()
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
-    told = summarise(request, find_frames(request), {}, records)
+    told = write_summary(request, find_frames(request), {}, records)
     assert told.errors["ground_truth"]["before"]["rmse"] is None
     assert told.errors["ground_truth"]["after"]["rmse"] == 1
     assert told.titles["after"] == "fused (net 20%)"
