@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
 from hypothesis import assume, given, settings
@@ -20,9 +18,12 @@ definition = definitions["compact"]
 
 @pytest.fixture(scope="module")
 def network() -> Compact:
+    """Random weights also where training begins at zero, so that every path shows."""
     torch.manual_seed(0)
     net = Compact().eval()
-    # heads start near zero; shaken, so that every path of the decoder shows in the output
+    for name, parameter in net.named_parameters():
+        if "prior" in name or name.startswith(("inlier_weights.", "scale.")):
+            torch.nn.init.normal_(parameter, std=0.05)
     for head in net.heads.values():
         torch.nn.init.normal_(head.weigh.weight, std=0.05)
     return net
@@ -37,22 +38,15 @@ def frame(height: int, width: int, count: int, seed: int = 0) -> tuple[Tensor, T
     return rgb, sparse.view(1, 1, height, width)
 
 
-PATTERNS = {
-    "row": (slice(40, 41), slice(None)),
-    "column": (slice(None), slice(3, 4)),
-    "corner": (slice(9), slice(9)),
-}
-
-
-@pytest.mark.parametrize("points", [0, 1, 2, 5, 500, 20_000, *PATTERNS, "one depth"])
+@pytest.mark.parametrize("points", [0, 1, 5, 500, 20_000, "row", "one depth"])
 def test_depth_is_positive_and_repeatable_wherever_the_points_lie(
     network: Compact, points: int | str
 ) -> None:
-    rgb, sparse = frame(128, 160, points if isinstance(points, int) else 128 * 160)
-    if isinstance(points, str):
-        full, sparse = sparse, torch.zeros_like(sparse)
-        rows, columns = PATTERNS.get(points, (slice(None, None, 7), slice(None, None, 7)))
-        sparse[..., rows, columns] = full[..., rows, columns] if points in PATTERNS else 2.0
+    rgb, sparse = frame(128, 160, points if isinstance(points, int) else 0)
+    if points == "row":
+        sparse[..., 40, :] = torch.linspace(1, 5, 160)
+    elif points == "one depth":
+        sparse[..., ::7, ::7] = 2.0
     with torch.no_grad():
         depth = network(rgb, sparse)
         assert torch.equal(network(rgb, sparse), depth)
@@ -64,13 +58,13 @@ def test_depth_is_positive_and_repeatable_wherever_the_points_lie(
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_inputs_ten_times_as_far_give_depth_ten_times_as_far(
-    shaken: Compact, factor: float, with_prior: bool
+    network: Compact, factor: float, with_prior: bool
 ) -> None:
     rgb, sparse = frame(96, 128, 300)
     depths = (sparse, prior_of(sparse)) if with_prior else (sparse,)
     with torch.no_grad():
-        expected = shaken(rgb, *depths) * factor
-        depth = shaken(rgb, *(one * factor for one in depths))
+        expected = network(rgb, *depths) * factor
+        depth = network(rgb, *(one * factor for one in depths))
     torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
@@ -92,35 +86,27 @@ def weights_of(network: Compact, sparse: Tensor, rgb: Tensor) -> Tensor:
     return network.inlier_weights(points, Cloud.of(points, rgb))
 
 
-@pytest.fixture(scope="module")
-def shaken(network: Compact) -> Compact:
-    """A network in which the layers of the prior have weights too."""
-    torch.manual_seed(1)
-    net = copy.deepcopy(network)
-    for name, parameter in net.named_parameters():
-        if "prior" in name or name.startswith(("inlier_weights.", "scale.")):
-            torch.nn.init.normal_(parameter, std=0.05)
-    return net
-
-
-def test_a_prior_that_is_unknown_everywhere_changes_nothing(shaken: Compact) -> None:
+def test_a_prior_that_is_unknown_everywhere_changes_nothing(network: Compact) -> None:
     rgb, sparse = frame(96, 128, 200)
     with torch.no_grad():
         torch.testing.assert_close(
-            shaken(rgb, sparse, torch.zeros_like(sparse)), shaken(rgb, sparse), rtol=1e-3, atol=0.0
+            network(rgb, sparse, torch.zeros_like(sparse)),
+            network(rgb, sparse),
+            rtol=1e-3,
+            atol=0.0,
         )
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("layer", definition.layers)
 def test_rear_of_front_is_the_network_bit_for_bit_and_errors_reach_every_layer(
-    shaken: Compact, layer: str, with_prior: bool
+    network: Compact, layer: str, with_prior: bool
 ) -> None:
     rgb, sparse = frame(96, 128, 200)
     inputs = [rgb, sparse, *([prior_of(sparse)] if with_prior else [])]
     with torch.no_grad():
-        expected = shaken(*inputs)
-    with Split(shaken, layer) as split:
+        expected = network(*inputs)
+    with Split(network, layer) as split:
         z = split.front(*inputs).requires_grad_(True)
         depth = split.rear(z)
         assert torch.equal(depth, expected)

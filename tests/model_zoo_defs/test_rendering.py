@@ -15,51 +15,27 @@ from model_zoo_defs.training.rendering.materials import Palette
 from model_zoo_defs.training.rendering.shading import seen
 from model_zoo_defs.training.rendering.shapes import Group
 from model_zoo_defs.training.scenes import scenes
-from model_zoo_defs.training.scenes.world import Sky, View, World, looking
+from model_zoo_defs.training.scenes.world import Sky, World, looking
 
 pytestmark = pytest.mark.slow
 
 HEIGHT, WIDTH = 48, 64
 
 
-def world_of(group: Group, palette: Palette) -> World:
-    mesh, materials = group.merged()
-    sky = Sky(
-        zenith=(0.5, 0.7, 1.0),
-        horizon=(1.0, 1.0, 1.0),
-        clouds=0.0,
-        ambient_up=(0.5, 0.5, 0.5),
-        ambient_down=(0.2, 0.2, 0.2),
-        haze_m=0.0,
-        occlusion_m=1.0,
-    )
-    return World(mesh=mesh, face_material=materials, table=palette.frozen(), lights=(), sky=sky)
-
-
-def plain_world(mesh: shapes.Mesh) -> World:
-    palette, group = Palette(np.random.default_rng(0)), Group()
-    group.add(mesh, palette.new("plain"))
-    return world_of(group, palette)
-
-
-def tiny_view(yaw: float = 0.0, pitch: float = 0.0) -> View:
-    return looking(
-        (0.3, -0.2, 1.5), (yaw, pitch, 0.05), fov_deg=70, shift=(0.1, 0), size=(HEIGHT, WIDTH)
-    )
-
-
-def job(out: Path, **changes: object) -> render.Job:
-    settings: dict[str, object] = {
-        "out": out, "seed": 5, "height": HEIGHT, "width": WIDTH, "frames": 8, "shard_frames": 4,
-        "kinds": ("desk",),
-    }  # fmt: skip
-    return render.Job(**{**settings, **changes})  # type: ignore[arg-type]
-
-
 def test_the_depth_of_a_slanted_floor_solves_its_plane_equation() -> None:
+    palette, group = Palette(np.random.default_rng(0)), Group()
     floor = [(-90, -90, 0), (90, -90, 0), (90, 90, 0), (-90, 90, 0)]
-    view = tiny_view(yaw=0.4, pitch=-0.7)
-    _, depth = seen(plain_world(shapes.quads([floor])), view, np.random.default_rng(0))
+    group.add(shapes.quads([floor]), palette.new("plain"))
+    mesh, materials = group.merged()
+    white, grey = (1.0, 1.0, 1.0), (0.5, 0.5, 0.5)
+    sky = Sky(
+        zenith=white, horizon=white, clouds=0.0, ambient_up=grey, ambient_down=grey, haze_m=0.0,
+        occlusion_m=1.0,
+    )  # fmt: skip
+    world = World(mesh=mesh, face_material=materials, table=palette.frozen(), lights=(), sky=sky)
+    turn, size = (0.4, -0.7, 0.05), (HEIGHT, WIDTH)
+    view = looking((0.3, -0.2, 1.5), turn, fov_deg=70, shift=(0.1, 0), size=size)
+    _, depth = seen(world, view, np.random.default_rng(0))
     _, directions = view.grid()
     expected = (-1.5 / directions[:, 2].astype(float)).reshape(HEIGHT, WIDTH)
     assert (depth > 0).all()
@@ -85,7 +61,11 @@ def test_a_seed_gives_the_same_bytes_by_any_number_of_workers_and_another_seed_d
 ) -> None:
     files = []
     for name, seed, workers in (("a", 5, 1), ("b", 5, 2), ("c", 6, 1)):
-        render.render_all(job(tmp_path / name, seed=seed), workers=workers)
+        job = render.Job(
+            out=tmp_path / name, seed=seed, height=HEIGHT, width=WIDTH, frames=8, shard_frames=4,
+            kinds=("desk",),
+        )  # fmt: skip
+        render.render_all(job, workers=workers)
         files.append([path.read_bytes() for path in sorted((tmp_path / name).iterdir())])
     assert files[0] == files[1]
     assert files[0] != files[2]
