@@ -205,21 +205,18 @@ def _build(folder: Path) -> nn.Module:
     logging: Any = transformers.utils.logging
     logging.set_verbosity_error()
     logging.disable_progress_bar()
-    try:
-        # The network must not be larger than its weights, which are read last.
-        config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
-        with _fewer_parameters_than_bytes(folder), torch.device("meta"):
-            networks: Any = transformers.AutoModelForDepthEstimation
-            networks.from_config(config)
-        module, info = transformers.AutoModelForDepthEstimation.from_pretrained(
-            str(folder),
-            local_files_only=True,
-            use_safetensors=True,
-            trust_remote_code=False,
-            output_loading_info=True,
-        )
-    except (OSError, ValueError, LookupError, TypeError, RuntimeError, ImportError) as error:
-        raise ModelError(f"{folder}: transformers cannot load it: {describe(error)}") from None
+    # The network must not be larger than its weights, which are read last.
+    networks: Any = transformers.AutoModelForDepthEstimation
+    config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
+    with _fewer_parameters_than_bytes(folder), torch.device("meta"):
+        networks.from_config(config)
+    module, info = networks.from_pretrained(
+        str(folder),
+        local_files_only=True,
+        use_safetensors=True,
+        trust_remote_code=False,
+        output_loading_info=True,
+    )
     # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:

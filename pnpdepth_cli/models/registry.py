@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.errors import ModelError, describe
+from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
 
@@ -42,10 +42,8 @@ def all_definitions() -> dict[str, ModelDefinition]:
 
 def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
     """The definitions of one family. ModelError if it cannot be loaded, or holds none."""
-    try:
+    with wrap_user_errors(f"network family {family!r}"):  # the code of another package
         entry = choices.NETWORKS[family]
-    except Exception as error:  # the code of another package
-        raise ModelError(f"network family {family!r} cannot be loaded: {describe(error)}") from None
     if isinstance(entry, ModuleType):
         entry = getattr(entry, "definitions", None) or getattr(entry, "definition", None)
     definitions = {entry.name: entry} if isinstance(entry, ModelDefinition) else entry
