@@ -108,35 +108,29 @@ PROJECTIONS = {
 }
 
 
-def kitti_file(path: Path, **values: object) -> Path:
-    """A file of named numbers; without a colon after R_rect and Tr_velo_cam, as KITTI has it."""
-    lines = ["calib_time: 03-Apr-2018 18:47:03"] if "S_rect_00" in values else []
-    for name, numbers in values.items():
-        colon = "" if name in ("R_rect", "Tr_velo_cam") else ":"
-        lines.append(f"{name}{colon} {' '.join(map(str, np.ravel(numbers).tolist()))}")
-    path.write_text("\n".join(lines) + "\n")
-    return path
+WITHOUT_COLON = ("R_rect", "Tr_velo_cam", "")
 
 
 def kitti_files(folder: Path, kind: str) -> Path:
-    """The calibration of this data set; the folder, or the file."""
+    """The calibration of this data set; the folder, or the only file."""
     plain = {f"P{n}": projection for n, projection in PROJECTIONS.items()}
     rectified = {f"P_rect_0{n}": projection for n, projection in PROJECTIONS.items()}
     sized = {"R_rect_00": RECTIFY, "S_rect_00": [1408, 376], "S_rect_02": [1408, 376], **rectified}
-    path = folder / "calib.txt"
-    if kind == "object":
-        return kitti_file(path, **plain, R0_rect=RECTIFY, Tr_velo_to_cam=TO_CAMERA)
-    if kind == "tracking":
-        return kitti_file(path, **plain, R_rect=RECTIFY, Tr_velo_cam=TO_CAMERA)
-    if kind == "odometry":  # already rectified
-        return kitti_file(path, **plain, Tr=RECTIFY @ TO_CAMERA)
-    if kind == "raw":
-        kitti_file(folder / "calib_velo_to_cam.txt", R=TURN, T=SHIFT)
-        return kitti_file(folder / "calib_cam_to_cam.txt", **sized).parent
-    turn = np.array(TURN).T
-    to_scanner = np.column_stack([turn, -turn @ SHIFT])
-    np.savetxt(folder / "calib_cam_to_velo.txt", to_scanner.reshape(1, 12))
-    return kitti_file(folder / "perspective.txt", **sized)
+    back = np.linalg.inv(np.vstack([TO_CAMERA, [0, 0, 0, 1]]))[:3]
+    files: dict[str, dict[str, Any]] = {
+        "object": {"calib.txt": {**plain, "R0_rect": RECTIFY, "Tr_velo_to_cam": TO_CAMERA}},
+        "tracking": {"calib.txt": {**plain, "R_rect": RECTIFY, "Tr_velo_cam": TO_CAMERA}},
+        "odometry": {"calib.txt": {**plain, "Tr": RECTIFY @ TO_CAMERA}},  # already rectified
+        "raw": {"calib_cam_to_cam.txt": sized, "calib_velo_to_cam.txt": {"R": TURN, "T": SHIFT}},
+        "360": {"perspective.txt": sized, "calib_cam_to_velo.txt": {"": back}},
+    }[kind]
+    for file, values in files.items():
+        lines = ["calib_time: 03-Apr-2018 18:47:03"] * (values is sized)
+        for name, numbers in values.items():
+            text = " ".join(map(str, np.ravel(numbers).tolist()))
+            lines.append(f"{name}{'' if name in WITHOUT_COLON else ':'} {text}")
+        (folder / file).write_text("\n".join(lines) + "\n")
+    return folder / file if len(files) == 1 else folder
 
 
 @pytest.mark.parametrize("kind", ["object", "tracking", "odometry", "raw", "360"])
