@@ -23,12 +23,13 @@ from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
 DEADLY = "        if float(rgb.mean()) > 0.99:\n            import os\n            os._exit(1)\n"
-on_a_cluster = pytest.mark.skipif(sys.platform != "linux", reason="nodes are loopback addresses")
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Three nodes of one CPU each, which are addresses of loopback."""
+    if sys.platform != "linux":
+        pytest.skip("nodes are loopback addresses")
     pytest.importorskip("ray")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray.cluster_utils import Cluster
@@ -57,7 +58,6 @@ def root(frames: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@on_a_cluster
 def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, root: Path) -> None:
     lost = cluster.worker_nodes.copy().pop()
 
@@ -76,7 +76,6 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
 
 
 @pytest.mark.slow
-@on_a_cluster
 def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     cluster: Any, tmp_path: Path
 ) -> None:
@@ -96,7 +95,6 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
 
 
 @pytest.mark.slow
-@on_a_cluster
 def test_what_is_wrong_with_all_frames_ends_the_batch(cluster: Any, root: Path) -> None:
     with pytest.raises(DeviceError, match="device cuda"):
         batch(root, ray=cluster.address, refine={"device": "cuda"})
@@ -106,7 +104,6 @@ def test_what_is_wrong_with_all_frames_ends_the_batch(cluster: Any, root: Path) 
 
 
 @pytest.mark.slow
-@on_a_cluster
 def test_a_stopped_batch_ends_with_the_frames_that_are_begun(cluster: Any, root: Path) -> None:
     listener = RecordingListener(lambda: bool(listener.records))
     batch(root, listener, ray=cluster.address)
