@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -255,8 +255,9 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
         if value.name not in constants:
             graph.add_input(value.name)
     shapes = set[str]()
-    for name, proto in zip(_names(model.graph.node), model.graph.node, strict=True):
+    for proto in model.graph.node:
         # The operator and its inputs, of which one may be left out.
+        name = _name(proto)
         attributes = {a.name: _attribute(a, path) for a in proto.attribute}
         used = sum(bool(output) for output in proto.output)
         node = Node(op=proto.op_type, opset=opset, outputs=used, attributes=attributes)
@@ -325,16 +326,12 @@ def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
         )
 
 
-def _names(nodes: Iterable[NodeProto]) -> list[str]:
-    """Names of the nodes for --layer; a node without a name has operator and output."""
-    names: list[str] = []
-    for proto in nodes:
-        first = next((output for output in proto.output if output), "")
-        name = proto.name or f"{proto.op_type}_{first}"
-        if name.replace(".", "").isdigit():
-            name = f"{proto.op_type}_{name}"
-        names.append(name.translate(str.maketrans("#[]", "___")))
-    return names
+def _name(proto: NodeProto) -> str:
+    """Name of the node for --layer; one without a name has operator and output."""
+    name = proto.name or f"{proto.op_type}_{''.join(proto.output[:1])}"
+    if name.replace(".", "").isdigit():
+        name = f"{proto.op_type}_{name}"
+    return name.translate(str.maketrans("#[]", "___"))
 
 
 def _attribute(proto: AttributeProto, path: Path) -> object:
