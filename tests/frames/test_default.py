@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.default import refine_default, without_outliers
 from pnpdepth_cli.frames.frame import Frame, Refined
@@ -28,10 +27,9 @@ from pnpdepth_cli.frames.fuse import (
     weighted_mean,
 )
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.resolve import resolve_layer, resolve_member
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import ClosedSettings, Settings
+from pnpdepth_cli.settings import ClosedSettings
 from tests.core.split.test_split import state_of
 from tests.frames.scenes import (
     SIZE,
@@ -394,30 +392,3 @@ def test_the_loss_without_updates_is_that_of_the_points_where_the_depth_is_finit
     assert found.losses == (pytest.approx(expected),)
     assert found.step == 0
     assert torch.equal(found.after, sky.where(sky.isfinite(), 0))
-
-
-@pytest.mark.parametrize(
-    ("build", "is_default", "expected"),
-    [
-        (Brightness, False, (9, "none")),
-        (Brightness, True, (5, "auto")),
-        (Nearest, False, (9, "none")),
-        (Nearest, True, (0, "none")),
-    ],
-)
-def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone(
-    build: type[Brightness | Nearest], is_default: bool, expected: tuple[int, str]
-) -> None:
-    asked, network = Settings(iterations=9, align="none", layer="layer"), member(build).network
-    found = resolve_member(network, frame_in_memory(), asked, is_default=is_default).settings
-    assert (found.iterations, found.align) == expected
-
-
-def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> None:
-    definition = replace(member(Brightness).network.definition, layers=tuple("abcde"))
-    asked = (None, "0", "0.12", "0.13", "0.87", "1", "x.y")
-    assert [resolve_layer(definition, each) for each in asked] == [*"aaabd", "e", "x.y"]
-    nothing = replace(definition, layers=())
-    for unlisted, layer in ((nothing, None), (nothing, "0"), (definition, "1.01")):
-        with pytest.raises(UsageError):
-            resolve_layer(unlisted, layer)
