@@ -290,6 +290,13 @@ def parse_yaml(path: Path, text: str) -> object:
         raise FileFormatError(f"{path} is not valid YAML ({one_line(error)})") from error
 
 
+def _is_numbers(line: str, count: int) -> bool:
+    try:
+        return len([float(word) for word in line.split()]) == count
+    except ValueError:
+        return False
+
+
 def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
 
@@ -298,15 +305,17 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     Raises:
         FileFormatError: A line is not made of as many numbers as the first.
     """
-    lines = [_SEPARATOR.sub(" ", text) for _, text in numbered_lines(data)]
-    header = lines[0].replace('"', "").lower().split() if lines else []
-    if header[:3] not in _HEADERS:
-        header = []
+    numbered = [(number, _SEPARATOR.sub(" ", text)) for number, text in numbered_lines(data)]
+    header = numbered[0][1].replace('"', "").lower().split() if numbered else []
+    header = header if header[:3] in _HEADERS else []
+    lines = [line.split() for _, line in numbered[bool(header) :]]
     try:
-        rows = np.array([line.split() for line in lines[bool(header) :]], np.float64)
-    except ValueError as error:
-        fact = f"lines that are not made of as many numbers as the first ({one_line(error)})"
-        raise FileFormatError(f"{path} has {fact}") from error
+        rows = np.array(lines, np.float64)
+    except ValueError:
+        count = max(3, len(lines[0]))
+        bad = (n for n, line in numbered[bool(header) :] if not _is_numbers(line, count))
+        number = next(bad, numbered[-1][0])
+        raise FileFormatError(f"{path}, line {number}: not {count} numbers") from None
     if not rows.size:
         return np.empty((0, 3)), header
     if rows.shape[1] < 3:

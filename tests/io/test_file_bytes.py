@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, read_json, sha256_of, write_json
+from pnpdepth_cli.io.file_bytes import (
+    fingerprint,
+    is_unchanged,
+    read_json,
+    read_rows,
+    sha256_of,
+    write_json,
+)
 
 
 @dataclass
@@ -53,6 +60,15 @@ def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes | None
     with pytest.raises(InputError if content is None else FileFormatError, match=r"r\.json") as no:
         read_json(path)
     assert "\n" not in str(no.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [("x,y,depth\n1,2,3\n1,b,3\n", 3), ("# c\n\n1 2 3\n1 2 3 4\n", 4), ("1 2\n1 2 3\n", 1)],
+)
+def test_a_row_that_is_not_of_as_many_numbers_is_named_by_its_line(text: str, line: int) -> None:
+    with pytest.raises(FileFormatError, match=rf"points\.csv, line {line}\b"):
+        read_rows(Path("points.csv"), text.encode())
 
 
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:
