@@ -53,6 +53,12 @@ def test_a_registered_image_stays(seed: int, count: int) -> None:
     assert estimate_registration([evidence_of(seed, count=count)]) is None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_few_points_do_not_move_an_image_by_two_pixels(seed: int) -> None:
+    nearly = ImageRegistration(zoom=1.0, right=2.0, down=0.0)
+    assert estimate_registration([evidence_of(seed, nearly, count=150)]) is None
+
+
 @pytest.mark.parametrize("gap_px", [5, 8])
 def test_a_registered_image_stays_where_points_beside_jumps_are_missing(gap_px: int) -> None:
     known = [evidence(*frame(seed, count=500, gap_px=gap_px)) for seed in range(8)]

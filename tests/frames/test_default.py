@@ -282,8 +282,8 @@ def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
         [(torch.tensor([4.0, 0.0, 0.0]), 0.25), (torch.tensor([1.0, 3.0, 0.0]), 0.75)]
     )
     assert torch.allclose(mean, torch.tensor([4.0**0.25, 3.0, 0.0]))
-    alone = torch.tensor([2.0, 0.0])
-    assert torch.equal(weighted_mean([(alone, 0.3)]), alone)
+    alone = torch.tensor([2.0, 3.0, 7.0, 0.0])
+    assert torch.equal(weighted_mean([(alone, 0.3), (alone + 1, 0.0)]), alone)
 
 
 @pytest.mark.parametrize("weighs", [True, False])
