@@ -177,6 +177,11 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
     """The layout of the folder, or else of those in it, by their paths; at least one."""
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
+    if root.suffix.lower() == ".r3d":
+        raise InputError(
+            f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
+            " RGB' in Record3D, and give the folder EXR_RGBD"
+        )
     inside = sorted(root.iterdir()) if root.is_dir() else []
     below = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     for folders in ([root], below):
