@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +13,18 @@ from pnpdepth_cli.io.bags import message_types
 
 HEIGHT, WIDTH, FOCAL_PX, RECTIFIED_PX = 48, 64, 60.0, 70.0
 IMAGES, POINTS = "/front/image_raw", "/lidar/points"
-
-
-Make = Callable[..., Any]
-"""Makes a message of a type such as "std_msgs/Header" of its fields."""
+Fields = dict[str, Any]
+"""Of a message, nested."""
 
 
 def write_bag(
     path: Path,
     *,
     frames: int = 3,
-    compressed: bool = False,
-    static: bool = True,
-    info: bool = True,
+    topic: str = IMAGES,
+    without: str = "",
     poses: str = "",
     compression: Any = None,
-    topic: str = IMAGES,
-    rectified: bool = False,
     clock_s: float = 0.0,
     depth: str = "",
     depth_frame: str = "camera",
@@ -38,66 +33,56 @@ def write_bag(
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
     Images have 30 ms between them, and each a scan 4 ms later; the scans are of a wall 5 m ahead.
-    With `poses`, base moves 0.3 m along x from one image to the next: "odometry", or the camera
-    does: "pose". `compression` is rosbags' of the chunks. With `rectified`, camera_info has a
-    camera of rectified images, of `RECTIFIED_PX`. `clock_s` is added to the stamps of the scans.
-    With `depth`, an encoding such as "16UC1" or "32FC1; compressedDepth", `depth_m` is there
-    instead of scans.
+    The images are JPEG where their topic ends in compressed. `without` is a topic that is not
+    there. With `poses`, base moves 0.3 m along x from one image to the next: "/odom", or the
+    camera does: "/vio/pose". `compression` is rosbags' of the chunks. `clock_s` is added to the
+    stamps of the scans. With `depth`, an encoding such as "16UC1" or "32FC1; compressedDepth",
+    `depth_m` is there instead of scans.
     """
-    ros1 = path.suffix == ".bag"
-    store = message_types(ros1=ros1)
 
-    def make(kind: str, **fields: Any) -> Any:
-        return store.types[kind.replace("/", "/msg/")](**fields)
-
-    def header(time_ns: int, frame: str) -> Any:
-        stamp = make("builtin_interfaces/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-        more = {"seq": 0} if ros1 else {}
-        return make("std_msgs/Header", stamp=stamp, frame_id=frame, **more)
-
-    def messages() -> Iterator[tuple[str, int, Any]]:
+    def messages() -> Iterator[tuple[str, int, str, Fields]]:
         start, step = 1_700_000_000 * 10**9, 30_000_000
-        if static:
-            yield "/tf_static", start, _transforms(make, header)
+        yield "/tf_static", start, "tf2_msgs/msg/TFMessage", {"transforms": _transforms()}
         for number in range(frames + 1):
             time_ns = start + step * number
             if poses:
-                stamp = header(time_ns - step // 2, "odom")
-                yield _moved(make, stamp, 0.3 * number - 0.15, poses)
+                stamp = _header(time_ns - step // 2, "odom")
+                yield (poses, time_ns - step // 2, *_moved(stamp, 0.3 * number - 0.15, poses))
             if number == frames:
                 return
-            stamp = header(time_ns, "camera")
-            if info:
-                yield "/front/camera_info", time_ns, _camera_info(make, stamp, ros1, rectified)
+            stamp = _header(time_ns, "camera")
+            yield ("/front/camera_info", time_ns, *_camera_info(stamp, FOCAL_PX, RECTIFIED_PX))
             pixels = np.full((HEIGHT, WIDTH, 3), 40 + number % 200, np.uint8)
             pixels[:, : WIDTH // 2, 0] = 200
-            if compressed:
+            if topic.endswith("compressed"):
                 jpeg = cv2.imencode(".jpg", pixels[:, :, ::-1])[1].ravel()
-                yield f"{topic}/compressed", time_ns, _compressed(make, stamp, "jpeg", jpeg)
+                yield (topic, time_ns, *_compressed(stamp, "jpeg", jpeg))
             else:
-                yield topic, time_ns, _image(make, stamp, pixels, "rgb8")
+                yield (topic, time_ns, *_image(stamp, pixels, "rgb8"))
             later_ns = time_ns + 5_000_000
             if depth:
-                stamp = header(time_ns + 4_000_000, depth_frame)
-                of_depth = _camera_info(make, stamp, ros1, False, depth_focal)
-                yield "/depth/camera_info", later_ns, of_depth
-                name, message = _depth(make, stamp, depth)
-                yield name, later_ns, message
+                stamp = _header(time_ns + 4_000_000, depth_frame)
+                info = _camera_info(stamp, depth_focal, depth_focal)
+                yield ("/depth/camera_info", later_ns, *info)
+                suffix = "/compressedDepth" if "compressed" in depth else ""
+                yield (f"/depth/image_raw{suffix}", later_ns, *_depth(stamp, depth))
             else:
-                stamp = header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar")
-                yield POINTS, later_ns, _cloud(make, stamp)
+                stamp = _header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar")
+                yield (POINTS, later_ns, *_cloud(stamp))
 
-    opened = _writer(path)
+    ros1 = path.suffix == ".bag"
+    store, opened = message_types(ros1=ros1), _writer(path)
     if compression is not None:
         opened.set_compression(compression)
     with opened as writer:
         connections: dict[str, Any] = {}
-        for name, time_ns, message in messages():
-            kind = message.__msgtype__
+        for name, time_ns, kind, fields in messages():
+            if name == without:
+                continue
             if name not in connections:
                 connections[name] = writer.add_connection(name, kind, typestore=store)
             encode = store.serialize_ros1 if ros1 else store.serialize_cdr
-            writer.write(connections[name], time_ns, encode(message, kind))
+            writer.write(connections[name], time_ns, encode(_message(store, kind, fields), kind))
     if path.suffix == ".mcap":
         (inner,) = path.with_suffix(".folder").glob("*.mcap")
         inner.rename(path)
@@ -115,76 +100,83 @@ def _writer(path: Path) -> Any:
     return rosbag2.Writer(path, version=9)
 
 
-def _link(make: Make, header: Any, child: str, shift: Sequence[float], xyzw: Any) -> Any:
-    """A transform: the pose of the child in the frame of the header."""
-    transform = make(
-        "geometry_msgs/Transform",
-        translation=make("geometry_msgs/Vector3", **dict(zip("xyz", shift, strict=True))),
-        rotation=make("geometry_msgs/Quaternion", **dict(zip("xyzw", xyzw, strict=True))),
-    )
-    return make(
-        "geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform
-    )
+def _message(store: Any, kind: str, given: Mapping[str, Any]) -> Any:
+    """A message of nested fields; what is not given is zero."""
+    from rosbags.interfaces import Nodetype
+
+    values: Fields = {}
+    for name, (node, of) in store.fielddefs[kind][1]:
+        value = given.get(name.lower())  # ROS 1 has D, K, R and P
+        if node is Nodetype.NAME:
+            values[name] = _message(store, of, value or {})
+        elif node is Nodetype.BASE:
+            values[name] = value or ("" if of[0] == "string" else 0)
+        elif of[0][0] is Nodetype.NAME:
+            values[name] = [_message(store, of[0][1], each) for each in value]
+        else:
+            values[name] = np.zeros(of[1]) if value is None else value
+    return store.types[kind](**values)
 
 
-def _moved(make: Make, header: Any, x: float, kind: str) -> tuple[str, int, Any]:
-    """The pose of base, or for "pose" of the camera, at x metres."""
-    time_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
-    point = make("geometry_msgs/Point", x=x, y=0.0, z=0.0)
-    pose = make(
-        "geometry_msgs/Pose",
-        position=point,
-        orientation=make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-    if kind == "pose":
-        return "/vio/pose", time_ns, make("geometry_msgs/PoseStamped", header=header, pose=pose)
-    still, unknown = make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0), np.zeros(36)
-    twist = make("geometry_msgs/Twist", linear=still, angular=still)
-    uncertain = {
-        "pose": make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
-        "twist": make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
-    }
-    odometry = make("nav_msgs/Odometry", header=header, child_frame_id="base", **uncertain)
-    return "/odom", time_ns, odometry
+def _header(time_ns: int, frame: str) -> Fields:
+    seconds, rest = divmod(time_ns, 10**9)
+    return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame}
 
 
-def _transforms(make: Make, header: Make) -> Any:
+def _moved(header: Fields, x: float, topic: str) -> tuple[str, Fields]:
+    """The pose of base, or of the camera, at x metres."""
+    pose = {"position": {"x": x}, "orientation": {"w": 1.0}}
+    if topic != "/odom":
+        return "geometry_msgs/msg/PoseStamped", {"header": header, "pose": pose}
+    odometry = {"header": header, "child_frame_id": "base", "pose": {"pose": pose}}
+    return "nav_msgs/msg/Odometry", odometry
+
+
+def _transforms() -> list[Fields]:
     """camera is in base, and so is lidar: x forward, y left, z up, 0.2 m above the camera.
 
     The camera of depth is 0.05 m left of the camera.
     """
-    base = header(10**9, "base")
-    camera = _link(make, base, "camera", (1.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))
-    lidar = _link(make, base, "lidar", (1.0, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0))
-    depth = _link(make, base, "depth", (1.0, 0.05, 0.0), (-0.5, 0.5, -0.5, 0.5))
-    return make("tf2_msgs/TFMessage", transforms=[camera, lidar, depth])
+    ahead = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}  # z of the camera is base's x
+    places = {
+        "camera": ({"x": 1.0}, ahead),
+        "lidar": ({"x": 1.0, "z": 0.2}, {"w": 1.0}),
+        "depth": ({"x": 1.0, "y": 0.05}, ahead),
+    }
+    return [
+        {
+            "header": _header(10**9, "base"),
+            "child_frame_id": name,
+            "transform": {"translation": shift, "rotation": rotation},
+        }
+        for name, (shift, rotation) in places.items()
+    ]
 
 
-def _camera_info(
-    make: Make, header: Any, ros1: bool, rectified: bool, focal: float = FOCAL_PX
-) -> Any:
-    matrix = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1.0])
-    values = {"d": np.zeros(5), "k": matrix, "r": np.eye(3).ravel(), "p": np.zeros(12)}
-    if rectified:
-        values["p"] = np.array([RECTIFIED_PX, 0, 31.5, 0, 0, RECTIFIED_PX, 23.5, 0, 0, 0, 1.0, 0])
-    whole = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
-    matrices = {name.upper() if ros1 else name: value for name, value in values.items()}
-    sizes = {"height": HEIGHT, "width": WIDTH, "binning_x": 0, "binning_y": 0}
-    sizes["roi"] = make("sensor_msgs/RegionOfInterest", **whole)
-    matrices["distortion_model"] = "plumb_bob"
-    return make("sensor_msgs/CameraInfo", header=header, **sizes, **matrices)
+def _camera_info(header: Fields, focal: float, rectified: float) -> tuple[str, Fields]:
+    fields = {
+        "header": header,
+        "height": HEIGHT,
+        "width": WIDTH,
+        "distortion_model": "plumb_bob",
+        "d": np.zeros(5),
+        "k": np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1.0]),
+        "r": np.eye(3).ravel(),
+        "p": np.array([rectified, 0, 31.5, 0, 0, rectified, 23.5, 0, 0, 0, 1.0, 0]),
+    }
+    return "sensor_msgs/msg/CameraInfo", fields
 
 
-def _compressed(make: Make, header: Any, kind: str, data: np.ndarray) -> Any:
-    return make("sensor_msgs/CompressedImage", header=header, format=kind, data=data)
+def _compressed(header: Fields, kind: str, data: np.ndarray) -> tuple[str, Fields]:
+    return "sensor_msgs/msg/CompressedImage", {"header": header, "format": kind, "data": data}
 
 
-def _image(make: Make, header: Any, pixels: np.ndarray, encoding: str) -> Any:
+def _image(header: Fields, pixels: np.ndarray, encoding: str) -> tuple[str, Fields]:
     """An image whose rows are longer than their pixels."""
     height, width = pixels.shape[:2]
     rows = np.pad(pixels.reshape(height, -1).view(np.uint8), ((0, 0), (0, 8)))
-    sizes = {"height": height, "width": width, "step": rows.shape[1], "data": rows.ravel()}
-    return make("sensor_msgs/Image", header=header, encoding=encoding, is_bigendian=0, **sizes)
+    fields = {"header": header, "encoding": encoding, "height": height, "width": width}
+    return "sensor_msgs/msg/Image", {**fields, "step": rows.shape[1], "data": rows.ravel()}
 
 
 def depth_m() -> np.ndarray:
@@ -194,12 +186,12 @@ def depth_m() -> np.ndarray:
     return depth
 
 
-def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
-    """The topic and the message of `depth_m`."""
+def _depth(header: Fields, kind: str) -> tuple[str, Fields]:
+    """The message of `depth_m`."""
     depth, (encoding, _, compressed) = depth_m(), kind.partition("; ")
     codes = (1000 * depth).astype("<u2") if encoding == "16UC1" else depth.astype("<f4")
     if not compressed:
-        return "/depth/image_raw", _image(make, header, codes, encoding)
+        return _image(header, codes, encoding)
     # compressed_depth_image_transport with depth_quantization = 100, depth_max = 10
     a = 100.0 * (100 + 1)
     b = 1 - a / 10
@@ -207,11 +199,10 @@ def _depth(make: Make, header: Any, kind: str) -> tuple[str, Any]:
         codes = np.where(depth > 0, a / np.maximum(depth, 1) + b, 0).astype(np.uint16)
     png = cv2.imencode(".png", codes)[1].ravel()
     start = np.frombuffer(np.array([a, b], "<f4").tobytes(), np.uint8)
-    data = np.concatenate([np.zeros(4, np.uint8), start, png])
-    return "/depth/image_raw/compressedDepth", _compressed(make, header, kind, data)
+    return _compressed(header, kind, np.concatenate([np.zeros(4, np.uint8), start, png]))
 
 
-def _cloud(make: Make, header: Any) -> Any:
+def _cloud(header: Fields) -> tuple[str, Fields]:
     """Fields that are not x y z, and not in this order; one point without return."""
     names, formats, offsets = ["ring", "z", "y", "x"], ["<u2", "<f4", "<f4", "<f8"], [0, 4, 8, 16]
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": 28})
@@ -220,10 +211,9 @@ def _cloud(make: Make, header: Any) -> Any:
     points["x"], points["y"][:150], points["z"][:150] = 5.0, y.ravel(), z.ravel()
     points["x"][150] = np.nan
     fields = [
-        make("sensor_msgs/PointField", name=name, offset=offset, datatype=kind, count=1)
+        {"name": name, "offset": offset, "datatype": kind, "count": 1}
         for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)
     ]
     data, step = np.frombuffer(points.tobytes(), np.uint8), layout.itemsize
     sizes = {"height": 1, "width": len(points), "point_step": step, "row_step": data.size}
-    kind = {"fields": fields, "is_bigendian": False, "is_dense": False}
-    return make("sensor_msgs/PointCloud2", header=header, data=data, **sizes, **kind)
+    return "sensor_msgs/msg/PointCloud2", sizes | {"header": header, "fields": fields, "data": data}

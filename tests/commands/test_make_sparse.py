@@ -19,12 +19,7 @@ from pnpdepth_cli.commands.make_sparse import (
     simulate_scan,
 )
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.errors import (
-    OutputError,
-    PnpDepthError,
-    SizeError,
-    UsageError,
-)
+from pnpdepth_cli.errors import OutputError, PnpDepthError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
@@ -79,11 +74,10 @@ def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more:
 
 
 def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnDisk) -> None:
-    small = frame.folder / "small.png"
+    small, wide = frame.folder / "small.png", frame.folder / "wide.png"
     Image.new("RGB", (20, 15)).save(small)
-    refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
-    wide = frame.folder / "wide.png"
     Image.new("RGB", (128, 48)).save(wide)
+    refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
     record = projected(frame, image=wide)
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
@@ -114,25 +108,25 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
 
 
 def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
-    pattern = {name: more.pop(name) for name in ("kind", "count", "fraction") if name in more}
     files = {"depth": frame.gt, "output": frame.folder / output}
-    return recorded(sample_depth(pattern=SamplePattern(**pattern), **files, **more))
+    return recorded(sample_depth(**files, **more))
 
 
 def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
     for name in ("a", "b"):
-        sampled(frame, f"{name}.png", count=100, seed=11)
+        record = sampled(frame, f"{name}.png", pattern=SamplePattern(count=100), seed=11)
+        assert record["seed"] == 11
     assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
     written = read_depth(frame.folder / "a.png")
     assert (np.count_nonzero(written.values), written.reading.scale) == (100, 256)
-    assert json.loads((frame.folder / "a.json").read_text())["seed"] == 11
 
 
 def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
     image = np.zeros((48, 64, 3), np.uint8)
     image[12:36, 16:48] = 255
     cv2.imwrite(str(frame.image), image)
-    record = sampled(frame, "e.png", kind="features", count=3000, image=frame.image)
+    pattern = SamplePattern(kind="features", count=3000)
+    record = sampled(frame, "e.png", pattern=pattern, image=frame.image)
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 
@@ -142,6 +136,5 @@ def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) ->
     record = recorded(simulate_scan(frame.gt, frame.calib, frame.folder / "out.csv", sensor))
     got = read_sparse(frame.folder / "out.csv", size=(60, 100))[0]
     np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
-    assert record["sensor"]["name"] == "21 beams"
-    assert record["sensor"]["max_range"] is None
+    assert (record["sensor"]["name"], record["sensor"]["max_range"]) == ("21 beams", None)
     assert len(got.depth) > 500

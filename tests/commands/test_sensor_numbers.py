@@ -61,17 +61,16 @@ def seen(xyz: NDArray[Any]) -> NDArray[np.float64]:
 def read(sparse: Path, calib: Path | None = STREET / "calib.txt", **options: Any) -> Frame:
     scan = ScanOptions(calib=calib, keep_occluded=True)
     files = FrameFiles(image=STREET / "rgb.png", sparse=sparse)
-    return read_frame(files, ReadOptions(scan=scan, **options))
+    return read_frame(files, ReadOptions(**({"scan": scan} | options)))
 
 
-def points_of(frame: Frame) -> NDArray[np.float64]:
+def same_points(sparse: Path, xyz: NDArray[Any], **options: Any) -> Frame:
+    """The frame of a scan, whose points are those of the rows."""
+    frame = read(sparse, **options)
     rows = np.column_stack([frame.points.xy.numpy(), frame.points.depth.numpy()])
-    return rows[np.argsort(np.floor(rows[:, :2] + 0.5) @ (1, SIZE[1]))]
-
-
-def same_points(sparse: Path, xyz: NDArray[Any], **changes: Any) -> None:
-    got = points_of(read(sparse, **changes))
+    got = rows[np.argsort(np.floor(rows[:, :2] + 0.5) @ (1, SIZE[1]))]
     np.testing.assert_allclose(got, seen(np.asarray(xyz, float)), rtol=1e-4, atol=2e-3)
+    return frame
 
 
 FIELDS = {
@@ -111,27 +110,26 @@ def test_a_bin_of_any_number_of_fields_has_the_same_points(
     same_points(tmp_path / "a.bin", scan[:, :3])
 
 
+def write_list(path: Path, rows: NDArray[Any]) -> None:
+    if path.suffix == ".npy":
+        np.save(path, rows)
+    else:
+        np.savetxt(path, rows, delimiter="," if path.suffix == ".csv" else " ")
+
+
 @pytest.mark.parametrize("name", ["a.npy", "a.txt", "a.csv"])
 @pytest.mark.parametrize("columns", [3, 4])
-def test_a_list_of_x_y_z_with_a_calibration_is_a_scan_in_every_format(
+def test_a_list_with_a_calibration_is_a_scan_unless_it_has_pixels(
     tmp_path: Path, scan: Rows, name: str, columns: int
 ) -> None:
-    rows = scan[:, :columns]
-    if name == "a.npy":
-        np.save(tmp_path / name, rows)
-    else:
-        np.savetxt(tmp_path / name, rows, delimiter="," if name == "a.csv" else " ")
+    write_list(tmp_path / name, scan[:, :columns])
     same_points(tmp_path / name, scan[:, :3])
     with pytest.raises(FileFormatError, match="--calib"):
         read(tmp_path / name, calib=None)
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.txt"])
-def test_a_list_of_pixels_with_the_cameras_calibration_stays_one(tmp_path: Path, name: str) -> None:
     rows = np.random.default_rng(0).uniform(1, 300, (50, 3))
-    (np.save if name == "a.npy" else np.savetxt)(tmp_path / name, rows)
-    got = read(tmp_path / name)
-    np.testing.assert_allclose(got.points.xy, rows[:, :2], rtol=1e-6)
+    if name != "a.csv":
+        write_list(tmp_path / name, rows)
+        np.testing.assert_allclose(read(tmp_path / name).points.xy, rows[:, :2], rtol=1e-6)
 
 
 SILENT = {"zeros": 0.0, "nan": np.nan, "one place": [1.2, 0.0, 0.9], "far": [0.0, 0.0, 1e10]}
@@ -144,8 +142,7 @@ def test_beams_without_return_are_no_points_and_are_counted(
     rows = np.concatenate([scan, np.full((9000, 4), [*np.broadcast_to(SILENT[kind], 3), 0])])
     rows = rows[np.random.default_rng(0).permutation(len(rows))].astype("<f4")
     rows.tofile(tmp_path / "a.bin")
-    same_points(tmp_path / "a.bin", scan[:, :3])
-    frame = read(tmp_path / "a.bin")
+    frame = same_points(tmp_path / "a.bin", scan[:, :3])
     assert 9000 in frame.sources["sparse"].dropped.values()
     assert any("9,000 of" in note for note in frame.notes)
 
@@ -195,52 +192,50 @@ def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path) -> None:
     assert len(read(tmp_path / "a.npy").points) == np.count_nonzero((sparse > 0) & (sparse < 1000))
 
 
-def warnings_of(sparse: Path, image: Path = STREET / "rgb.png", **scan: Any) -> list[str]:
-    scan_options = ScanOptions(calib=STREET / "calib.txt", **scan)
-    frame = read_frame(FrameFiles(image=image, sparse=sparse), ReadOptions(scan=scan_options))
-    return [note for note in frame.notes if note.startswith("warning: ")]
+def warnings_of(sparse: Path = STREET / "000000.bin", **scan: Any) -> list[str]:
+    options = ScanOptions(calib=STREET / "calib.txt", **scan)
+    return [note for note in read(sparse, scan=options).notes if note.startswith("warning: ")]
 
 
-def test_a_scan_that_the_image_contradicts_is_warned_of_with_the_better_reading(
-    tmp_path: Path,
+@pytest.mark.parametrize(("axis", "name"), [(1, "y"), (2, "z")])
+def test_a_mirrored_scan_is_warned_of_with_the_better_reading(
+    axis: int, name: str, tmp_path: Path
 ) -> None:
-    whole = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
-    assert warnings_of(STREET / "000000.bin") == []
-    for axis, name in ((1, "y"), (2, "z")):
-        mirrored = whole.copy()
-        mirrored[:, axis] *= -1
-        mirrored.tofile(tmp_path / "mirrored.bin")
-        (warning,) = warnings_of(tmp_path / "mirrored.bin")
-        assert f"with {name} of the scan negated" in warning
-    (warning,) = warnings_of(STREET / "000000.bin", camera=1)
+    mirrored = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
+    mirrored[:, axis] *= -1
+    mirrored.tofile(tmp_path / "mirrored.bin")
+    (warning,) = warnings_of(tmp_path / "mirrored.bin")
+    assert f"with {name} of the scan negated" in warning
+
+
+def test_a_calibration_that_the_image_contradicts_is_warned_of(tmp_path: Path) -> None:
+    assert warnings_of() == []
+    (warning,) = warnings_of(camera=1)
     assert "with --camera 2" in warning
-    sine, cosine = np.sin(np.radians(2)), np.cos(np.radians(2))
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # about the camera's y
+    turn = cv2.Rodrigues(np.radians([0.0, 2, 0]))[0]  # about the camera's y
+    turned, mirrored = tmp_path / "turned.txt", tmp_path / "mirrored.txt"
     pose = matrix("Tr_velo_to_cam")
-    np.savetxt(tmp_path / "turned.txt", np.column_stack([turn @ pose[:, :3], pose[:, 3]]))
-    (warning,) = warnings_of(STREET / "000000.bin", extrinsics=tmp_path / "turned.txt")
+    np.savetxt(turned, np.column_stack([turn @ pose[:, :3], pose[:, 3]]))
+    (warning,) = warnings_of(extrinsics=turned)
     assert "turned by 0° about the camera's x and -2° about y" in warning
-
-
-def test_a_matrix_that_mirrors_is_named_as_one(tmp_path: Path) -> None:
-    mirrored = matrix("Tr_velo_to_cam") * (1, -1, 1, 1)
-    np.savetxt(tmp_path / "mirrored.txt", mirrored)
+    np.savetxt(mirrored, pose * (1, -1, 1, 1))
     with pytest.raises(FileFormatError, match="determinant −1"):
-        warnings_of(STREET / "000000.bin", extrinsics=tmp_path / "mirrored.txt")
+        warnings_of(extrinsics=mirrored)
 
 
 def test_a_valid_calibration_is_not_doubted_for_beams_without_return(tmp_path: Path) -> None:
     whole = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
-    silent = np.concatenate([np.zeros((300_000, 4), "<f4"), whole])
-    silent.tofile(tmp_path / "silent.bin")
-    pose = np.column_stack([matrix("Tr_velo_to_cam")[:, :3], matrix("Tr_velo_to_cam")[:, 3]])
-    np.savetxt(tmp_path / "pose.txt", pose)
+    np.concatenate([np.zeros((300_000, 4), "<f4"), whole]).tofile(tmp_path / "silent.bin")
+    np.savetxt(tmp_path / "pose.txt", matrix("Tr_velo_to_cam"))
     assert warnings_of(tmp_path / "silent.bin", extrinsics=tmp_path / "pose.txt") == []
 
 
-def indoor(sparse: Path, mask: Path | None, least: float | None = None, **options: Any) -> Frame:
+def indoor(
+    sparse: Path, mask: Path | None = None, least: float | None = None, **files: Any
+) -> Frame:
     asked = {"sparse": sparse, "sparse_mask": mask, "min_confidence": least}
-    return read_frame(FrameFiles(image=INDOOR / "rgb.png", **asked, **options), ReadOptions())
+    options = ReadOptions(sparse_range=files.pop("sparse_range", False))
+    return read_frame(FrameFiles(image=INDOOR / "rgb.png", **asked, **files), options)
 
 
 @pytest.mark.parametrize(
@@ -258,37 +253,33 @@ def test_only_sparse_depth_of_enough_confidence_is_used(
     path = tmp_path / f"confidence{suffix}"
     if suffix == ".exr":
         write_exr(path, {"Z": stored})
+    elif suffix == ".npy":
+        np.save(path, stored)
     else:
-        np.save(path, stored) if suffix == ".npy" else Image.fromarray(stored).save(path)
-    frame = indoor(tmp_path / "sparse.npy", path, of)
+        Image.fromarray(stored).save(path)
+    sparse = tmp_path / "sparse.npy"
+    frame = indoor(sparse, path, of)
     assert len(frame.points) == np.count_nonzero((confidence == 2) & (small > 0))
     column, row = frame.points.xy.numpy().round().astype(int).T
     expected = truth[1::4, 1::4][row // 4, column // 4]
     np.testing.assert_allclose(frame.points.depth, expected, rtol=1e-6)
-    count = np.count_nonzero(confidence > 0)
-    assert len(indoor(tmp_path / "sparse.npy", path).points) == count
-    low = float(stored[stored > 0].min())
-    assert len(indoor(tmp_path / "sparse.npy", path, low).points) == count
-    assert len(indoor(tmp_path / "sparse.npy", path, 0).points) == np.count_nonzero(small)
     assert any(f"{len(frame.points):,} of" in note for note in frame.notes)
+    for least in (None, float(stored[stored > 0].min())):
+        assert len(indoor(sparse, path, least).points) == np.count_nonzero(confidence)
+    assert len(indoor(sparse, path, 0).points) == np.count_nonzero(small)
     with pytest.raises(NoPointsError):
-        indoor(tmp_path / "sparse.npy", path, of + 1)
+        indoor(sparse, path, of + 1)
     with pytest.raises(UsageError):
-        indoor(tmp_path / "sparse.npy", None, of)
+        indoor(sparse, None, of)
 
 
-def test_an_array_of_truth_values_is_a_mask_and_no_depth(tmp_path: Path) -> None:
+def test_a_mask_is_no_depth_and_is_said_where_it_is_not_used(tmp_path: Path) -> None:
     np.save(tmp_path / "mask.npy", np.arange(640) < np.full((480, 1), 320))
     frame = indoor(INDOOR / "sparse.png", tmp_path / "mask.npy")
-    expected = np.count_nonzero(codes_of(INDOOR / "sparse.png")[:, :320])
-    assert len(frame.points) == expected
+    assert len(frame.points) == np.count_nonzero(codes_of(INDOOR / "sparse.png")[:, :320])
     with pytest.raises(FileFormatError, match=r"mask\.npy"):
-        indoor(tmp_path / "mask.npy", None)
-
-
-def test_a_mask_of_ground_truth_that_is_not_there_is_said_not_to_be_used(tmp_path: Path) -> None:
-    Image.fromarray(np.ones((480, 640), np.uint8)).save(tmp_path / "mask.png")
-    frame = indoor(INDOOR / "sparse.png", None, masks=(tmp_path / "mask.png",))
+        indoor(tmp_path / "mask.npy")
+    frame = indoor(INDOOR / "sparse.png", masks=(tmp_path / "mask.npy",))  # of no ground truth
     assert any("sparse_mask" in note for note in frame.notes)
 
 
@@ -300,18 +291,15 @@ def test_distances_from_a_wide_camera_become_depth(tmp_path: Path) -> None:
     np.save(tmp_path / "distance.npy", (truth * length).astype(np.float32))
     (tmp_path / "calib.txt").write_text("K: [320, 0, 319.5, 0, 320, 239.5, 0, 0, 1]")
 
-    def read_as(calib: Path | None, sparse: Path) -> Frame:
-        files = FrameFiles(image=INDOOR / "rgb.png", sparse=sparse, calib=calib)
-        return read_frame(files, ReadOptions(sparse_range=True))
-
-    frame = read_as(tmp_path / "calib.txt", tmp_path / "distance.npy")
+    asked = {"sparse": tmp_path / "distance.npy", "sparse_range": True}
+    frame = indoor(**asked, calib=tmp_path / "calib.txt")
     column, row = frame.points.xy.numpy().astype(int).T
     assert len(frame.points) == np.count_nonzero(truth)
     np.testing.assert_allclose(frame.points.depth, truth[row, column], rtol=1e-6)
     with pytest.raises(UsageError, match="--calib"):
-        read_as(None, tmp_path / "distance.npy")
+        indoor(**asked)
     with pytest.raises(UsageError, match="no depth map or list"):
-        read_as(STREET / "calib.txt", STREET / "000000.bin")
+        read(STREET / "000000.bin", sparse_range=True)
 
 
 def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> None:
@@ -330,16 +318,11 @@ def test_extrinsics_with_a_calibration_of_kitti_are_rectified_as_its_own_are(
 ) -> None:
     turn = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
     np.savetxt(tmp_path / "pose.txt", turn.T @ matrix("Tr_velo_to_cam"))  # of the unrectified one
-    rows = {
-        "P2": matrix("P2").ravel(),
-        "R0_rect": turn.ravel(),
-        "Tr_velo_to_cam": np.eye(4)[:3].ravel(),  # another sensor's
-    }
-    lines = [f"{name}: {' '.join(map(repr, row.tolist()))}" for name, row in rows.items()]
+    other = np.eye(3, 4)  # another sensor's
+    rows = {"P2": matrix("P2"), "R0_rect": turn, "Tr_velo_to_cam": other}
+    lines = [f"{name}: {' '.join(map(str, row.ravel()))}" for name, row in rows.items()]
     (tmp_path / "calib.txt").write_text("\n".join(lines))
     np.save(tmp_path / "a.npy", scan[:, :3])
-    files = FrameFiles(image=STREET / "rgb.png", sparse=tmp_path / "a.npy")
-    of_scan = {"calib": tmp_path / "calib.txt", "extrinsics": tmp_path / "pose.txt"}
-    options = ReadOptions(scan=ScanOptions(keep_occluded=True, **of_scan))
-    got = points_of(read_frame(files, options))
-    np.testing.assert_allclose(got, seen(scan[:, :3].astype(float)), rtol=1e-4, atol=2e-3)
+    given = {"calib": tmp_path / "calib.txt", "extrinsics": tmp_path / "pose.txt"}
+    options = ScanOptions(keep_occluded=True, **given)
+    same_points(tmp_path / "a.npy", scan[:, :3], scan=options)

@@ -81,13 +81,10 @@ def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: Fra
     assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
 
 
-def test_numbers_that_are_none_are_unknown() -> None:
+def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused() -> None:
     errors = {"used": {"after": {"mae": float("nan"), "rmse": float("inf")}}}
     (stages,) = read_again(FrameRecord(errors=errors)).errors.values()
     assert stages == {"after": {"mae": None, "rmse": None}}
-
-
-def test_the_camera_is_kept_exactly_and_numbers_of_none_are_refused() -> None:
     camera = read_again(RECORD).camera
     assert camera is not None
     again, pose = camera.read()

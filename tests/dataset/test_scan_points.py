@@ -92,9 +92,8 @@ def test_the_direction_is_judged_by_the_points_in_the_image_and_what_is_upright(
     turn: NDArray[np.float64], inside: int, inverted: int, notes: int | None
 ) -> None:
     ahead, ahead_inverted = turn[2], turn.T[2]
-    beside = np.repeat(
-        [[0, 0, 1], [0, 0, -1]] if turn is CYCLE else [[0, 1, 0], [0, -1, 0]], 500, 0
-    )
+    up = np.array([0, 0, 1] if turn is CYCLE else [0, 1, 0])
+    beside = np.repeat([up, -up], 500, axis=0)
     along = np.repeat([ahead, ahead_inverted], [inside, inverted], axis=0)
     scan = 5 * np.concatenate([along, beside])
     camera, pose = Camera(intrinsics=K), Extrinsics(turn, np.zeros(3))

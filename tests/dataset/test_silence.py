@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +23,20 @@ SPOKEN = ("warning", "without return", "that is none", "far plane", "1,000 times
 """What the lines of the gate's rules have, but not the line of a good file."""
 
 
+def said_of(scale: float | None = None, **files: Path) -> list[str]:
+    """What the gate says of a frame whose points are all kept."""
+    options = ReadOptions(scan=ScanOptions(keep_occluded=True))
+    notes = read_frame(FrameFiles(sparse_scale=scale, **files), options).notes
+    return [note for note in notes if any(word in note for word in SPOKEN)]
+
+
 def words(path: Path) -> list[str]:
-    """What the gate says of one depth map, as sparse depth, as ground truth, and as a list."""
+    """What the gate says of one depth map, as ground truth, and as sparse depth."""
     scale = next(value for name, value in SCALES.items() if name in str(path))
     depth = read_depth(path, scale=scale)
     values, notes = plausible_map(depth.values, depth.reading, "gt", "--gt-scale", scale)
     np.testing.assert_array_equal(values, depth.values)
-    files = FrameFiles(sparse=path, sparse_scale=scale)
-    frame = read_frame(files, ReadOptions(scan=ScanOptions(keep_occluded=True)))
-    return [*notes, *_spoken(frame.notes)]
-
-
-def _spoken(notes: tuple[str, ...]) -> list[str]:
-    return [note for note in notes if any(word in note for word in SPOKEN)]
+    return [*notes, *said_of(scale, sparse=path)]
 
 
 PATTERNS = (
@@ -47,12 +47,6 @@ PATTERNS = (
 
 def maps(root: Path) -> list[Path]:
     return sorted({path for pattern in PATTERNS for path in root.glob(f"**/{pattern}")})
-
-
-def said_of(**files: Path) -> list[str]:
-    """What the gate says of a frame whose points are all kept."""
-    options = ReadOptions(scan=ScanOptions(keep_occluded=True))
-    return _spoken(read_frame(FrameFiles(**files), options).notes)
 
 
 @pytest.mark.slow
@@ -66,19 +60,9 @@ def test_nothing_is_said_of_the_samples_in_any_format(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "list.txt", listed)
     for suffix in (".npy", ".exr", ".tiff", ".pfm", ".npz"):
         write_depth(tmp_path / f"map{suffix}", values)
-    image = SAMPLES / "street" / "rgb.png"
+    image, calib = (SAMPLES / "street" / name for name in ("rgb.png", "calib.txt"))
     for path in sorted(tmp_path.iterdir()):
-        calib = SAMPLES / "street" / "calib.txt"
         assert said_of(image=image, sparse=path, calib=calib) == [], path
-
-
-def scans(root: Path) -> Iterator[tuple[Path, Path, Path]]:
-    """The image, the scan and the calibration of each frame."""
-    yield tuple(SAMPLES / "street" / n for n in ("rgb.png", "000000.bin", "calib.txt"))  # type: ignore[misc]
-    for scan in sorted((root / "kitti_object" / "velodyne").glob("*.bin")):
-        folder = scan.parents[1]
-        image = folder / "image_2" / f"{scan.stem}.png"
-        yield image, scan, folder / "calib" / f"{scan.stem}.txt"
 
 
 def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
@@ -89,7 +73,12 @@ def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
 
 
 def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:
-    for image, scan, calib in scans(shared_data):
+    street, kitti = SAMPLES / "street", shared_data / "kitti_object"
+    frames = [(street / "rgb.png", street / "000000.bin", street / "calib.txt")]
+    for scan in sorted((kitti / "velodyne").glob("*.bin")):
+        name = scan.stem
+        frames += [(kitti / f"image_2/{name}.png", scan, kitti / f"calib/{name}.txt")]
+    for image, scan, calib in frames:
         xyz = read_scan(scan)[0]
         whole = np.column_stack([xyz, np.ones((len(xyz), 3))]).astype("<f4")
         formats = {

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -23,6 +22,7 @@ from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 from tests.commands.batches import batch, done, pairs_on_disk
 from tests.commands.frames import FrameOnDisk, frame_on_disk, run
+from tests.data_sets import image
 
 PHOTOS = Path(__file__).parents[2] / "samples" / "photos"
 METRES_PER_UNIT = 0.0876
@@ -32,11 +32,9 @@ METRES_PER_UNIT = 0.0876
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """A project of three photos and a text model."""
-    write_text_model(tmp_path / "sparse" / "0", names=("a.png", "b.png", "c.png"))
-    (tmp_path / "images").mkdir()
-    pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    write_text_model(tmp_path / "sparse/0", names=("a.png", "b.png", "c.png"))
     for name in "abc":
-        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), pixels)
+        image(tmp_path / f"images/{name}.png", HEIGHT, WIDTH)
     return tmp_path
 
 
@@ -49,28 +47,40 @@ def change(project: Path, file: str, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
-def refine(frame: FrameOnDisk, project: Path, **changes: Any) -> FrameRecord:
-    files = {"image": project / "images" / "a.png", "sparse": project / "sparse" / "0"}
-    return run(frame, **(files | changes))
+def refine(project: Path, output: str = "out", **changes: Any) -> FrameRecord:
+    files = {"image": project / "images/a.png", "sparse": project / "sparse/0"}
+    frame = frame_on_disk(project, HEIGHT, WIDTH)
+    return run(frame, output=project / output, **(files | changes))
 
 
-def test_a_turned_photo_is_read_as_colmap_reads_it(tmp_path: Path, project: Path) -> None:
-    plain = refine(frame_on_disk(tmp_path), project)
-    photo = project / "images" / "a.png"
-    with Image.open(photo) as image:
-        exif = image.getexif()
+@pytest.mark.parametrize(("unit_scale", "unit"), [(None, "model units"), (0.5, "m")])
+def test_depth_is_in_model_units_or_with_a_scale_in_metres(
+    unit_scale: float | None, unit: str, project: Path
+) -> None:
+    record = refine(project, unit_scale=unit_scale)
+    metric = unit_scale is not None
+    assert (record.unit, record.settings["align"]) == (unit, "none" if metric else "scale")
+    assert record.points is not None
+    factor = unit_scale or 1.0
+    assert 3.4 < record.points.nearest / factor < record.points.farthest / factor < 4.6
+    scale = read_depth(project / "out/a_depth.png").reading.scale
+    assert (scale == 256) == metric
+    assert np.log2(scale) % 1 == 0
+    photo = project / "images/a.png"  # turned by EXIF, it is read as COLMAP reads it
+    with Image.open(photo) as opened:
+        exif = opened.getexif()
         exif[0x0112] = 6
-        image.save(photo, exif=exif)
-    turned = refine(frame_on_disk(tmp_path), project, output=tmp_path / "turned")
-    assert turned.size == plain.size == (WIDTH, HEIGHT)
-    assert turned.points == plain.points
+        opened.save(photo, exif=exif)
+    turned = refine(project, "turned", unit_scale=unit_scale)
+    assert turned.size == record.size == (WIDTH, HEIGHT)
+    assert turned.points == record.points
 
 
 @pytest.mark.parametrize("name", ["03", "04"])
 def test_a_real_model_agrees_with_the_ground_truth_up_to_one_scale(name: str) -> None:
     truth = read_depth(PHOTOS / "gt" / f"{name}.png").values
-    image = PHOTOS / "images" / f"{name}.jpg"
-    points = read_colmap_points(PHOTOS, image, truth.shape, unit_scale=METRES_PER_UNIT).points
+    photo = PHOTOS / "images" / f"{name}.jpg"
+    points = read_colmap_points(PHOTOS, photo, truth.shape, unit_scale=METRES_PER_UNIT).points
     assert len(points) > 100
     column, row = np.rint(points.xy).astype(int).T
     known = truth[row, column] > 0
@@ -79,25 +89,10 @@ def test_a_real_model_agrees_with_the_ground_truth_up_to_one_scale(name: str) ->
     assert np.mean(np.abs(ratio - 1) < 0.05) > 0.7
 
 
-@pytest.mark.parametrize(("unit_scale", "unit"), [(None, "model units"), (0.5, "m")])
-def test_depth_is_in_model_units_or_with_a_scale_in_metres(
-    unit_scale: float | None, unit: str, tmp_path: Path, project: Path
-) -> None:
-    record = refine(frame_on_disk(tmp_path), project, unit_scale=unit_scale)
-    metric = unit_scale is not None
-    assert (record.unit, record.settings["align"]) == (unit, "none" if metric else "scale")
-    assert record.points is not None
-    factor = unit_scale or 1.0
-    assert 3.4 < record.points.nearest / factor < record.points.farthest / factor < 4.6
-    scale = read_depth(tmp_path / "out" / "a_depth.png").reading.scale
-    assert (scale == 256) == metric
-    assert np.log2(scale) % 1 == 0
-
-
-def test_what_does_not_fit_a_model_is_refused(tmp_path: Path, project: Path) -> None:
-    frame = frame_on_disk(tmp_path, HEIGHT, WIDTH)
+def test_what_does_not_fit_a_model_is_refused(project: Path) -> None:
+    frame = frame_on_disk(project, HEIGHT, WIDTH)
     with pytest.raises(UsageError, match="--unit-scale"):
-        refine(frame, project, gt=frame.gt)
+        refine(project, gt=frame.gt)
     with pytest.raises(UsageError, match=r"s\.png is no COLMAP model"):
         run(frame, unit_scale=1.0)
     for scale in (0.0, np.inf, np.nan):
@@ -145,16 +140,14 @@ def test_an_image_without_tracks_has_all_visible_points(tracks: str, project: Pa
 
 
 def test_points_behind_the_camera_are_counted_or_refused(project: Path) -> None:
-    points = project / "sparse" / "0" / "points3D.txt"
-    behind, beside, near, *others = points.read_text().splitlines(keepends=True)
-    behind, beside, near = (
-        " ".join([line.split()[0], "0", "0", z, *line.split()[4:]]) + "\n"
-        for line, z in ((behind, "-4"), (beside, "0"), (near, "0.5"))
-    )
-    points.write_text("".join([behind, beside, near, *others]))
+    points = project / "sparse/0/points3D.txt"
+    lines = points.read_text().splitlines()
+    for index, z in enumerate(("-4", "0", "0.5"), start=1):
+        number, _, _, _, *rest = lines[index].split()
+        lines[index] = " ".join([number, "0", "0", z, *rest])
+    points.write_text("\n".join(lines))
     seen = read(project).points
-    assert seen.dropped["behind the camera"] == 2
-    assert seen.depth.min() == 0.5
+    assert (seen.dropped["behind the camera"], seen.depth.min()) == (2, 0.5)
     change(project, "images.txt", "1 1 0 0 0 0.0 0 0 1", "1 1 0 0 0 0.0 0 -9 1")
     with pytest.raises(InputError, match=r"all 40 points of 'a\.png' .* are behind its camera"):
         read(project)
@@ -171,16 +164,14 @@ def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
 
 
 def test_each_registered_photo_of_the_largest_model_is_a_frame(project: Path) -> None:
-    cv2.imwrite(str(project / "images" / "new.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    (project / "images" / "c.png").unlink()
-    write_text_model(project / "sparse" / "1", names=("d.png",))
+    image(project / "images/new.png")
+    (project / "images/c.png").unlink()
+    write_text_model(project / "sparse/1", names=("d.png",))
     layout, frames, unmatched = list_frames(project)
-    assert layout == "colmap"
-    assert [each.name for each in frames] == ["a", "b"]
+    assert (layout, [each.name for each in frames]) == ("colmap", ["a", "b"])
     assert frames[1].pose == ((1, 0, 0, -0.1), (0, 1, 0, 0), (0, 0, 1, 0))
-    assert [each.path.relative_to(project).as_posix() for each in unmatched] == [
-        "images/new.png", "sparse/1", "images/c.png",
-    ]  # fmt: skip
+    lost = [each.path.relative_to(project).as_posix() for each in unmatched]
+    assert lost == ["images/new.png", "sparse/1", "images/c.png"]
 
 
 CALIB = "K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n"
@@ -203,11 +194,10 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
 
 
 def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: FrameOnDisk) -> None:
-    image = Image.open(frame.image)
-    exif = image.getexif()
+    opened, photo = Image.open(frame.image), frame.folder / "img.jpg"
+    exif = opened.getexif()
     exif[0x8769] = {0xA405: 26}
-    photo = frame.folder / "img.jpg"
-    image.save(photo, exif=exif)
+    opened.save(photo, exif=exif)
     record = run(replace(frame, image=photo), view_3d=True)
     assert " 26 mm" in camera_of(record).source
     assert any("no distortion (EXIF" in note for note in record.notes)

@@ -23,12 +23,11 @@ from pnpdepth_cli.sensors.point_cloud import (
 )
 
 HEIGHT, WIDTH = 24, 32
-INTRINSICS = np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]])
-CAMERA = Camera(intrinsics=INTRINSICS)
+CAMERA = Camera(intrinsics=np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]]))
 
 
-def whole(depth: np.ndarray, camera: Camera, **options: Any) -> PointCloud:
-    return joined(cloud_from_depth(depth, camera, **options))
+def whole(depth: np.ndarray, **options: Any) -> PointCloud:
+    return joined(cloud_from_depth(depth, CAMERA, **options))
 
 
 def joined(clouds: Iterable[PointCloud]) -> PointCloud:
@@ -37,18 +36,13 @@ def joined(clouds: Iterable[PointCloud]) -> PointCloud:
     return PointCloud(xyz=np.concatenate(xyz), normals=np.concatenate(normals), rgb=colours)
 
 
-def plane_depth(normal: tuple[float, float, float], distance: float) -> np.ndarray:
-    """(H, W) depth of the plane normal · x = distance."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    rays = np.stack([(columns - 15.5) / 30, (rows - 11) / 28, np.ones((HEIGHT, WIDTH))], -1)
-    return (distance / (rays @ np.array(normal))).astype(np.float32)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0.5, 20))
 def test_a_plane_has_its_normal_everywhere_and_no_edge(a: float, b: float, distance: float) -> None:
     normal = np.array([a, b, 1.0]) / np.linalg.norm([a, b, 1.0])
-    cloud = whole(plane_depth(tuple(normal), distance), CAMERA)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.stack([(columns - 15.5) / 30, (rows - 11) / 28, np.ones((HEIGHT, WIDTH))], -1)
+    cloud = whole((distance / (rays @ normal)).astype(np.float32))
     assert len(cloud.xyz) == HEIGHT * WIDTH
     assert cloud.xyz @ normal == pytest.approx(np.full(len(cloud.xyz), distance), rel=1e-4)
     assert cloud.normals @ -normal == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-3)
@@ -60,8 +54,8 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
     expected = np.zeros_like(depth, bool)
     expected[:, 19:21] = True
     assert (depth_edges(depth, 0.05) == expected).all()
-    assert len(whole(depth, CAMERA).xyz) == HEIGHT * (WIDTH - 2)
-    assert len(whole(depth, CAMERA, edge=0).xyz) == HEIGHT * WIDTH
+    assert len(whole(depth).xyz) == HEIGHT * (WIDTH - 2)
+    assert len(whole(depth, edge=0).xyz) == HEIGHT * WIDTH
 
 
 def test_unknown_and_excluded_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
@@ -69,7 +63,7 @@ def test_unknown_and_excluded_pixels_have_no_point_and_a_pose_moves_the_others()
     depth[8, 4], depth[5, 6] = 0, np.inf
     keep = np.ones(depth.shape, bool)
     keep[:2] = False
-    cloud = whole(depth, CAMERA, keep=keep)
+    cloud = whole(depth, keep=keep)
     assert len(cloud.xyz) == HEIGHT * WIDTH - 2 * WIDTH - 2
     assert (cloud.xyz[:, 2] == 3).all()
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
@@ -79,15 +73,12 @@ def test_unknown_and_excluded_pixels_have_no_point_and_a_pose_moves_the_others()
 
 
 def test_merged_clouds_have_one_mean_point_per_voxel() -> None:
-    rng = np.random.default_rng(2)
-    clouds = [
-        PointCloud(
-            xyz=rng.uniform(-1, 1, (500, 3)).astype(np.float32),
-            rgb=rng.integers(0, 256, (500, 3), dtype=np.uint8),
-            normals=np.tile(np.float32([0, 0, -1]), (500, 1)),
-        )
-        for _ in range(3)
-    ]
+    rng, normals = np.random.default_rng(2), np.tile(np.float32([0, 0, -1]), (500, 1))
+    clouds = []
+    for _ in range(3):
+        xyz = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
+        rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+        clouds.append(PointCloud(xyz=xyz, rgb=rgb, normals=normals))
     merged, every = merge_in_voxels(clouds, 0.5), joined(clouds)
     cells = np.floor(every.xyz / 0.5)
     assert len(merged.xyz) == len(np.unique(cells, axis=0))
@@ -134,9 +125,7 @@ def test_a_pixel_that_is_unknown_occluded_or_outside_elsewhere_is_left_out() -> 
 
 def test_neighbours_are_the_nearest_that_look_the_same_way() -> None:
     back = np.diag([-1.0, 1, -1])
-    turns = [np.eye(3), np.eye(3), back, np.eye(3)]
-    poses = np.stack(
-        [np.column_stack([turn, [x, 0, 0]]) for turn, x in zip(turns, (0, 3, 1, 2), strict=True)]
-    )
+    places = ((np.eye(3), 0), (np.eye(3), 3), (back, 1), (np.eye(3), 2))
+    poses = np.stack([np.column_stack([turn, [x, 0, 0]]) for turn, x in places])
     assert neighbouring_views(poses, 0) == [3, 1]
     assert neighbouring_views(poses, 2) == []

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.errors import FileFormatError, InputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, SizeError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.colmap_models import write_text_model
@@ -29,7 +30,6 @@ from tests.data_sets import (
     SELECTED,
     TREES,
     WIDTH,
-    arkitscenes,
     codes,
     eth3d,
     image,
@@ -41,7 +41,6 @@ from tests.data_sets import (
     tree,
     tum,
     video,
-    void,
 )
 
 AT_START = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))
@@ -87,81 +86,86 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     assert [frame.name for frame in read_frames(root)] == ["a", "b"]
 
 
-def test_kittis_selection_pairs_its_long_names(tmp_path: Path) -> None:
-    tree(tmp_path, TREES["kitti-depth"][0])
-    (frame,) = read_frames(tmp_path)
-    for path, kind in ((frame.sparse, "velodyne_raw"), (frame.gt, "groundtruth_depth")):
-        assert path == tmp_path / kind / f"{SELECTED.format(kind)}.png"
-    assert frame.calib == tmp_path / "intrinsics" / f"{SELECTED.format('image')}.txt"
-    assert (frame.sparse_scale, frame.gt_scale) == (256, 256)
+IN_DRIVE = f"{DRIVE}/proj_depth/{{}}/image_02/0000000005.png"
+ANNOTATED = f"data_depth_annotated/val/{IN_DRIVE.format('groundtruth')}"
+VELODYNE = f"data_depth_velodyne/train/{IN_DRIVE.format('velodyne_raw')}"
+PHOTO = f"2011_09_26/{DRIVE}/image_0{{}}/data/0000000005.png"
+RAW = {"calib": "2011_09_26"}
 
 
-def test_kittis_tree_finds_its_images_in_the_raw_data(tmp_path: Path) -> None:
-    tree(
-        tmp_path,
-        f"val/{DRIVE}/proj_depth/{{velodyne_raw,groundtruth}}/image_0{{2,3}}/0000000005.png"
-        f" 2011_09_26/{DRIVE}/image_0{{2,3}}/data/0000000005.png 2011_09_26/calib_cam_to_cam.txt",
-    )
-    left, right = read_frames(tmp_path, "kitti-depth")
-    assert (left.name, left.camera, right.camera) == (f"{DRIVE}_0000000005_image_02", 2, 3)
-    assert right.image == tmp_path / "2011_09_26" / DRIVE / "image_03/data/0000000005.png"
-    assert right.calib == tmp_path / "2011_09_26"
-    shutil.rmtree(tmp_path / "2011_09_26")
+@pytest.mark.parametrize(
+    ("files", "starts", "frames"),
+    [
+        (
+            TREES["kitti-depth"][0],
+            ["."],
+            [
+                {
+                    "sparse": f"velodyne_raw/{SELECTED.format('velodyne_raw')}.png",
+                    "gt": f"groundtruth_depth/{SELECTED.format('groundtruth_depth')}.png",
+                    "calib": f"intrinsics/{SELECTED.format('image')}.txt",
+                    "sparse_scale": 256,
+                    "gt_scale": 256,
+                }
+            ],
+        ),
+        (
+            f"val/{DRIVE}/proj_depth/{{velodyne_raw,groundtruth}}/image_0{{2,3}}/0000000005.png"
+            f" {PHOTO.format('{2,3}')} 2011_09_26/calib_cam_to_cam.txt",
+            ["."],
+            [RAW | {"image": PHOTO.format(camera), "camera": camera} for camera in (2, 3)],
+        ),
+        (
+            f"{VELODYNE} {ANNOTATED} raw/{PHOTO.format(2)}",
+            [".", "data_depth_velodyne"],
+            [{"sparse": VELODYNE, "gt": ANNOTATED, "image": f"raw/{PHOTO.format(2)}"}],
+        ),
+        (
+            f"{TREES['kitti-raw'][0]} {ANNOTATED}",
+            [".", "2011_09_26", f"2011_09_26/{DRIVE}"],
+            [
+                RAW | {"camera": 2, "gt": ANNOTATED},
+                RAW | {"camera": 2, "gt": None},
+                *[RAW | {"camera": 3, "gt": None}] * 2,
+            ],
+        ),
+        (
+            "data/room/{image,sparse_depth,ground_truth}/1.png data/room/K.txt",
+            ["."],
+            [{"calib": "data/room/K.txt"}],
+        ),
+    ],
+)
+def test_the_files_of_a_frame_are_found_from_wherever_the_data_set_starts(
+    files: str, starts: list[str], frames: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    tree(tmp_path, files)
+    for start in starts:
+        for found, parts in zip(read_frames(tmp_path / start), frames, strict=True):
+            paths = {name: tmp_path / part for name, part in parts.items() if type(part) is str}
+            assert found == replace(found, **(parts | paths))
+
+
+def test_kittis_depth_without_the_raw_images_says_where_it_looked(tmp_path: Path) -> None:
+    tree(tmp_path, f"{VELODYNE} {ANNOTATED}")
     with pytest.raises(InputError, match=f"{DRIVE}/image_02/data"):
         read_frames(tmp_path)
 
 
-def test_kittis_depth_as_downloaded_pairs_annotated_velodyne_and_raw(tmp_path: Path) -> None:
-    inside = f"{DRIVE}/proj_depth/{{}}/image_02/0000000005.png"
-    scan = tmp_path / "data_depth_velodyne/train" / inside.format("velodyne_raw")
-    gt = tmp_path / "data_depth_annotated/train" / inside.format("groundtruth")
-    photo = tmp_path / "raw/2011_09_26" / DRIVE / "image_02/data/0000000005.png"
-    touch(scan, gt, photo)
-    for start in (tmp_path, tmp_path / "data_depth_velodyne"):
-        (frame,) = read_frames(start)
-        assert (frame.sparse, frame.gt, frame.image) == (scan, gt, photo)
-
-
-@pytest.mark.parametrize("start", [".", "2011_09_26", f"2011_09_26/{DRIVE}"])
-def test_a_raw_drive_has_calibration_and_annotated_depth(start: str, tmp_path: Path) -> None:
-    tree(tmp_path, TREES["kitti-raw"][0])
-    gt = tmp_path / "data_depth_annotated" / "val" / DRIVE / "proj_depth/groundtruth/image_02"
-    touch(gt / "0000000005.png")
-    layout, frames, unmatched = list_frames(tmp_path / start)
-    assert layout == "kitti-raw"
-    assert {frame.calib for frame in frames} == {tmp_path / "2011_09_26"}
-    assert [frame.camera for frame in frames] == [2, 2, 3, 3]
-    assert [frame.gt for frame in frames] == [gt / "0000000005.png", None, None, None]
-    assert [lost.path.name for lost in unmatched] == ["0000000007.png"]
-
-
-def poses_of_odometry(root: Path, *rows: str) -> None:
-    tree(root, "sequences/00/image_2/00000{0,2}.png sequences/00/velodyne/00000{0,2}.bin")
-    touch(root / "sequences/00/calib.txt", root / "poses/00.txt")
-    (root / "poses/00.txt").write_text("\n".join(rows) + "\n")
+def odometry(root: Path) -> None:
+    tree(root, TREES["kitti-odometry"][0])
+    tree(root, "sequences/00/{image_2/000002.png,velodyne/000002.bin} poses/00.txt")
 
 
 def test_odometry_has_poses_by_frame_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    poses_of_odometry(tmp_path, *(f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in ("0.5", "1", "-1.5e-01")))
-    tree(tmp_path, TREES["kitti-odometry"][0])
+    odometry(tmp_path)
+    rows = [f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in ("0.5", "1", "-1.5e-01")]
+    (tmp_path / "poses/00.txt").write_text("".join(rows))
     assert [frame.pose for frame in read_frames(tmp_path)] == [at_x(0.5), at_x(-0.15), None]
     monkeypatch.chdir(tmp_path / "sequences/00")
     assert [f.pose for f in read_frames(Path())] == [at_x(0.5), at_x(-0.15)]
-
-
-_ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
-
-
-@pytest.mark.parametrize(
-    ("rows", "named"),
-    [("", "00.txt"), (_ROW, "000002.png"), (_ROW[2:], "00.txt"), ("nan" + _ROW[1:], "00.txt")],
-)
-def test_poses_are_twelve_numbers_a_frame(tmp_path: Path, rows: str, named: str) -> None:
-    poses_of_odometry(tmp_path, rows)
-    with pytest.raises(InputError, match=named):
-        read_frames(tmp_path)
 
 
 def test_tum_pairs_images_and_depth_that_are_nearest_in_time(tmp_path: Path) -> None:
@@ -191,31 +195,43 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     assert frame.pose == at_x(7)
 
 
-@pytest.mark.parametrize(
-    ("file", "line"),
-    [
-        ("rgb.txt", "nan rgb/a.png"),
-        ("depth.txt", "soon depth/1.png"),
-        ("rgb.txt", "1.0"),
-        ("rgb.txt", "1.0 rgb/a\0.png"),
-        ("associations.txt", "0 rgb/0.png 0"),
-        ("associations.txt", "0 rgb/0.png nan depth/0.png"),
-        ("associations.txt", "0 rgb/0.png 0 rgb/1.png"),
-    ],
-)
-def test_a_line_of_tum_that_means_nothing_is_named(tmp_path: Path, file: str, line: str) -> None:
-    tum(tmp_path)
-    (tmp_path / file).write_text(f"{line}\n")
-    with pytest.raises(FileFormatError, match=r"line 1|rgb/a\\x00\.png"):
-        read_frames(tmp_path)
-
-
 def inputs_of(frame: FrameFiles, root: Path) -> Frame:
     """The frame as a batch reads it; points are sampled where it has none."""
     pattern = None if frame.sparse is not None else parse_sample("20")
     refine = RefineRequest().with_fields(sample=pattern)
     request = BatchRequest(source=root, output=root / "out", refine=refine)
     return read_requested(request_of(request, frame))
+
+
+_POSE = "1 0 0 0 0 1 0 0 0 0 1 0"
+
+
+@pytest.mark.parametrize(
+    ("make", "file", "text", "named"),
+    [
+        (odometry, "poses/00.txt", "", r"00\.txt"),
+        (odometry, "poses/00.txt", _POSE, r"000002\.png"),
+        (odometry, "poses/00.txt", _POSE[2:], r"00\.txt"),
+        (odometry, "poses/00.txt", f"nan{_POSE[1:]}", r"00\.txt"),
+        (tum, "rgb.txt", "nan rgb/a.png", "line 1"),
+        (tum, "depth.txt", "soon depth/1.png", "line 1"),
+        (tum, "rgb.txt", "1.0", "line 1"),
+        (tum, "rgb.txt", "1.0 rgb/a\0.png", r"rgb/a\\x00\.png"),
+        (tum, "associations.txt", "0 rgb/0.png 0", "line 1"),
+        (tum, "associations.txt", "0 rgb/0.png nan depth/0.png", "line 1"),
+        (tum, "associations.txt", "0 rgb/0.png 0 rgb/1.png", "line 1"),
+        (eth3d, "office/ground_truth_depth/dslr_images/DSC_0219.JPG", "0" * 12, r"DSC_0219\.JPG"),
+        (stray_scanner, "odometry.csv", "header\n0, 0, x, 0, 0, 0, 0, 0, 1", r"odometry\.csv"),
+        (stray_scanner, "rgb.mp4", "#EXTM3U\nhttp://localhost/video.ts\n", r"rgb\.mp4"),
+    ],
+)
+def test_a_file_of_a_data_set_that_means_nothing_is_named(
+    make: Callable[[Path], None], file: str, text: str, named: str, tmp_path: Path
+) -> None:
+    make(tmp_path)
+    (tmp_path / file).write_text(f"{text}\n")
+    with pytest.raises(InputError, match=named):
+        inputs_of(read_frames(tmp_path)[0], tmp_path)
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -228,40 +244,30 @@ def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) ->
     np.testing.assert_allclose(inputs.points.depth, 2, rtol=1e-3)
     assert inputs.image is not None
     assert inputs.image.shape[:2] == inputs.gt.shape == inputs.points.size
+    if name == "arkitscenes":  # whose low resolution keeps its points
+        points = inputs.points
+        assert (len(points), points.xy[0].tolist()) == (HEIGHT * WIDTH // 16, [1.5, 1.5])
     half = name in ("diode", "ibims", "eth3d")
     assert int(known.sum()) == HEIGHT * WIDTH // (2 if half else 1)
     assert not (half and known[:, WIDTH // 2 :].any())
 
 
-def test_the_low_resolution_depth_of_arkitscenes_keeps_its_points(tmp_path: Path) -> None:
-    arkitscenes(tmp_path)
-    points = inputs_of(read_frames(tmp_path)[0], tmp_path).points
-    assert (len(points), points.xy[0].tolist()) == (HEIGHT * WIDTH // 16, [1.5, 1.5])
-
-
-def test_eth3ds_model_is_sparse_depth_of_its_undistorted_images(tmp_path: Path) -> None:
-    photo = tmp_path / "images/dslr_images_undistorted/DSC_0219.JPG"
-    image(photo)
-    model = tmp_path / "dslr_calibration_undistorted"
-    write_text_model(model, names=("dslr_images_undistorted/DSC_0219.JPG",))
+@pytest.mark.parametrize(
+    ("model", "photo"),
+    [
+        ("dslr_calibration_undistorted", "images/dslr_images_undistorted/DSC_0219.JPG"),
+        ("colmap/sparse/0", "images/frame_00001.png"),  # as nerfstudio has it
+    ],
+)
+def test_a_model_elsewhere_is_sparse_depth_of_its_images(
+    model: str, photo: str, tmp_path: Path
+) -> None:
+    for folder in ("images", "images_2"):
+        image(tmp_path / photo.replace("images", folder, 1))
+    write_text_model(tmp_path / model, names=(photo.removeprefix("images/"),))
     (frame,) = read_frames(tmp_path)
-    assert (frame.image, frame.sparse) == (photo, model)
+    assert (frame.image, frame.sparse) == (tmp_path / photo, tmp_path / model)
     assert len(inputs_of(frame, tmp_path).points) > 0
-
-
-def test_raw_depth_of_eth3d_that_does_not_fit_its_image_is_refused(tmp_path: Path) -> None:
-    eth3d(tmp_path)
-    (frame,) = read_frames(tmp_path)
-    assert frame.gt is not None
-    frame.gt.write_bytes(b"0" * 12)
-    with pytest.raises(InputError, match=r"DSC_0219\.JPG"):
-        inputs_of(frame, tmp_path)
-
-
-def test_all_of_void_is_taken_without_a_list_of_the_test_split(tmp_path: Path) -> None:
-    void(tmp_path)
-    (tmp_path / "test_image.txt").unlink()
-    assert [frame.calib for frame in read_frames(tmp_path)] == [tmp_path / "data/desktop/K.txt"] * 2
 
 
 def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
@@ -303,14 +309,21 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
     assert [frame.name for frame in read_frames(tmp_path, "pairs")] == ["mine/a"]
 
 
-def test_an_unknown_folder_or_layout_is_named(tmp_path: Path) -> None:
-    tree(tmp_path, "image_2/0.png calib/0.txt")
-    with pytest.raises(InputError, match="kitti-object"):
-        list_frames(tmp_path)
-    with pytest.raises(InputError, match="kitti-object"):
-        list_frames(tmp_path, "kitti-object")
-    with pytest.raises(UsageError, match="kitti-object"):
-        list_frames(tmp_path, "kitti-objects")
+@pytest.mark.parametrize(
+    ("root", "name", "error", "said"),
+    [
+        (".", None, InputError, "kitti-object"),
+        (".", "kitti-object", InputError, "kitti-object"),
+        (".", "kitti-objects", UsageError, "kitti-object"),
+        ("phone.r3d", None, InputError, r"LZFSE.*'EXR \+ RGB'"),
+    ],
+)
+def test_an_unknown_folder_or_layout_is_named(
+    root: str, name: str | None, error: type[Exception], said: str, tmp_path: Path
+) -> None:
+    tree(tmp_path, "image_2/0.png calib/0.txt phone.r3d")
+    with pytest.raises(error, match=said):
+        list_frames(tmp_path / root, name)
 
 
 def test_a_frame_that_is_smaller_than_its_part_is_refused() -> None:
@@ -350,22 +363,3 @@ def test_depth_maps_smaller_than_images_are_millimetres(tmp_path: Path) -> None:
     frame = read_frame(read_frames(tmp_path, "pairs")[1], ReadOptions())
     np.testing.assert_allclose(frame.points.depth, 2)
     assert frame.sources["sparse"].assumed
-
-
-def test_what_is_no_video_or_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    stray_scanner(tmp_path)
-    frames = read_frames(tmp_path)
-    (tmp_path / "rgb.mp4").write_text("#EXTM3U\nhttp://localhost/video.ts\n")
-    with pytest.raises(InputError, match=r"rgb\.mp4"):
-        read_frame(frames[0], ReadOptions())
-    (tmp_path / "odometry.csv").write_text("header\n0, 0, x, 0, 0, 0, 0, 0, 1\n")
-    with pytest.raises(InputError, match=r"odometry\.csv"):
-        list_frames(tmp_path)
-
-
-def test_nerfstudios_folder_has_its_model_in_colmap(tmp_path: Path) -> None:
-    write_text_model(tmp_path / "colmap/sparse/0", names=("frame_00001.png",))
-    touch(tmp_path / "images/frame_00001.png", tmp_path / "images_2/frame_00001.png")
-    (frame,) = read_frames(tmp_path, "colmap")
-    assert frame.sparse == tmp_path / "colmap/sparse/0"
-    assert read_frames(tmp_path / "colmap/sparse/0", "colmap")[0].image == frame.image

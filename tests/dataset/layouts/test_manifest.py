@@ -8,7 +8,7 @@ import pytest
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, name_problem
 from pnpdepth_cli.dataset.layouts import list_frames
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.data_sets import read_frames, touch
 
@@ -18,11 +18,6 @@ def manifest(folder: Path, text: str) -> Path:
     touch(folder / "i.png")
     (folder / "m.csv").write_text(text, encoding="utf-8")
     return folder / "m.csv"
-
-
-def frames_named(folder: Path, *names: str) -> list[FrameFiles]:
-    rows = "".join(f"i.png,{name}\n" for name in names)
-    return read_frames(manifest(folder, f"image,name\n{rows}"))
 
 
 def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
@@ -60,6 +55,10 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
         ("image,gt_size_ok\ni.png,maybe\n", "gt_size_ok is 'maybe', not true or false"),
         ("image\n" + "x" * 200_000 + "\n", "field larger than field limit"),
         ("image\ni\0.png\n", "no file can have this name"),
+        *(
+            (f"image,name\ni.png,{first}\ni.png,{second}\n", "line 3")  # of one file
+            for first, second in (("a", "./a"), ("x/y", "x/./y"), ("Frame", "frame"), ("ß", "SS"))
+        ),
     ],
 )
 def test_a_line_that_means_nothing_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -75,31 +74,27 @@ def test_a_missing_file_of_a_manifest_is_named_with_its_line(tmp_path: Path) -> 
     assert "line 3" in str(lost)
 
 
-def test_frames_of_one_stem_are_named_by_their_folders(tmp_path: Path) -> None:
-    touch(*(tmp_path / "data" / name for name in ("one/x.png", "two/x.png", "y.png")))
-    rows = "data/one/x.png,\ndata/two/x.png,\ndata/y.png,mine\n"
-    frames = read_frames(manifest(tmp_path, f"image,name\n{rows}"))
-    assert [frame.name for frame in frames] == ["one/x", "two/x", "mine"]
-
-
-def test_a_manifest_may_name_files_with_new_lines(tmp_path: Path) -> None:
-    touch(tmp_path / "a\nb.png", tmp_path / "c\u2028d.png")
-    frames = read_frames(manifest(tmp_path, 'image\n"a\nb.png"\nc\u2028d.png\n'))
-    assert [frame.name for frame in frames] == ["a\nb", "c\u2028d"]
+NAMES = {
+    "console": "console", "a.con": "a.con", "n" * 239: "n" * 239, "x/y": "x/y", "é": "é",
+    "./s": "s", "z//y/.": "z/y",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("first", "second"), [("a", "./a"), ("x/y", "x/./y"), ("Frame", "frame"), ("ß", "SS")]
+    ("text", "names"),
+    [
+        # of one stem, by their folders
+        ("image,name\none/x.png,\ntwo/x.png,\ny.png,mine\n", ["one/x", "two/x", "mine"]),
+        ('image\n"a\nb.png"\nc\u2028d.png\n', ["a\nb", "c\u2028d"]),
+        ("\n".join(["image,name", *(f"i.png,{name}" for name in NAMES)]), list(NAMES.values())),
+    ],
 )
-def test_two_names_of_one_file_are_refused(tmp_path: Path, first: str, second: str) -> None:
-    with pytest.raises(FileFormatError, match="line 3"):
-        frames_named(tmp_path, first, second)
-
-
-def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
-    given = ["console", "a.con", "n" * 239, "x/y", "é", "./s", "z//y/."]
-    read = ["console", "a.con", "n" * 239, "x/y", "é", "s", "z/y"]
-    assert [frame.name for frame in frames_named(tmp_path, *given)] == read
+def test_names_stay_but_for_dots_and_double_slashes(
+    text: str, names: list[str], tmp_path: Path
+) -> None:
+    for file in ("one/x.png", "two/x.png", "y.png", "a\nb.png", "c\u2028d.png"):
+        touch(tmp_path / file)
+    assert [frame.name for frame in read_frames(manifest(tmp_path, text))] == names
 
 
 @pytest.mark.parametrize(
@@ -107,11 +102,9 @@ def test_names_stay_but_for_dots_and_double_slashes(tmp_path: Path) -> None:
     [
         *((name, "leads out of the output folder") for name in ("../a", "/a", "x/../../a")),
         *((name, "on Windows") for name in ("a\\b", "C:/frames/a")),
-        ("a\0b", "no file name has"),
-        ("\ud800", "no file name has"),
+        *((name, "no file name has") for name in ("a\0b", "\ud800")),
         (".", "names no file"),
-        ("n" * 240, "is longer than 239 bytes"),
-        ("x/" + "é" * 120, "is longer than 239 bytes"),
+        *((name, "is longer than 239 bytes") for name in ("n" * 240, "x/" + "é" * 120)),
     ],
 )
 def test_a_name_that_no_file_can_have_is_refused(name: str, problem: str) -> None:
