@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from pnpdepth_cli.cli.main import cli, run
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.weights import read_checkpoint
 from tests.bags import write_bag
 from tests.commands.scan_frames import scan_on_disk
 
@@ -166,6 +168,10 @@ def onnx(path: Path) -> None:
     write_network(path)
 
 
+def weights(path: Path) -> None:
+    torch.save({"w": torch.ones(2)}, path)
+
+
 def depth(path: Path) -> None:
     write_depth(path, np.ones((4, 5), np.float32))
 
@@ -185,6 +191,7 @@ def depth(path: Path) -> None:
             lambda path: open_bag(path).__enter__(),
         ),
         ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
+        ("w.pt", "zipfile.ZipFile", weights, read_checkpoint),
     ],
 )
 def test_a_library_without_a_function_is_no_damaged_file(

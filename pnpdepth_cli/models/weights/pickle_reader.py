@@ -55,8 +55,8 @@ class BrokenFileError(Exception):
 
 CONTENT_ERRORS = (
     *(BrokenFileError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
-    *(struct.error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
-    *(RuntimeError, SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
+    *(struct.error, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
+    *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""
 
@@ -97,7 +97,10 @@ class _Unpickler(pickle._Unpickler):
 
     def _step(self, function: Callable[[], None], _: object) -> None:
         self._charge(1)
-        function()
+        try:
+            function()
+        except AttributeError:  # of an object on the stack
+            raise BrokenFileError("its pickle uses an object as one of another kind") from None
 
     def _charge(self, steps: int) -> None:
         self._left -= steps
