@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -157,27 +158,22 @@ def video(path: Path, levels: list[int]) -> None:
     writer.release()
 
 
-def record3d(root: Path, frames: int = 3) -> None:
+def record3d(root: Path) -> None:
     """Depth of 2 m, and the same motion in ARKit's axes."""
-    for number in range(frames):
+    for number in range(3):
         image(root / f"rgb/{number}.jpg")
         (root / "depth").mkdir(exist_ok=True)
         write_depth(root / f"depth/{number}.exr", np.full((HEIGHT // 2, WIDTH // 2), 2, np.float32))
     half_turn_about_x = [1, 0, 0, 0]  # from ARKit's axes, y up, to those of the world here
-    metadata = {
-        "K": [30, 0, 0, 0, 30, 0, WIDTH / 2, 12, 1],
-        "w": WIDTH,
-        "h": HEIGHT,
-        "poses": [[*half_turn_about_x, n / 10, 0, 0] for n in range(frames)],
-    }
-    (root / "metadata.json").write_text(json.dumps(metadata))
+    poses = [[*half_turn_about_x, n / 10, 0, 0] for n in range(3)]
+    metadata = {"K": [30, 0, 0, 0, 30, 0, WIDTH / 2, 12, 1], "w": WIDTH, "h": HEIGHT}
+    (root / "metadata.json").write_text(json.dumps(metadata | {"poses": poses}))
 
 
 def tum(root: Path) -> None:
     root.mkdir(exist_ok=True)
-    (root / "rgb.txt").write_text(
-        "# time file\n1.000 rgb/1.000.png\n1.033 rgb/1.033.png\n2 rgb/2.png\n"
-    )
+    lines = ["# time file", "1.000 rgb/1.000.png", "1.033 rgb/1.033.png", "2 rgb/2.png"]
+    (root / "rgb.txt").write_text("\n".join(lines))
     (root / "depth.txt").write_text("1.015 depth/1.015.png\n1.030 depth/1.030.png\n")
 
 
@@ -215,10 +211,7 @@ BENCHMARKS: dict[str, tuple[Maker, list[str]]] = {
 }
 """Sets with depth of 2 m."""
 MAKERS: dict[str, tuple[Maker, list[str]]] = {
-    **{
-        name: (lambda root, files=files: tree(root, files), names)  # type: ignore[misc]
-        for name, (files, names) in TREES.items()
-    },
+    **{name: (partial(tree, patterns=files), names) for name, (files, names) in TREES.items()},
     **BENCHMARKS,
     "stray-scanner": (stray_scanner, ["000000", "000001", "000002"]),
     "record3d": (record3d, ["0", "1", "2"]),
