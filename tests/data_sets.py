@@ -142,20 +142,15 @@ def stray_scanner(root: Path, frames: int = 3) -> None:
         confidence = np.full((HEIGHT // 2, WIDTH // 2), 2, np.uint8)
         confidence[:, : WIDTH // 8] = 0
         _write(root / f"confidence/{number:06}.png", confidence)
-    video(root / "rgb.mp4", [20 + 15 * number for number in range(frames)])
+    mp4v = cv2.VideoWriter.fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(root / "rgb.mp4"), mp4v, 30, (WIDTH, HEIGHT))
+    for number in range(frames):
+        video.write(np.full((HEIGHT, WIDTH, 3), 20 + 15 * number, np.uint8))
+    video.release()
     (root / "camera_matrix.csv").write_text(f"30.0, 0.0, {WIDTH / 2}\n0.0, 30.0, 12.0\n0, 0, 1")
     rows = [f"{n / 60}, {n:06}, {n / 10}, 0, 0, 0, 0, 0, 1\n" for n in range(frames)]
     header = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
     (root / "odometry.csv").write_text(header + "".join(rows))
-
-
-def video(path: Path, levels: list[int]) -> None:
-    """A grey video with a frame of each level."""
-    size = (WIDTH, HEIGHT)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30, size)
-    for level in levels:
-        writer.write(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
-    writer.release()
 
 
 def record3d(root: Path) -> None:

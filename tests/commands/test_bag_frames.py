@@ -34,7 +34,7 @@ KINDS = ("ros1.bag", "ros2", "drive.mcap")
 def written(bag: Path, folder: Path, **options: object) -> list[str]:
     """What was said while the frames of a bag were written."""
     messages: list[str] = []
-    write_frames(FramesRequest(bag=bag, output=folder, **options), messages.append)  # type: ignore[arg-type]
+    write_frames(FramesRequest(bag=bag, output=folder, **options), messages.append)
     return messages
 
 
@@ -46,7 +46,6 @@ def extracted(folder: Path, kind: str = "a.mcap", **bag: Any) -> list[str]:
 
 def points_of(frame: FrameFiles) -> Points:
     """The scan of a frame that was written, in its image."""
-    assert frame.sparse is not None
     options = ScanOptions(calib=frame.calib)
     return read_scan_points(frame.sparse, options, (HEIGHT, WIDTH)).points
 
@@ -64,7 +63,7 @@ def test_a_bag_becomes_calibrated_frames_with_poses(kind: str, topic: str, tmp_p
     assert topics == [topic, POINTS, "/odom"]
     frames = read_frames(tmp_path / "frames")
     assert [frame.name for frame in frames] == [f"1700000000_0{n}0000" for n in (0, 3, 6)]
-    pixels = read_rgb(frames[1].image).values  # type: ignore[arg-type]
+    pixels = read_rgb(frames[1].image).values
     assert pixels.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(pixels[5, 5] * 255, [200, 41, 41], atol=0 if topic == IMAGES else 4)
     calibration = read_calibration(tmp_path / "frames" / "calib.txt")
@@ -87,7 +86,7 @@ def test_a_bag_becomes_calibrated_frames_with_poses(kind: str, topic: str, tmp_p
 def test_depth_images_are_sparse_depth(kind: str, error: float, tmp_path: Path) -> None:
     extracted(tmp_path, "ros1.bag", depth=kind)
     for frame in read_frames(tmp_path / "frames"):
-        np.testing.assert_allclose(read_depth(frame.sparse).values, depth_m(), rtol=error)  # type: ignore[arg-type]
+        np.testing.assert_allclose(read_depth(frame.sparse).values, depth_m(), rtol=error)
     extracted(tmp_path / "wide", depth=kind, depth_focal=30.0)
     points = points_of(read_frames(tmp_path / "wide/frames")[0])  # of half the focal length
     np.testing.assert_allclose(points.xy[:, 0] % 2, 0.5, atol=0.01)  # 31.5 + 2 · (u − 31.5)

@@ -67,7 +67,7 @@ def test_a_projected_scan_lands_where_it_was_made_to(frame: ScanOnDisk, suffix: 
 def refused(frame: ScanOnDisk, error: type[PnpDepthError], message: str, **more: object) -> None:
     before = sorted(frame.folder.rglob("*"))
     with pytest.raises(error) as caught:
-        projected(frame, **more)  # type: ignore[arg-type]
+        projected(frame, **more)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert sorted(frame.folder.rglob("*")) == before
@@ -107,26 +107,22 @@ def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> N
         ScanOptions(extrinsics=frame.calib).describes(frame.gt)
 
 
-def sampled(frame: ScanOnDisk, output: str, **more: Any) -> dict[str, Any]:
-    files = {"depth": frame.gt, "output": frame.folder / output}
-    return recorded(sample_depth(**files, **more))
-
-
 def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
-    for name in ("a", "b"):
-        record = sampled(frame, f"{name}.png", pattern=SamplePattern(count=100), seed=11)
+    one, other = frame.folder / "a.png", frame.folder / "b.png"
+    for path in (one, other):
+        record = recorded(sample_depth(frame.gt, path, SamplePattern(count=100), seed=11))
         assert record["seed"] == 11
-    assert (frame.folder / "a.png").read_bytes() == (frame.folder / "b.png").read_bytes()
-    written = read_depth(frame.folder / "a.png")
+    assert one.read_bytes() == other.read_bytes()
+    written = read_depth(one)
     assert (np.count_nonzero(written.values), written.reading.scale) == (100, 256)
 
 
 def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
-    image = np.zeros((48, 64, 3), np.uint8)
-    image[12:36, 16:48] = 255
-    cv2.imwrite(str(frame.image), image)
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[12:36, 16:48] = 255
+    cv2.imwrite(str(frame.image), pixels)
     pattern = SamplePattern(kind="features", count=3000)
-    record = sampled(frame, "e.png", pattern=pattern, image=frame.image)
+    record = recorded(sample_depth(frame.gt, frame.folder / "e.png", pattern, image=frame.image))
     assert record["points"]["count"] < 3000
     assert any("of the 3,000 points asked for" in note for note in record["notes"])
 

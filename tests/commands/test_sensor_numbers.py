@@ -57,9 +57,11 @@ def seen(xyz: NDArray[Any]) -> NDArray[np.float64]:
     return rows[inside][np.unique(index, return_index=True)[1]]
 
 
-def read(sparse: Path, calib: Path | None = STREET / "calib.txt", **options: Any) -> Frame:
+def read(
+    sparse: Path, calib: Path | None = STREET / "calib.txt", gt: Path | None = None, **options: Any
+) -> Frame:
     scan = ScanOptions(calib=calib, keep_occluded=True)
-    files = FrameFiles(image=STREET / "rgb.png", sparse=sparse)
+    files = FrameFiles(image=STREET / "rgb.png", sparse=sparse, gt=gt)
     return read_frame(files, ReadOptions(**({"scan": scan} | options)))
 
 
@@ -134,16 +136,9 @@ def test_a_scan_in_millimetres_stops_and_is_read_by_the_option(tmp_path: Path, s
     np.save(tmp_path / "a.npy", 1000 * scan[:, :3])
     with pytest.raises(InputError, match="--depth-scale 1000"):
         read(tmp_path / "a.npy")
-    same_points(tmp_path / "a.npy", scan[:, :3], depth_scale=1000.0)
-    files = FrameFiles(
-        image=STREET / "rgb.png",
-        sparse=tmp_path / "a.npy",
-        gt=STREET / "gt.png",  # which states its own scale
-        calib=STREET / "calib.txt",
-    )
-    gt = read_frame(files, ReadOptions(depth_scale=1000.0)).gt
-    assert gt is not None
-    np.testing.assert_allclose(gt, codes_of(STREET / "gt.png") / 256, rtol=1e-6)
+    gt = STREET / "gt.png"  # which states its own scale
+    frame = same_points(tmp_path / "a.npy", scan[:, :3], depth_scale=1000.0, gt=gt)
+    np.testing.assert_allclose(frame.gt, codes_of(gt) / 256, rtol=1e-6)
 
 
 def codes_of(path: Path) -> NDArray[np.float64]:
@@ -151,28 +146,21 @@ def codes_of(path: Path) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("far", [1e10, 65504, 10000, 1000])
-def test_a_far_plane_of_ground_truth_is_neither_scored_nor_sampled(
-    tmp_path: Path, far: float
-) -> None:
+def test_a_far_plane_is_neither_scored_nor_sampled_nor_a_point(tmp_path: Path, far: float) -> None:
     truth = codes_of(STREET / "gt.png") / 256
-    prediction = np.where(truth > 0, truth + 0.25, 50)
-    np.save(tmp_path / "prediction.npy", prediction.astype(np.float32))
-    np.save(tmp_path / "gt.npy", np.where(truth > 0, truth, far).astype(np.float32))
-    request = EvalRequest(prediction=tmp_path / "prediction.npy", ground_truth=tmp_path / "gt.npy")
-    result = evaluate(request)
+    prediction, gt, sparse = (tmp_path / f"{name}.npy" for name in ("prediction", "gt", "sparse"))
+    np.save(prediction, np.where(truth > 0, truth + 0.25, 50).astype(np.float32))
+    np.save(gt, np.where(truth > 0, truth, far).astype(np.float32))
+    result = evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
     assert result.mean["mae"] == pytest.approx(0.25, abs=1e-5)
     assert result.counts["pixels"] == np.count_nonzero(truth)
     assert any(f"{np.count_nonzero(truth == 0):,} of" in note for note in result.notes)
-    files = {"depth": tmp_path / "gt.npy", "output": tmp_path / "sparse.npy"}
-    drawn, _, _ = sample_depth(pattern=SamplePattern(count=3000), **files)
+    drawn, _, _ = sample_depth(gt, tmp_path / "drawn.npy", SamplePattern(count=3000))
     assert drawn.depth.max() <= truth.max()
-
-
-def test_a_far_plane_of_sparse_depth_is_no_point(tmp_path: Path) -> None:
-    sparse = codes_of(STREET / "sparse.png") / 256
-    sparse[:40, ::7] = 10000
-    np.save(tmp_path / "a.npy", sparse.astype(np.float32))
-    assert len(read(tmp_path / "a.npy").points) == np.count_nonzero((sparse > 0) & (sparse < 1000))
+    depth = codes_of(STREET / "sparse.png") / 256
+    depth[:40, ::7] = far
+    np.save(sparse, depth.astype(np.float32))
+    assert len(read(sparse).points) == np.count_nonzero((depth > 0) & (depth < far))
 
 
 def warnings_of(sparse: Path = STREET / "000000.bin", **scan: Any) -> list[str]:
@@ -273,7 +261,6 @@ def test_distances_from_a_wide_camera_become_depth(tmp_path: Path) -> None:
     assert length.max() == pytest.approx(1.6, abs=0.01)  # 60 % in the corners
     np.save(tmp_path / "distance.npy", (truth * length).astype(np.float32))
     (tmp_path / "calib.txt").write_text("K: [320, 0, 319.5, 0, 320, 239.5, 0, 0, 1]")
-
     asked = {"sparse": tmp_path / "distance.npy", "sparse_range": True}
     frame = indoor(**asked, calib=tmp_path / "calib.txt")
     column, row = frame.points.xy.numpy().astype(int).T
@@ -292,7 +279,6 @@ def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> Non
     np.testing.assert_allclose(image.values, pixels / 255, atol=1e-6)
     assert image.note is not None
     frame = frame_of_arrays(pixels, codes_of(INDOOR / "sparse.png") / 1000)
-    assert frame.image is not None
     np.testing.assert_allclose(frame.image, pixels / 255, atol=1e-6)
 
 

@@ -86,7 +86,6 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
     (stages,) = read_again(FrameRecord(errors=errors)).errors.values()
     assert stages == {"after": {"mae": None, "rmse": None}}
     camera = read_again(RECORD).camera
-    assert camera is not None
     again, pose = camera.read()
     assert CameraRecord.of(again, pose) == RECORD.camera
     assert (again.intrinsics == CAMERA.intrinsics).all()

@@ -30,7 +30,6 @@ TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from a LiDAR's axes to a
 @pytest.mark.parametrize("rectified", [True, False])
 def test_edges_say_whether_an_image_is_rectified(rectified: bool, tmp_path: Path) -> None:
     right = read_calibration(STREET / "calib.txt")
-    assert right.scanner is not None
     image, scan, calib = STREET / "rgb.png", STREET / "000000.bin", tmp_path / "camera_info.yaml"
     if not rectified:  # as the raw camera would have seen it
         xy = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), -1).astype(np.float32)
@@ -43,7 +42,6 @@ def test_edges_say_whether_an_image_is_rectified(rectified: bool, tmp_path: Path
     lines = [f"{name}: {values.ravel().tolist()}\n" for name, values in numbers.items()]
     calib.write_text("".join([*lines, "distortion_model: plumb_bob\n"]))
     camera = read_scan_points(scan, ScanOptions(calib=calib), SIZE, image).camera
-    assert camera is not None
     np.testing.assert_array_equal(camera.intrinsics, right.camera.intrinsics if rectified else K)
     assert camera.has_lens is not rectified
     blind = read_scan_points(scan, ScanOptions(calib=calib), SIZE)  # raw is said to be assumed
@@ -53,14 +51,12 @@ def test_edges_say_whether_an_image_is_rectified(rectified: bool, tmp_path: Path
 @pytest.mark.parametrize("to_rectified", [True, False])
 def test_edges_say_whether_transforms_lead_to_the_rectified_camera(to_rectified: bool) -> None:
     right = read_calibration(STREET / "calib.txt")
-    assert right.scanner is not None
     turn = Extrinsics(Rotation.from_euler("xyz", [3, 4, 0], degrees=True).as_matrix(), np.zeros(3))
     scanner = right.scanner if to_rectified else turn.inverse() @ right.scanner
     cameras = {"P and R": (right.camera, turn), "P": (right.camera, SAME_PLACE)}
     raw = Calibration(camera=Camera(intrinsics=K), scanner=scanner, rectified=cameras)
     frames = [(read_rgb(STREET / "rgb.png").values, read_scan(STREET / "000000.bin")[0])]
     chosen, _ = choose_camera(raw, frames, "/front/image_rect")
-    assert chosen.scanner is not None
     np.testing.assert_allclose(chosen.scanner.rotation, right.scanner.rotation, atol=1e-9)
 
 
@@ -124,9 +120,7 @@ def test_the_wrong_direction_of_a_real_scan_is_recognised(shared_data: Path) -> 
     folder = shared_data / "kitti_object"
     for path in sorted((folder / "calib").glob("*.txt")):
         scan = read_scan(folder / "velodyne" / f"{path.stem}.bin")[0]
-        calibration = read_calibration(path)
-        camera, right = calibration.camera, calibration.scanner
-        assert right is not None
+        camera, right = read_calibration(path).camera, read_calibration(path).scanner
         portrait = Camera(intrinsics=np.array([[700.0, 0, 180], [0, 700, 600], [0, 0, 1]]))
         assert check_direction(scan, camera, right, (375, 1242)) == []
         assert check_direction(scan, portrait, right, (1242, 375)) == []

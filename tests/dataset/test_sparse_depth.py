@@ -12,7 +12,7 @@ from PIL import Image
 
 from pnpdepth_cli.dataset.arrays import camera_of_file
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
@@ -60,7 +60,6 @@ def test_depth_is_in_model_units_or_with_a_scale_in_metres(
     record = refine(project, unit_scale=unit_scale)
     metric = unit_scale is not None
     assert (record.unit, record.settings["align"]) == (unit, "none" if metric else "scale")
-    assert record.points is not None
     factor = unit_scale or 1.0
     assert 3.4 < record.points.nearest / factor < record.points.farthest / factor < 4.6
     scale = read_depth(project / "out/a_depth.png").reading.scale
@@ -177,17 +176,12 @@ def test_each_registered_photo_of_the_largest_model_is_a_frame(project: Path) ->
 CALIB = "K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\n"
 
 
-def camera_of(record: FrameRecord) -> CameraRecord:
-    assert record.camera is not None
-    return record.camera
-
-
 def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDisk) -> None:
     calib = frame.folder / "k.txt"
     calib.write_text(f"{CALIB}distortion: [-0.1, 0, 0, 0]\n")
     record = run(frame, scan=ScanOptions(calib=calib))
-    assert camera_of(record).intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
-    assert camera_of(record).distortion == [-0.1, 0, 0, 0]
+    assert record.camera.intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
+    assert record.camera.distortion == [-0.1, 0, 0, 0]
     calib.write_text(f"{CALIB}size: [64, 48]\n")
     with pytest.raises(SizeError, match=r"\b64×48"):
         run(frame, scan=ScanOptions(calib=calib), overwrite=True)
@@ -199,7 +193,7 @@ def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: Frame
     exif[0x8769] = {0xA405: 26}
     opened.save(photo, exif=exif)
     record = run(replace(frame, image=photo), view_3d=True)
-    assert " 26 mm" in camera_of(record).source
+    assert " 26 mm" in record.camera.source
     assert any("no distortion (EXIF" in note for note in record.notes)
 
 
@@ -208,7 +202,7 @@ def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
     frame, calib = frame_on_disk(tmp_path, 60, 80), tmp_path / "k.txt"
     calib.write_text(CALIB)
     record = run(frame, part=part, scan=ScanOptions(calib=calib))
-    camera, _ = camera_of(record).read()
+    camera, _ = record.camera.read()
     whole, _ = camera_of_file(calib, None, (60, 80))
     xy = np.array([[33.0, 41.0], [50.0, 47.0]])
     rays = unproject(whole, xy, np.ones(2))
@@ -223,4 +217,4 @@ def test_a_batch_records_the_cameras_of_its_frames(tmp_path: Path) -> None:
         (root / "calib.txt").write_text(CALIB.replace("50", focal_px))
         assert done(root) == ["a"]
     record = FrameRecord.read(root / "out/a.json")
-    assert camera_of(record).intrinsics[0][0] == 60
+    assert record.camera.intrinsics[0][0] == 60

@@ -84,8 +84,6 @@ def test_merged_clouds_have_one_mean_point_per_voxel() -> None:
     assert len(merged.xyz) == len(np.unique(cells, axis=0))
     first = (cells == np.floor(merged.xyz[0] / 0.5)).all(axis=1)
     assert merged.xyz[0] == pytest.approx(every.xyz[first].mean(axis=0), abs=1e-6)
-    assert merged.rgb is not None
-    assert every.rgb is not None
     assert merged.rgb[0] == pytest.approx(every.rgb[first].mean(axis=0), abs=0.51)
 
 

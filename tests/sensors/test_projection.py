@@ -134,7 +134,6 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
 def test_points_of_the_wall_within_the_boards_are_occluded(tmp_path: Path) -> None:
     points = boards_before_a_wall()
     hidden = occluded_in_map(points)
-    assert hidden is not None
     assert points.depth[hidden].min() > 19  # the foreground itself stays
     between = interleaved(as_depth_image(points))
     column, row = points.xy.astype(int).T
@@ -163,7 +162,6 @@ def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: 
         gt = read_depth(path.parents[1] / "groundtruth" / path.name).values
         points, _ = read_sparse(path)
         hidden = occluded_in_map(points)
-        assert hidden is not None
         true_depth = gt[tuple(points.xy.astype(int).T[::-1])]
         agrees = np.abs(points.depth - true_depth) <= 0.1 * true_depth
         known = true_depth > 0
@@ -171,7 +169,6 @@ def test_kittis_maps_are_recognised_and_its_filtered_scans_are_not(shared_data: 
         assert hidden[known & ~agrees].mean() > 0.4
     folder = shared_data / "kitti_object"
     calibration = read_calibration(folder / "calib" / "000001.txt")
-    assert calibration.scanner is not None
     scan, _ = read_scan(folder / "velodyne" / "000001.bin")
     filtered = project_velodyne(scan, calibration.camera, calibration.scanner, (375, 1242))
     assert occluded_in_map(points_of(as_depth_image(filtered))) is None

@@ -38,7 +38,6 @@ from tests.data_sets import (
     touch,
     tree,
     tum,
-    video,
 )
 
 AT_START = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))
@@ -226,11 +225,9 @@ def test_a_file_of_a_data_set_that_means_nothing_is_named(
 def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) -> None:
     BENCHMARKS[name][0](tmp_path)
     inputs = inputs_of(read_frames(tmp_path)[0], tmp_path)
-    assert inputs.gt is not None
     known = inputs.gt > 0
     np.testing.assert_allclose(inputs.gt[known], 2, rtol=1e-3)
     np.testing.assert_allclose(inputs.points.depth, 2, rtol=1e-3)
-    assert inputs.image is not None
     assert inputs.image.shape[:2] == inputs.gt.shape == inputs.points.size
     if name == "arkitscenes":  # whose low resolution keeps its points
         points = inputs.points
@@ -267,6 +264,8 @@ def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
         move_depth(tmp_path, depth, (4, 9))
     with pytest.raises(SizeError, match="90°"):
         move_depth(tmp_path, depth[:1], (4, 2))
+    with pytest.raises(SizeError, match=r"\b912×228"):  # a part of the frame
+        ODOMETRY_PART.apply(np.zeros((200, 1000)))
 
 
 def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path) -> None:
@@ -275,7 +274,6 @@ def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path)
     mask(tmp_path / "mask.png")
     (tmp_path / "list.csv").write_text("image,gt,mask,gt_size_ok\na.png,gt.png,mask.png,true\n")
     inputs = inputs_of(read_frames(tmp_path / "list.csv")[0], tmp_path)
-    assert inputs.gt is not None
     assert int((inputs.gt > 0).sum()) == HEIGHT * WIDTH // 2
     np.save(tmp_path / "mask.npy", np.arange(25).reshape(5, 5, 1) % 2)
     kept = apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.npy",))
@@ -313,11 +311,6 @@ def test_an_unknown_folder_or_layout_is_named(
         list_frames(tmp_path / root, name)
 
 
-def test_a_frame_that_is_smaller_than_its_part_is_refused() -> None:
-    with pytest.raises(SizeError, match=r"\b912×228"):
-        ODOMETRY_PART.apply(np.zeros((200, 1000)))
-
-
 @pytest.mark.parametrize(("make", "confident"), [(stray_scanner, 0.75), (record3d, 1.0)])
 def test_a_phones_recording_is_a_frame(
     make: Callable[[Path], None], confident: float, tmp_path: Path
@@ -326,11 +319,8 @@ def test_a_phones_recording_is_a_frame(
     frame = read_frame(read_frames(tmp_path)[2], ReadOptions())
     assert len(frame.points) == confident * HEIGHT * WIDTH / 4
     np.testing.assert_allclose(frame.points.depth, 2)
-    assert frame.image is not None
     assert frame.image.shape[:2] == frame.points.size == (HEIGHT, WIDTH)
-    assert frame.camera is not None
     assert frame.camera.intrinsics.tolist() == [[30, 0, WIDTH / 2], [0, 30, 12], [0, 0, 1]]
-    assert frame.pose is not None
     np.testing.assert_allclose(frame.pose, [[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 0]])
 
 
@@ -338,15 +328,11 @@ def test_each_frame_of_a_video_belongs_to_the_depth_of_its_number(tmp_path: Path
     stray_scanner(tmp_path, 12)
     frames = read_frames(tmp_path)
     for number in (11, 2, 3, 0):
-        image = read_frame(frames[number], ReadOptions()).image
-        assert image is not None
-        np.testing.assert_allclose(image.mean(), (20 + 15 * number) / 255, atol=0.02)
-
-
-def test_depth_maps_smaller_than_images_are_millimetres(tmp_path: Path) -> None:
-    stray_scanner(tmp_path / "phone")
-    (tmp_path / "phone/depth").rename(tmp_path / "sparse")
-    video(tmp_path / "rgb.mov", [90, 90, 90])
+        level = read_frame(frames[number], ReadOptions()).image.mean()
+        np.testing.assert_allclose(level, (20 + 15 * number) / 255, atol=0.02)
+    # as pairs, whose depth maps are smaller than the images, and so in millimetres
+    (tmp_path / "depth").rename(tmp_path / "sparse")
+    (tmp_path / "rgb.mp4").rename(tmp_path / "rgb.mov")
     frame = read_frame(read_frames(tmp_path, "pairs")[1], ReadOptions())
     np.testing.assert_allclose(frame.points.depth, 2)
     assert frame.sources["sparse"].assumed
