@@ -53,11 +53,6 @@ def imported_modules(file: Path) -> frozenset[str]:
     return frozenset(modules)
 
 
-def tops(file: Path) -> set[str]:
-    """The packages that a file imports from."""
-    return {name.split(".")[0] for name in imported_modules(file)}
-
-
 def packages_imported(file: Path) -> set[str]:
     parts = (name.split(".") for name in imported_modules(file))
     return {p[1] for p in parts if p[0] == "pnpdepth_cli" and len(p) > 1 and p[1] in MAY_IMPORT}
@@ -84,15 +79,19 @@ def test_a_network_file_knows_nothing_of_the_program_but_the_definition_contract
         assert all(name.startswith("pnpdepth_cli.models.definition") for name in ours), file
 
 
-def test_a_library_is_imported_only_where_it_belongs() -> None:
+@pytest.mark.parametrize(
+    ("libraries", "folders"),
+    [
+        ("click rich tqdm", {*MAY_IMPORT} - {"cli"}),
+        ("torch", {"io", "sensors"}),
+        ("cv2", {"core", "models"}),
+        ("numpy", {"core"}),
+    ],
+)
+def test_a_library_is_imported_only_where_it_belongs(libraries: str, folders: set[str]) -> None:
     for file in PACKAGE.rglob("*.py"):
-        for libraries, folders in (
-            ({"click", "rich", "tqdm"}, {*MAY_IMPORT} - {"cli"}),
-            ({"torch"}, {"io", "sensors"}),
-            ({"cv2"}, {"core", "models"}),
-            ({"numpy"}, {"core"}),
-        ):
-            assert file.relative_to(PACKAGE).parts[0] not in folders or not tops(file) & libraries
+        tops = {name.split(".")[0] for name in imported_modules(file)}
+        assert file.relative_to(PACKAGE).parts[0] not in folders or not tops & {*libraries.split()}
 
 
 def imports_nothing_of(heavy: str, code: str, *arguments: str) -> str:
@@ -156,11 +155,7 @@ def test_few_functions_lie_between_the_command_and_equation_3(
 def test_a_name_is_a_place() -> None:
     """No two classes, and no two files but `__init__`, have one name."""
     files = sorted(PACKAGE.rglob("*.py"))
-    classes = [
-        node.name
-        for file in files
-        for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, ast.ClassDef)
-    ]
-    for names in (classes, [file.stem for file in files if file.stem != "__init__"]):
-        assert [name for name, count in Counter(names).items() if count > 1] == []
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    classes = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
+    modules = Counter(file.stem for file in files if file.stem != "__init__")
+    assert [name for name, count in [*classes.items(), *modules.items()] if count > 1] == []

@@ -26,6 +26,9 @@ def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -
     assert budget().max_file_bytes == 1 << 30
     assert budget().max_image_bytes == 8 * budget().max_pixels
     assert budget().max_decoded_bytes > 32 * budget().max_pixels
+    # A small file may hold an image of one colour, but not any number of values.
+    assert budget().max_values_from(1) == 1 << 25
+    assert budget().max_values_from(1 << 20) == min(budget().max_pixels, 1032 << 20)
 
 
 def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:
@@ -34,8 +37,3 @@ def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:
         check_claim("a has bytes", -1, 5, way_out="make it smaller")
     with pytest.raises(ModelError):
         check_claim("a has 6 bytes", 6, 5, error=ModelError)
-
-
-def test_a_small_file_may_hold_an_image_of_one_colour_but_not_any_number_of_values() -> None:
-    assert budget().max_values_from(1) == 1 << 25
-    assert budget().max_values_from(1 << 20) == min(budget().max_pixels, 1032 << 20)

@@ -40,7 +40,7 @@ def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_th
         table["scanss"]
 
 
-def test_every_name_is_implemented_in_the_order_of_the_list() -> None:
+def test_every_name_is_implemented_in_the_order_of_the_list_and_a_format_has_its_suffixes() -> None:
     for names, implemented in (
         (choices.LOSSES, losses.TABLE),
         (choices.UPDATES, update_rules.TABLE),
@@ -52,9 +52,5 @@ def test_every_name_is_implemented_in_the_order_of_the_list() -> None:
     ):
         assert tuple(names) == tuple(implemented)
     assert choices.LOSSES["l1"] is losses.TABLE["l1"]
-
-
-def test_every_format_has_a_file_name_made_of_its_own_name() -> None:
     for name, depth_format in choices.FORMATS.items():
-        assert f".{name}" in depth_format.suffixes
-        assert set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)
+        assert {f".{name}"} <= set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)

@@ -21,6 +21,7 @@ NAN, INF = math.nan, math.inf
 
 
 def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
+    assert Settings(lr="1e-2") == Settings(lr=0.01)
     assert Settings().closed() == PAPER.closed() == ClosedSettings()
     paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
     assert paper == (5, 0.01, "l1", "sign", "none")
@@ -33,9 +34,7 @@ def test_what_the_user_leaves_open_is_the_networks_and_then_the_papers() -> None
     plain = ModelDefinition(name="plain", input_kind="rgb", size=Multiple(8), build=nn.Identity)
     stranger = replace(plain, defaults=UNTUNED_DEFAULTS)
     assert resolve_settings(plain, Settings()) == PAPER.closed()
-    settings = resolve_settings(stranger, Settings())
-    for name in ("iterations", "lr", "loss", "update", "schedule", "blur"):
-        assert getattr(settings, name) == getattr(UNTUNED_DEFAULTS, name)
+    assert resolve_settings(stranger, Settings()) == UNTUNED_DEFAULTS.over(PAPER).closed()
     # another update rule than the network's resets its step
     settings = resolve_settings(stranger, Settings(update="sign"))
     assert (settings.lr, settings.schedule, settings.blur) == (0.01, "constant", 0)
@@ -82,4 +81,3 @@ def test_those_steps_are_taken_that_refinement_takes(lr: Any) -> None:
             Settings(lr=lr)
     else:
         assert step_size(Settings(lr=lr).lr, torch.arange(8.0)) == step
-        assert Settings(lr="1e-2") == Settings(lr=0.01)

@@ -12,9 +12,11 @@ from pnpdepth_cli.cli.main import run
 from tests.commands.frames import FrameOnDisk
 
 
-def test_layers_says_why_a_layer_cannot_be_cut_at(
+def test_networks_are_listed_and_layers_with_why_one_cannot_be_cut_at(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert run(["models"]) == 0
+    assert {"sparse2dense-kitti", "sparse2dense-tiny"} <= set(capsys.readouterr().out.split())
     arguments = ["layers", "--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     assert run([*arguments, "--json", "--all"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
@@ -43,11 +45,6 @@ def test_an_onnx_file_is_refined_and_checked(
     checked = json.loads(capsys.readouterr().out)
     assert set(checked["layers"].values()) == {"ok"}
     assert any("rgb range 'unit' is assumed" in note for note in checked["notes"])
-
-
-def test_networks_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["models"]) == 0
-    assert {"sparse2dense-kitti", "sparse2dense-tiny"} <= set(capsys.readouterr().out.split())
 
 
 def test_doctor_reports_versions_what_is_missing_and_a_refined_plane(

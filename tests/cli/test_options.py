@@ -1,4 +1,4 @@
-"""Options of the commands: in groups of the help, few, and each said once."""
+"""Options of the commands: in groups of the help, and few."""
 
 from __future__ import annotations
 
@@ -58,18 +58,6 @@ def test_no_command_has_too_many_options_and_none_but_vary_holds_others_in_its_v
     assert sum(map(len, options.values())) + len(own_options(cli)) <= MOST_IN_ALL
     found = [option for each in options.values() for option in each.values()]
     assert [o.name for o in found if "NAME=VALUE" in f"{o.metavar} {o.help}"] == ["vary"]
-
-
-def test_options_of_one_name_say_the_same_thing_in_every_command() -> None:
-    texts: dict[str, set[str | None]] = {}
-    for each in COMMANDS.values():
-        for name, option in own_options(each).items():
-            texts.setdefault(name, set()).add(option.help)
-    own = {
-        *("--output", "--image", "--calib", "--poses", "--html", "--csv", "--latex", "--protocol"),
-        *("--model", "--max-depth", "--columns"),
-    }
-    assert {name for name, helps in texts.items() if len(helps) > 1} <= own
 
 
 def test_every_field_of_a_request_has_one_name_and_its_option_is_one_of_batch() -> None:

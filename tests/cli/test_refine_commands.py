@@ -44,16 +44,12 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     assert "\x1b" not in err
 
 
-def test_ray_without_an_address_is_this_machine_and_is_imported_only_to_run(
+def test_ray_without_an_address_is_this_machine_and_nothing_to_do_needs_neither_it_nor_torch(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert [run(arguments(*more)) for more in ((), ("--ray",))] == [0, 0]
     assert run(arguments("--ray", "--seed", "1")) == 2
-
-
-def test_a_run_with_nothing_to_do_needs_no_torch(root: Path) -> None:
-    assert run(arguments()) == 0
     code = (
         "import sys\nfrom pnpdepth_cli.cli.main import run\n"
         "sys.exit(run(sys.argv[1:]) or 'torch' in sys.modules)"
@@ -129,11 +125,11 @@ def test_the_default_method_the_number_of_points_networks_and_switches_can_be_va
     root: Path,
 ) -> None:
     batch = ["batch", "drive", "-o", "out", "--limit", "1"]
-    varied = ["--vary", "method=fused,paper", "--vary", "sample=20,10%"]
-    assert run([*batch, *NETWORK, *varied]) == 0
+    assert run([*batch, *NETWORK, "--vary", "method=fused,paper", "--vary", "sample=20,10%"]) == 0
     fixed = {name: each["fixed_by"] for name, each in summaries().items()}
-    assert [fixed[f"method=fused,sample={n}"] for n in ("20", "10%")] == [""] * 2
-    assert [fixed[f"method=paper,sample={n}"] for n in ("20", "10%")] == ["--method paper"] * 2
+    methods = {"fused": "", "paper": "--method paper"}
+    expected = {f"method={m},sample={n}": by for m, by in methods.items() for n in ("20", "10%")}
+    assert fixed == expected
     varied = ["--vary", "model=eigen-tiny,fcrn-tiny", "--vary", "uncertainty=on,off"]
     assert run([*batch, "--iterations", "0", *varied]) == 0
 
