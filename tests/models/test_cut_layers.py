@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models import cut_layers
 from pnpdepth_cli.models.cut_layers import (
     best_layer,
     default_layer,
@@ -97,17 +96,15 @@ def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
     assert wanted_field((100, 400), 10_000) == 50
 
 
-def test_few_points_want_a_deep_layer_and_many_a_late_one(
-    network: Network, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cut_layers, "LEAST_FRACTION", 0.0)
-    image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
-    assert best_layer(network, (image,), (64, 96), 20) == "0"
-    assert best_layer(network, (image,), (1, 1), 36) == "2"
-    assert best_layer(network, (image,), (64, 96), 0) is None
+def test_few_points_want_a_deep_layer_and_many_a_late_one(network: Network) -> None:
+    assert best_layer(network, (IMAGE,), (32, 48), 20) == "0"
+    assert best_layer(network, (IMAGE,), (1, 1), 36) == "2"
+    assert best_layer(network, (IMAGE,), (32, 48), 0) is None
 
 
-def test_the_default_is_the_definitions_layer_else_the_best_one(network: Network) -> None:
+def test_the_default_is_the_definitions_layer_else_the_best_or_the_first(network: Network) -> None:
     assert default_layer(network, (160, 192), 50) == "0"
+    first = replace(network.definition, layers=("2",))
+    assert default_layer(replace(network, definition=first), (160, 192), 50) == "2"
     named = replace(network.definition, defaults=Settings(layer="2"))
     assert default_layer(replace(network, definition=named), (160, 192), 50) == "2"

@@ -14,11 +14,10 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.definition import Fixed, Near
-from pnpdepth_cli.models.frame_map import FrameMap
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Near
+from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 from tests.models.weights.files import little
 
@@ -58,23 +57,23 @@ def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
     return folder
 
 
+def prepared(folder: Path, processing: dict[str, Any]) -> ModelDefinition:
+    (folder / "preprocessor_config.json").write_text(json.dumps(processing))
+    return hf_definition(folder)
+
+
 def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_path: Path) -> None:
     folder = described(tmp_path / "a", "depth_anything")
     assert hf_definition(folder).size == Near(of=14, height=56, width=56)
     definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
     assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
     assert hf_definition(described(tmp_path / "d", "dpt")).size == Fixed(64, 64)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
-    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 5, 9).network == (294, 518)
 
 
 @pytest.mark.parametrize(
     ("processing", "size"),
     [
         ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
-        ({"size": {"height": 1, "width": 1 << 16}}, Fixed(1, 1 << 16)),
-        ({"size": 56, "keep_aspect_ratio": True}, Near(of=32, height=56, width=56)),
         ({**ASPECT, "size": 9, "ensure_multiple_of": 1 / 64}, Near(of=64, height=9, width=9)),
         ({"do_resize": False, "size": 56}, Near(of=32)),
         ({"size_divisor": 1 << 16}, Near(of=1 << 16)),
@@ -83,16 +82,18 @@ def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_
 def test_the_size_is_fixed_or_near_one_or_a_multiple(
     processing: dict[str, Any], size: Fixed | Near, folder: Path
 ) -> None:
-    (folder / "preprocessor_config.json").write_text(json.dumps(processing))
-    assert hf_definition(folder).size == size
+    assert prepared(folder, processing).size == size
+
+
+def test_a_size_near_one_is_that_of_transformers() -> None:
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
+    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
 
 
 @pytest.mark.parametrize(
     ("processing", "mean", "std"),
     [
-        ({}, 0.0, 1.0),
         ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
-        ({"image_mean": [0.25] * 3, "image_std": [0.2] * 3}, 0.25, 0.2),
         ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
         ({"image_mean": [51] * 3, "image_std": [102] * 3, "do_rescale": False}, 0.2, 0.4),
     ],
@@ -100,9 +101,7 @@ def test_the_size_is_fixed_or_near_one_or_a_multiple(
 def test_normalisation_is_that_of_an_image_from_0_to_1(
     processing: dict[str, Any], mean: float, std: float, folder: Path
 ) -> None:
-    text = json.dumps({"size_divisor": 32} | processing)
-    (folder / "preprocessor_config.json").write_text(text)
-    normalisation = hf_definition(folder).normalisation
+    normalisation = prepared(folder, {"size_divisor": 32} | processing).normalisation
     assert normalisation is not None
     assert normalisation.mean == pytest.approx((mean,) * 3)
     assert normalisation.std == pytest.approx((std,) * 3)
@@ -120,29 +119,25 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
         (folder / "config.json").write_text(text)
         with pytest.raises(ModelError, match=str(folder)):
             hf_definition(folder)
-    (folder / "config.json").unlink()
-    with pytest.raises(ModelError):
-        hf_definition(folder)
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"size_divisor": "x"},
+        {"size_divisor": (1 << 16) + 1},
+        {"size_divisor": 1 / ((1 << 16) + 1)},
         {"rescale_factor": 0},
         {"do_normalize": True, "image_std": [10**400] * 3},
         {"size": {"height": "x", "width": 3}},
-        *({"size": size} for size in (0, (1 << 16) + 1, 56.0)),
-        *({"size_divisor": side} for side in (-1, (1 << 16) + 1, 1 / ((1 << 16) + 1), 1.0)),
+        {"size": 0},
     ],
 )
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
     change: dict[str, Any], folder: Path
 ) -> None:
-    settings = change if "size" in change else {"size_divisor": 32} | change
-    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
     with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
-        hf_definition(folder)
+        prepared(folder, change)
     assert "\n" not in str(error.value)
 
 
@@ -229,16 +224,10 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
         monkeypatch.setattr(owner, function, None)  # a call raises
     network = load_network(str(saved(tmp_path / name, name)), None)
     definition = network.definition
-    assert definition.layers
     frame = FrameMap.fit(definition.size, 60, 90)
-    chosen = torch.randperm(60 * 90, generator=torch.Generator().manual_seed(0))[:100]
-    points = SparsePoints(
-        xy=torch.stack([chosen % 90, chosen // 90], dim=1).float(),
-        depth=1 + 3 * (chosen // 90).float() / 60, size=(60, 90),
-    )  # fmt: skip
+    _, points, _ = synthetic_frame(frame.image)
     at = frame.points_to_network(points)
-    rgb = torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0))
-    arguments = network.arguments_of(network.image_of(frame, rgb), at)
+    arguments = network.synthetic_arguments(frame)
     with torch.no_grad():
         whole = network.raw_of(network.module(*arguments))
     metric = definition.output_scale == "metric"
@@ -262,8 +251,7 @@ def test_a_folder_loads_lists_layers_and_refines_without_network_access(
         ({"hidden_sizes": [8, 8, 16, 1_000_000]}, "describes a larger network than its weights"),
         ({"decoder_hidden_size": 4}, "raises|its weights leave"),
         ({"_attn_implementation": "org/kernel"}, "may fetch and run code"),
-        ({"attn_implementation": {"backbone_config": "org/kernel"}}, "may fetch and run code"),
-        ({"x": {"_attn_implementation_internal": "flash_attention_2"}}, "may fetch and run code"),
+        ({"x": {"attn_implementation": {"backbone": "org/kernel"}}}, "may fetch and run code"),
     ],
 )
 def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(

@@ -20,7 +20,7 @@ from onnx import helper, numpy_helper
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Multiple
-from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.onnx.operators import OPERATORS
 from tests.models.onnx.onnx_files import write_network
 from tests.models.weights.files import little
@@ -28,6 +28,9 @@ from tests.models.weights.files import little
 
 def image(*shape: int) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(0))
+
+
+IMAGE = image(1, 3, 32, 48)
 
 
 def refused(path: Path, spec: str | None = None) -> str:
@@ -46,28 +49,27 @@ def size_of(*sides: int) -> Any:
     return constant("n", list(sides))
 
 
-@pytest.mark.parametrize("channels_last", [False, True])
-def test_a_cut_at_any_node_gives_the_network_bit_for_bit(
-    tmp_path: Path, channels_last: bool
+def cut_everywhere(network: Network, x: torch.Tensor) -> torch.Tensor:
+    """The network's output, which is the same to the bit when it is cut at any node."""
+    with torch.no_grad():
+        whole: torch.Tensor = network.module(x)
+        for name, _ in network.module.named_children():
+            with Split(network.module, name) as split:
+                assert torch.equal(split.rear(split.front(x)), whole), name
+    return whole
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 32, 48), ("n", 3, "h", None), (1, 32, 48, 3)])
+def test_a_network_is_cut_at_any_node_bit_for_bit_and_agrees_with_onnxruntime(
+    shape: tuple[Any, ...], tmp_path: Path
 ) -> None:
-    shape = (1, 32, 48, 3) if channels_last else (1, 3, 32, 48)
-    path = write_network(tmp_path / "net.onnx", shape=shape, channels_last=channels_last)
+    last = shape[3] == 3
+    path = write_network(tmp_path / "net.onnx", shape=shape, channels_last=last)
     network = load_network(str(path), None)
     assert network.definition.layers[0] == "Relu_d"
-    module, x = network.module, image(*shape)
-    with torch.no_grad():
-        whole = module(x)
-        for name, _ in module.named_children():
-            with Split(module, name) as split:
-                assert torch.equal(split.rear(split.front(x)), whole), name
-
-
-@pytest.mark.parametrize("shape", [(1, 3, 32, 48), ("n", 3, "h", "w"), (1, 3, None, None)])
-def test_fixed_and_free_input_sizes_agree_with_onnxruntime(
-    tmp_path: Path, shape: tuple[object, ...]
-) -> None:
-    network = load_network(str(write_network(tmp_path / "net.onnx", shape=shape)), None)
-    assert "agrees with onnxruntime" in network.verify((image(1, 3, 32, 48),))[0]
+    x = image(1, 32, 48, 3) if last else IMAGE
+    cut_everywhere(network, x)
+    assert "agrees with onnxruntime" in network.verify((x,))[0]
 
 
 def test_an_incorrect_conversion_is_refused(
@@ -77,20 +79,16 @@ def test_an_incorrect_conversion_is_refused(
     monkeypatch.setitem(OPERATORS, "Resize", lambda node, options: right(node, options).flip(3))
     network = load_network(str(write_network(tmp_path / "net.onnx")), None)
     with pytest.raises(ModelError):
-        network.verify((image(1, 3, 32, 48),))
+        network.verify((IMAGE,))
 
 
-@pytest.mark.parametrize(("side", "multiple"), [(14, 14), (7, 32)])
-def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(
-    tmp_path: Path, side: int, multiple: int
-) -> None:
-    patch = {"kernel_shape": [side, side], "strides": [side, side]}
+def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(tmp_path: Path) -> None:
     nodes = (
-        constant("w", np.zeros((1, 1, side, side), np.float32)),
-        helper.make_node("Conv", ["depth", "w"], ["out"], **patch),
+        constant("w", np.zeros((1, 1, 14, 14), np.float32)),
+        helper.make_node("Conv", ["depth", "w"], ["out"], kernel_shape=[14] * 2, strides=[14] * 2),
     )
     path = write_network(tmp_path / "x.onnx", shape=(1, 3, "h", "w"), nodes=nodes, outputs=("out",))
-    assert load_network(str(path), None).definition.size == Multiple(multiple)
+    assert load_network(str(path), None).definition.size == Multiple(14)
 
 
 def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
@@ -123,19 +121,16 @@ def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None
     refused(path, f"{path}:x")
     for name in ("depth", "g"):
         network = load_network(f"{path}:{name}", None)
-        assert "agrees with onnxruntime" in network.verify((image(1, 3, 32, 48),))[0]
+        assert "agrees with onnxruntime" in network.verify((IMAGE,))[0]
 
 
 def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Path) -> None:
-    by = helper.make_tensor("value", 7, [4], [1, 1, 2, 2])
     nodes = (
         helper.make_node("Shape", ["depth"], ["shape"], "shape/read"),
-        helper.make_node("Constant", [], ["twice"], "shape/by", value=by),
+        constant("twice", [1, 1, 2, 2]),
         helper.make_node("Mul", ["shape", "twice"], ["size"], "shape/times"),
         helper.make_node("Resize", ["depth", "", "", "size"], ["big"], "big/up", mode="linear"),
-        helper.make_node("Shape", ["d"], ["coarse"], "shape/coarse"),
-        helper.make_node("Reshape", ["d", "coarse"], ["same"], "side/reshape"),
-        helper.make_node("GlobalAveragePool", ["same"], ["pooled"], "side/pool"),
+        helper.make_node("GlobalAveragePool", ["d"], ["pooled"], "side/pool"),
         helper.make_node("ReduceMean", ["pooled"], ["mean"], "side/mean", axes=[1]),
         helper.make_node("Add", ["big", "mean"], ["out"], "big/add"),
     )
@@ -144,27 +139,13 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     network = load_network(str(path), None)
     names = [name for name, _ in network.module.named_children()]
     # in the file's order, though the side's nodes could be run before
-    assert names[-5:] == ["big/up", "side/reshape", "side/pool", "side/mean", "big/add"]
+    assert names[-4:] == ["big/up", "side/pool", "side/mean", "big/add"]
     assert not any(name.startswith("shape/") for name in names)
     for height, width in ((32, 48), (64, 32)):
-        x = image(1, 3, height, width)
-        with torch.no_grad():
-            whole = network.module(x)
-            assert whole.shape[-2:] == (2 * height, 2 * width)
-            for name in names:
-                with Split(network.module, name) as split:
-                    assert torch.equal(split.rear(split.front(x)), whole), name
-    assert network.verify((image(1, 3, 32, 48),))
+        whole = cut_everywhere(network, image(1, 3, height, width))
+        assert whole.shape[-2:] == (2 * height, 2 * width)
     # on another device the sizes stay where Python reads them
-    assert network.module.to("meta")(image(1, 3, 32, 48).to("meta")).shape == (1, 1, 64, 96)
-
-
-def test_a_network_in_half_precision_is_refused(tmp_path: Path) -> None:
-    from onnxruntime.transformers.float16 import convert_float_to_float16
-
-    whole = onnx.load(write_network(tmp_path / "net.onnx"))
-    onnx.save(convert_float_to_float16(whole, keep_io_types=True), tmp_path / "half.onnx")
-    assert "float32" in refused(tmp_path / "half.onnx")
+    assert network.module.to("meta")(IMAGE.to("meta")).shape == (1, 1, 64, 96)
 
 
 # ------------------------------------------------------------------ files that mean harm
@@ -177,32 +158,46 @@ def edited(path: Path, change: Callable[[Any], object]) -> Path:
     return path
 
 
-def test_graphs_that_are_broken_are_refused_in_one_line(tmp_path: Path) -> None:
-    def read(name: str) -> Callable[[Any], None]:
-        return lambda model: model.graph.node[0].input.__setitem__(0, name)
-
-    refused(edited(tmp_path / "a.onnx", read("nowhere")))
-    for name in "ae":  # of this node itself, and of a later one
-        refused(edited(tmp_path / f"{name}.onnx", read(name)))
-    for dims in ([4], [-1], [2**62, 2**62], [2**62] * 20):
-
-        def change(model: Any, dims: list[int] = dims) -> None:
-            del model.graph.initializer[0].dims[:]
-            model.graph.initializer[0].dims.extend(dims)
-
-        refused(edited(tmp_path / "c.onnx", change))
+def reads(name: str) -> Callable[[Any], object]:
+    return lambda model: model.graph.node[0].input.__setitem__(0, name)
 
 
-BOMBS = {
-    "a constant": [
-        size_of(100_000, 100_000), helper.make_node("ConstantOfShape", ["n"], ["big"]),
+def claims(*dims: int) -> Callable[[Any], object]:
+    return lambda model: model.graph.initializer[0].dims.__setitem__(slice(None), dims)
+
+
+def has_function(model: Any) -> None:
+    call = helper.make_node("f", ["x"], ["y"], domain="own")
+    opsets = [helper.make_opsetid("own", 1)]
+    model.functions.append(helper.make_function("own", "f", ["x"], ["y"], [call], opsets))
+
+
+def has_half_precision(model: Any) -> None:
+    model.graph.initializer[0].data_type = onnx.TensorProto.FLOAT16
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        *((reads(name), "'enc/conv.1'") for name in ("nowhere", "a", "e")),
+        *((claims(*dims), "'w1'") for dims in ([4], [2**62] * 20)),
+        (has_function, "functions"),  # which may call each other without end
+        (has_half_precision, "float32"),
     ],
+)
+def test_graphs_that_are_broken_or_not_covered_are_refused(
+    change: Callable[[Any], object], message: str, tmp_path: Path
+) -> None:
+    assert message in refused(edited(tmp_path / "a.onnx", change))
+
+
+WORK = {
+    "a constant": [size_of(100_000, 100_000), helper.make_node("ConstantOfShape", ["n"], ["big"])],
     "constants": [
         constant("d0", [1.0]),
         *(helper.make_node("Concat", [f"d{n}"] * 2, [f"d{n + 1}"], axis=0) for n in range(34)),
         helper.make_node("Identity", ["d34"], ["big"]),
     ],
-    "Tile": [size_of(1, 1, 1000, 1000), helper.make_node("Tile", ["depth", "n"], ["big"])],
     "Resize": [
         constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
@@ -214,39 +209,31 @@ BOMBS = {
         helper.make_node("Reshape", ["long", "m"], ["a2"]),
         helper.make_node("MatMul", ["a1", "a2"], ["big"]),
     ],
-}  # fmt: skip
-
-
-WORK = {
-    "Conv": [
-        constant("n", [1, 1, 2048, 2048]),
-        helper.make_node("ConstantOfShape", ["n"], ["a1"]),
-        constant("m", [1, 1, 1024, 1024]),
-        helper.make_node("ConstantOfShape", ["m"], ["a2"]),
-        helper.make_node("Conv", ["a1", "a2"], ["big"]),
-    ],
-    "ReduceSum": [
+    "sums": [
         size_of(4096, 4096),
         helper.make_node("ConstantOfShape", ["n"], ["a1"]),
         *(helper.make_node("ReduceSum", ["a1"], [f"r{n}"], keepdims=0) for n in range(2000)),
         helper.make_node("Sum", [f"r{n}" for n in range(2000)], ["big"]),
     ],
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", [*BOMBS, *WORK])
+@pytest.mark.parametrize("kind", WORK)
 def test_far_more_memory_or_arithmetic_than_networks_have_is_refused_before(
     kind: str, tmp_path: Path
 ) -> None:
-    tail = [
+    tail = (
         helper.make_node("ReduceSum", ["big"], ["small"], keepdims=0),
-        helper.make_node("Cast", ["small"], ["number"], to=1),
-        helper.make_node("Mul", ["depth", "number"], ["out"]),
-    ]
-    nodes = (*(BOMBS | WORK)[kind], *tail)
-    path = write_network(tmp_path / "x.onnx", nodes=nodes, outputs=("out",))
+        helper.make_node("Mul", ["depth", "small"], ["out"]),
+    )
+    path = write_network(tmp_path / "x.onnx", nodes=(*WORK[kind], *tail), outputs=("out",))
     with little(megabytes=500, seconds=4):
         refused(path)
+
+
+def test_an_image_size_beyond_the_budget_is_refused(tmp_path: Path) -> None:
+    with little():
+        assert "pixels" in refused(write_network(tmp_path / "x.onnx", shape=(1, 3, 10**6, 10**6)))
 
 
 def beside(path: Path, *, copies: int = 0, dims: Any = (8, 3, 3, 3), **entry: object) -> Path:
@@ -274,9 +261,9 @@ OUTSIDE = ["../secret.bin", "../../../../../../etc/passwd", "/etc/passwd", "link
     "entry",
     [
         *({"location": location} for location in OUTSIDE),
-        *({"offset": n} for n in (-4, 4, 2**62, 10**40, "x", "9" * 5000)),
+        *({"offset": n} for n in (-4, 4, 2**62, "x")),
         *({"length": n} for n in (-1, 4, 2**62)),
-        *({"dims": dims} for dims in ((2**31, 2**31), (8, 3, 3))),
+        {"dims": (2**31, 2**31)},
         {"copies": 1000},
     ],
     ids=lambda entry: f"{next(iter(entry.items()))}"[:40],
@@ -297,20 +284,5 @@ def test_weights_beside_the_model_are_those_of_one_file(tmp_path: Path) -> None:
     path = beside(tmp_path / "x.onnx", copies=1)
     (tmp_path / "one.onnx").write_bytes(onnx.load(str(path)).SerializeToString())
     files = (str(path), str(tmp_path / "one.onnx"))
-    one, two = (load_network(file, None).module(image(1, 3, 32, 48)) for file in files)
+    one, two = (load_network(file, None).module(IMAGE) for file in files)
     assert torch.equal(one, two)
-
-
-@pytest.mark.parametrize("sides", [(10**6, 10**6), (2**62, 2**62), (20_000, 20_000)])
-def test_an_image_size_beyond_the_budget_is_refused(sides: Any, tmp_path: Path) -> None:
-    with little():
-        assert "pixels" in refused(write_network(tmp_path / "x.onnx", shape=(1, 3, *sides)))
-
-
-def test_functions_are_refused_as_they_may_call_each_other_without_end(tmp_path: Path) -> None:
-    def add(model: Any) -> None:
-        call = helper.make_node("f", ["x"], ["y"], domain="own")
-        opsets = [helper.make_opsetid("own", 1)]
-        model.functions.append(helper.make_function("own", "f", ["x"], ["y"], [call], opsets))
-
-    assert "functions" in refused(edited(tmp_path / "a.onnx", add))

@@ -93,7 +93,7 @@ def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path, kind: str, how: str) -
     assert set(sys.modules) == before
 
 
-def archive_of(path: Path, pickled: bytes, storage: bytes = b"", **how: Any) -> Path:
+def archive_of(path: Path, pickled: bytes, storage: bytes, **how: Any) -> Path:
     with zipfile.ZipFile(path, "w", **how) as archive:
         archive.writestr("x/data.pkl", pickled)
         archive.writestr("x/data/0", storage)
@@ -117,23 +117,15 @@ def tensor_pickle(elements: int, shape: tuple[Any, ...], stride: tuple[int, ...]
     return real.getvalue()
 
 
-def nested_tuples(depth: int) -> bytes:
-    """Opcodes of a tuple that holds the one inside it twice, and that 1 twice, and so on."""
-    return b"K\x01" + b"q\x00h\x00\x86" * depth
-
-
-NESTED = nested_tuples(200)
+# opcodes of a tuple that holds the one inside it twice, and that 1 twice, and so on
+NESTED = b"K\x01" + b"q\x00h\x00\x86" * 200
 BOMBS = {
     "a tensor repeated by strides of 0": tensor_pickle(1, (10**12,), (0,)),
     "a tensor beyond its storage": tensor_pickle(1, (10**9,), (1,)),
     "a storage larger than stored": tensor_pickle(10**12, (10**12,), (1,)),
     "text longer than the file": b"\x80\x02X" + struct.pack("<I", 2**32 - 1) + b"a.",
-    "bytes longer than the file": b"\x80\x05\x96" + struct.pack("<Q", 2**62) + b"a.",
     "tuples, printed": b"\x80\x02" + NESTED + b".",
     "tuples as a key": b"\x80\x02}" + NESTED + b"K\x01s.",
-    "tuples as a key of a dict call": b"\x80\x02ccollections\nOrderedDict\n]("
-    + NESTED
-    + b"K\x01\x86e\x85R.",
     "tuples in a set": b"\x80\x04\x8f(" + NESTED + b"\x90.",
     "tuples as a storage": b"\x80\x02(X\x07\x00\x00\x00storage" + NESTED * 4 + b"tQ.",
     "a call for memory": b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe4\x0b\x54\x02\x85R.",
@@ -151,30 +143,10 @@ def test_a_small_pickle_takes_no_time_and_no_memory(kind: str, tmp_path: Path) -
 
 
 def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
-    path = archive_of(
-        tmp_path / "x.pt", pickle.dumps(1), b"\0" * 10**8, compression=zipfile.ZIP_DEFLATED
-    )
-    assert path.stat().st_size < 10**6
-    assert "compressed" in refused(path)
-
-
-@pytest.mark.parametrize(
-    "tensor",
-    [
-        torch.eye(3).to_sparse(),
-        torch.eye(3).to_sparse_csr(),
-        torch.empty(3, device="meta"),
-        torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8),
-        torch.zeros(1).expand(100_000, 100_000),
-    ],
-)
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_a_tensor_of_an_unusual_kind_or_size_is_refused(tensor: Any, tmp_path: Path) -> None:
-    state = {"layer.weight": tensor, "layer.bias": torch.ones(1)}
-    torch.save(state, tmp_path / "w.pt")
-    torch.save({"state_dict": state}, tmp_path / "inside.pt")
-    for name in ("w.pt", "inside.pt"):
-        refused(tmp_path / name)
+    packed = {"compression": zipfile.ZIP_DEFLATED}
+    path = archive_of(tmp_path / "x.pt", pickle.dumps(1), b"\0" * 10**8, **packed)
+    with little():
+        assert "compressed" in refused(path)
 
 
 # ------------------------------------------------------------------ numpy
@@ -190,17 +162,6 @@ PYTHON_2 = (
 """The pickle of an object array with a dict of dicts, as numpy wrote it under Python 2."""
 
 
-@pytest.mark.parametrize("protocol", [2, 3, 4])
-def test_a_pickled_dict_of_dicts_gives_its_arrays_to_the_bit(protocol: int, tmp_path: Path) -> None:
-    layer = {"weights": np.ones((7, 7, 3, 4), np.float32), "mean": np.arange(300.0)}
-    layers = {"conv1": layer, "alone": np.arange(6, dtype=np.int64)}
-    read = read_numpy_file(npy_of(tmp_path / "x.npy", pickled(layers, protocol)))
-    assert list(read) == ["conv1.weights", "conv1.mean", "alone"]
-    for tensor, array in zip(read.values(), (*layer.values(), layers["alone"]), strict=True):
-        assert torch.equal(tensor, torch.from_numpy(array))
-        assert tensor.is_contiguous()
-
-
 def test_a_dict_of_arrays_that_python_2_wrote_is_read(tmp_path: Path) -> None:
     path = npy_of(tmp_path / "x.npy", zlib.decompress(base64.b85decode(PYTHON_2)))
     arrays = read_numpy_file(path)
@@ -209,32 +170,31 @@ def test_a_dict_of_arrays_that_python_2_wrote_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("code", ["<f2", "<f4", "<f8", ">f4", ">i2", "|i1", "|u1", "<i4", "|b1"])
-def test_every_type_order_and_shape_is_read(code: str, tmp_path: Path) -> None:
+def test_arrays_of_every_type_order_and_shape_are_read_by_name(code: str, tmp_path: Path) -> None:
     base = np.arange(24).reshape(2, 3, 4).astype(np.dtype(code))
-    arrays = {"c": base, "fortran": np.asfortranarray(base), "turned": base.T, "part": base[:, 1:]}
-    arrays |= {"number": np.array(base[1, 1, 1]), "empty": base[:0]}
+    layer = {"fortran": np.asfortranarray(base), "turned": base.T, "part": base[:, 1:]}
+    arrays = {"conv": layer, "number": np.array(base[1, 1, 1]), "empty": base[:0]}
     read = read_numpy_file(npy_of(tmp_path / "x.npy", pickled(arrays)))
-    for name, array in arrays.items():
-        assert read[name].shape == array.shape
-        assert np.array_equal(read[name].numpy(), array)
+    assert list(read) == ["conv.fortran", "conv.turned", "conv.part", "number", "empty"]
+    for array, tensor in zip(
+        [*layer.values(), *list(arrays.values())[1:]], read.values(), strict=True
+    ):
+        assert tensor.shape == array.shape
+        assert np.array_equal(tensor.numpy(), array)
 
 
 @pytest.mark.parametrize(
     "content",
     [
         [1, 2],
-        "text",
-        {"a": 1},
         {"a": {"b": "text"}},
         {"a": np.array(["x", "y"])},
-        {"a": np.array([1 + 2j])},
         {"a": np.array([{}, 1], dtype=object)},
-        {"a": {"b": {"c": {"d": np.ones(1)}}}},
         RING,
         {"a": torch.nn.Identity()},
     ],
 )
-def test_other_contents_are_named(content: Any, tmp_path: Path) -> None:
+def test_what_is_no_dict_of_arrays_of_numbers_is_refused(content: Any, tmp_path: Path) -> None:
     refused(npy_of(tmp_path / "x.npy", pickled(content)))
 
 
@@ -253,8 +213,6 @@ def array_of(**replaced: Any) -> Any:
 
 ARRAY_BOMBS = {
     "a shape beyond the data": {"a": array_of(shape=(10**9,))},
-    "a shape that overflows": {"a": array_of(shape=(2**40, 2**40))},
-    "a negative shape": {"a": array_of(shape=(-1,))},
     "the same bytes as many arrays": {
         str(n): array_of(shape=(10**6,), data=data)
         for data in [b"\0" * 4 * 10**6]
