@@ -51,13 +51,10 @@ def built(definition: ModelDefinition) -> Network:
 def test_every_layer_can_be_cut_at_and_z_is_where_the_paper_has_it(name: str) -> None:
     network = built(find_definition(name))
     size = network.definition.size
-    height, width = (64, 96)
+    height, width = 64, 96
     if isinstance(size, Fixed) and name != "fcrn-tiny":
         height, width = size.height, size.width
-    elif not isinstance(size, Fixed):
-        height, width = (-(-side // size.of) * size.of for side in (64, 96))
-    frame = FrameMap.fit(Fixed(height, width), height, width)
-    arguments = network.synthetic_arguments(frame)
+    arguments = network.synthetic_arguments(FrameMap.fit(Fixed(height, width), height, width))
     assert network.definition.default_layer == CUTS[name][0]
     aligned = "auto" if name == "sfmlearner-tiny" else "none"
     assert network.definition.default_alignment == aligned

@@ -49,10 +49,9 @@ def test_every_kind_renders_a_full_scene_of_known_depth(kind: str) -> None:
     for frame in frames:
         assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
         assert frame.rgb.std() > 3
-        assert np.isfinite(frame.depth).all()
-        assert (frame.depth > 0).mean() > 0.3
-        assert frame.depth[frame.depth > 0].min() > 0.05
-        assert frame.depth.max() <= 120
+        known = frame.depth[frame.depth > 0]
+        assert known.size > 0.3 * HEIGHT * WIDTH
+        assert 0.05 < known.min() <= known.max() <= 120
         assert frame.kind == scenes.KINDS.index(kind)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,11 +39,11 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def losses(folder: Path) -> list[float]:
+def learned(folder: Path) -> bool:
     with (folder / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["step"]) for row in rows] == [4, 8]
-    return [float(row["loss"]) for row in rows]
+    return float(rows[1]["loss"]) < float(rows[0]["loss"])
 
 
 def test_a_run_of_compact_learns_and_going_on_gives_the_same_bytes(
@@ -53,19 +54,16 @@ def test_a_run_of_compact_learns_and_going_on_gives_the_same_bytes(
         size=(32, 64), save_every=4, pretrained=False, workers=0, lr=1e-2,
     )  # fmt: skip
     weights = train.train(whole).read_bytes()
+    assert learned(whole.out)
+    assert (whole.out / "val.csv").exists()
     # as a run killed right after step 4 leaves its folder
     broken = replace(whole, out=tmp_path / "broken")
     broken.out.mkdir()
     run = train.Run(broken)
-    for sample in train._loader(broken, 0):
+    for sample in itertools.islice(train._loader(broken, 0), 4):
         run.learn(sample)
-        if run.step == 4:
-            run.save()
-            break
+    run.save()
     assert train.train(replace(broken, resume=True)).read_bytes() == weights
-    first, second = losses(whole.out)
-    assert second < first
-    assert (whole.out / "val.csv").exists()
 
 
 class Toy(nn.Module):
@@ -105,5 +103,4 @@ def test_a_run_of_a_tiny_edition_learns_and_going_on_gives_the_same_bytes(
         run.learn(run.batch(number))
     run.save()
     assert tiny.train(TOY, RECIPE, replace(broken, resume=True)).read_bytes() == weights
-    first, second = losses(whole.out)
-    assert second < first
+    assert learned(whole.out)

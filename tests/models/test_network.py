@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,13 @@ from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, lo
 from pnpdepth_cli.points import SparsePoints
 
 
+def definition(**more: Any) -> ModelDefinition:
+    settings = {"input_kind": "rgb", "size": Multiple(1), "build": nn.Identity, "layers": ("",)}
+    return ModelDefinition(name="mine", **settings | more)
+
+
 def network(**more: Any) -> Network:
-    settings = {"name": "mine", "input_kind": "rgb", "size": Multiple(1), "build": nn.Identity}
-    settings |= {"layers": ("",)}
-    return load_network(ModelDefinition(**settings | more), None)
+    return load_network(definition(**more), None)
 
 
 def test_an_image_is_normalised_and_points_are_scattered() -> None:
@@ -82,53 +87,35 @@ def test_a_network_that_is_no_better_than_the_median_depth_is_named(
 
 # ------------------------------------------------------------------ loading
 
-FILE = """
-from pathlib import Path
-from torch import nn
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-OWN = Path(__file__).parent / "own.safetensors"
-def of(build, **more):
-    kind = {"name": "mine", "input_kind": "rgb", "size": Multiple(1), "layers": ("0",)}
-    return ModelDefinition(build=build, **kind, **more)
-definition = of(lambda: nn.Conv2d(1, 1, 1))
-owned = of(lambda: nn.Conv2d(1, 1, 1), checkpoint=OWN)
-empty = of(nn.Identity)
-built = of(nn.Conv2d(1, 1, 1))
-raising = of(lambda: 1 / 0)
-text = of(lambda: "text")
-"""
-
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "mine.py"
-    path.write_text(FILE)
-    weights = {"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}
-    save_file(weights, tmp_path / "own.safetensors")
-    return path
+def weights(tmp_path: Path) -> Path:
+    tensors = {"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}
+    save_file(tensors, tmp_path / "own.safetensors")
+    return tmp_path / "own.safetensors"
 
 
 def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_chance(
-    file: Path,
+    weights: Path,
 ) -> None:
-    own = file.parent / "own.safetensors"
-    for spec, checkpoint in ((f"{file}:owned", None), (str(file), own)):
+    bare = definition(build=lambda: nn.Conv2d(1, 1, 1))
+    owned = replace(bare, checkpoint=weights)
+    for spec, checkpoint in ((owned, None), (bare, weights)):
         loaded = load_network(spec, checkpoint)
         assert float(loaded.module.weight) == 3  # type: ignore[arg-type]
         assert not loaded.module.training
         assert not any(p.requires_grad for p in loaded.module.parameters())
-        assert loaded.checkpoint == own
-    own.unlink()
-    for spec in (str(file), f"{file}:owned"):
+        assert loaded.checkpoint == weights
+    weights.unlink()
+    for spec in (bare, owned):
         with pytest.raises(CheckpointError):
             load_network(spec, None)
-    assert load_network(f"{file}:empty", None).checkpoint is None  # has no weights
 
 
-@pytest.mark.parametrize("attribute", ["raising", "text", "built"])
-def test_a_build_that_raises_or_returns_no_module_is_refused(attribute: str, file: Path) -> None:
-    with pytest.raises(ModelError):
-        load_network(f"{file}:{attribute}", None)
+@pytest.mark.parametrize("build", [lambda: 1 / 0, lambda: "text", nn.Conv2d(1, 1, 1)])
+def test_a_build_that_raises_or_returns_no_module_is_refused(build: Callable[..., Any]) -> None:
+    with pytest.raises(ModelError, match="'mine'"):
+        load_network(definition(build=build), None)
 
 
 @pytest.mark.parametrize("name", ["cuda:99", "meta", "nonsense"])

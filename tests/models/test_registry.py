@@ -10,8 +10,6 @@ import torch
 
 import model_zoo_defs
 from pnpdepth_cli import choices
-from pnpdepth_cli.commands import networks
-from pnpdepth_cli.commands.networks import list_models
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import all_definitions, find_definition
@@ -48,17 +46,12 @@ def install(folder: Path, entry_points: str) -> None:
 
 
 @pytest.mark.parametrize("text", [ONE, SEVERAL])
-def test_one_new_file_in_model_zoo_defs_adds_a_network(
-    text: str, open_list: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_new_file_in_model_zoo_defs_adds_a_network(text: str, open_list: Path) -> None:
     stem = f"my_net{len(text)}"
     name = stem.replace("_", "-")
     (open_list / f"{stem}.py").write_text(text.replace("NAME", name))
     assert list(all_definitions())[-1] == name
     assert find_definition(name).build().out_channels == 1
-    mine = {name: all_definitions()[name]}
-    monkeypatch.setattr(networks, "all_definitions", lambda: mine)  # the others take long
-    assert [one["name"] for one in list_models()] == [name]
 
 
 def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> None:
@@ -77,7 +70,6 @@ def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> Non
     ("entry_point", "reason"),
     [
         ("theirs = missing_package:definition", "ModuleNotFoundError"),
-        ("theirs = os.path", "gives a NoneType"),
         ("theirs = os.path:sep", "gives a str"),
     ],
 )

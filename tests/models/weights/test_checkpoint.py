@@ -107,13 +107,6 @@ def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -
         loads(tmp_path / "w.pth", {})
 
 
-def test_the_tensors_of_a_whole_module_are_extracted_and_reported(tmp_path: Path) -> None:
-    torch.manual_seed(3)
-    torch.save(Net(), tmp_path / "w.pth")
-    (note,) = loads(tmp_path / "w.pth", weights())
-    assert note.startswith("checkpoint w.pth: its pickle names tests.models.weights")
-
-
 # ------------------------------------------------------------------ files that do not fit
 
 
