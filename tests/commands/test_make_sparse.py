@@ -32,8 +32,7 @@ def frame(tmp_path: Path) -> ScanOnDisk:
 
 def recorded(written: Written) -> dict[str, Any]:
     """The record beside what was written."""
-    content: dict[str, Any] = json.loads(written[2][0].with_suffix(".json").read_text())
-    return content
+    return dict(json.loads(written[2][0].with_suffix(".json").read_text()))
 
 
 def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:

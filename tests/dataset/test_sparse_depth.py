@@ -153,7 +153,7 @@ def test_points_behind_the_camera_are_counted_or_refused(project: Path) -> None:
 
 
 def test_images_of_mixed_cameras_have_each_their_own(project: Path) -> None:
-    cameras = project / "sparse" / "0" / "cameras.txt"
+    cameras = project / "sparse/0/cameras.txt"
     cameras.write_text(f"{cameras.read_text()}2 SIMPLE_PINHOLE 32 24 25 16.25 11.5\n")
     change(project, "images.txt", "2 1 0 0 0 0.1 0 0 1 b.png", "2 1 0 0 0 0.1 0 1 2 b.png")
     small = read(project, "b.png")

@@ -59,8 +59,6 @@ def test_a_lidar_of_ones_own_measures_known_depth_along_evenly_spaced_beams() ->
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)
 HOLES = np.where(np.random.default_rng(8).random((60, 80)) < 0.3, 0, DEPTH).astype(np.float32)
-
-
 BOARD = np.repeat(np.indices((60, 80, 1)).sum(axis=0) // 12 % 2, 3, axis=2).astype(np.float32)
 PLAIN = np.full((60, 80, 3), 0.5, np.float32)
 
