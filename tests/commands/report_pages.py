@@ -8,46 +8,35 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
-_DATA = re.compile(r'(?s)<script type="application/json" id="data">(.*?)</script>')
-
 
 def page_data(folder: Path) -> dict[str, Any]:
     """The data of the page's script, and the text of its head."""
     text = (folder / "index.html").read_text()
-    found = _DATA.search(text)
-    assert found
-    data: dict[str, Any] = json.loads(found[1])
-    head = text[: found.start()]
-
-    def pairs(element: str, first: str, second: str) -> list[tuple[str, ...]]:
-        (part,) = re.findall(f'(?s)id="{element}">(.*?)</[du]l>', head) or [""]
-        return _found(f"<{first}>(.*?)</{first}><{second}>(.*?)</{second}>", part)
-
+    head, script = text.split('<script type="application/json" id="data">')
+    data = json.loads(script.split("</script>")[0])
+    ((title,),) = _found('id="title">(.*?)<', head)
+    tables = re.findall('(?s)<table class="means">(.*?)</table>', head)
     return {
         **data["head"],
         "frames": data["frames"],
-        "title": unescape(re.findall('id="title">(.*?)<', head)[0]),
-        "facts": pairs("facts", "dt", "dd"),
-        "without": pairs("reasons", "strong", "span"),
-        "notes": re.findall("<li[^>]*>(.*?)</li>", head.split('id="notes">')[1].split("</ul>")[0]),
-        "tables": [
-            _table(each) for each in re.findall('(?s)<table class="means">(.*?)</table>', head)
-        ],
+        "title": title,
+        "facts": _found("<dt>(.*?)</dt><dd>(.*?)</dd>", head),
+        "without": _found("<strong>(.*?)</strong><span>(.*?)</span>", head),
+        "notes": [note for (note,) in _found("<li[^>]*>([^<]*)</li>", head)],
+        "tables": [_table(each) for each in tables],
     }
 
 
 def _found(pattern: str, text: str) -> list[tuple[str, ...]]:
-    return [tuple(map(unescape, each)) for each in re.findall(pattern, text)]
+    matches = re.finditer(pattern, text, re.DOTALL)
+    return [tuple(map(unescape, match.groups())) for match in matches]
 
 
 def _table(text: str) -> dict[str, Any]:
-    header, *rows = (
-        [unescape(cell) for cell in re.findall("<t[hd][^>]*>(.*?)</t[hd]>", row)]
-        for row in re.findall("(?s)<tr>(.*?)</tr>", text)
-    )
-    return {
-        "title": unescape(re.findall("<caption>(.*?)<", text)[0]), "header": header, "rows": rows
-    }  # fmt: skip
+    ((title,),) = _found("<caption>(.*?)<", text)
+    rows = re.findall("(?s)<tr>(.*?)</tr>", text)[1:]
+    cells = [_found("<t[hd][^>]*>(.*?)</t[hd]>", row) for row in rows]
+    return {"title": title, "rows": [[cell for (cell,) in row] for row in cells]}
 
 
 def frames_of(folder: Path) -> dict[str, dict[str, Any]]:

@@ -6,8 +6,6 @@ from dataclasses import replace
 from math import nan
 from typing import Any, Literal
 
-import pytest
-
 from pnpdepth_cli.commands.tables import (
     Table,
     change,
@@ -19,17 +17,19 @@ from pnpdepth_cli.commands.tables import (
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 
+CHANGES = [
+    (1.0, nan, "–", "dim"),
+    (0.0, 1.0, "–", "dim"),
+    (2.0, 2.0, "+0.0%", "dim"),
+    (1.0, 0.5, "-50.0%", "good"),
+    (1.0, 1.5, "+50.0%", "bad"),
+]
 
-@pytest.mark.parametrize(
-    ("before", "after", "text", "style"),
-    [(1.0, nan, "–", "dim"), (0.0, 1.0, "–", "dim"), (2, 2, "+0.0%", "dim"),
-     (1.0, 0.5, "-50.0%", "good"), (1.0, 1.5, "+50.0%", "bad")],
-)  # fmt: skip
-def test_a_change_is_relative_and_coloured_by_whether_it_is_better(
-    before: float, after: float, text: str, style: str
-) -> None:
-    cell = change(before, after)
-    assert (cell, cell.style) == (text, style)
+
+def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
+    for before, after, text, style in CHANGES:
+        cell = change(before, after)
+        assert (cell, cell.style) == (text, style)
 
 
 def record_of(*networks: str, **fields: Any) -> FrameRecord:
@@ -94,10 +94,8 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         "linear": {"mae": None, "frames": 3},
         "nearest": {"mae": 3.0, "rmse": 4.0, "frames": 3},
     }
-    errors, titles = (
-        {"ground_truth": stages, "used": stages},
-        stage_titles(record_of("net", weights={"net": 1.0})),
-    )
+    errors = {"ground_truth": stages, "used": stages}
+    titles = stage_titles(record_of("net", weights={"net": 1.0}))
     (table,) = means_tables(errors, "m", titles, ("mae", "rmse"))
     assert table.title == "means: errors against ground truth, 3 frames"
     assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
@@ -116,11 +114,10 @@ def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> No
 
 
 def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
-    afters = {
-        (1.0, 0.0): "net, residual propagated",
-        (0.0, 1.0): "fused (compact 100%)",
-        (0.25, 0.75): "fused (net 25%, compact 75%)",
-    }
-    for (net, compact), after in afters.items():
+    for net, compact, after in (
+        (1.0, 0.0, "net, residual propagated"),
+        (0.0, 1.0, "fused (compact 100%)"),
+        (0.25, 0.75, "fused (net 25%, compact 75%)"),
+    ):
         record = record_of("net", "compact", weights={"net": net, "compact": compact})
         assert names_of_depths(record) == ("net, aligned with the points", after)

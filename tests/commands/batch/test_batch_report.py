@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from pnpdepth_cli.commands.batch import batch_report as report_batch
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io.depth import read_depth
-from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk, refinement
+from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk
 from tests.commands.report_pages import everything, frames_of, page_data
 
 
@@ -43,25 +41,21 @@ def test_the_page_links_the_panels_that_a_frames_record_names_and_shows_their_er
         ("image", "preview", "Image"),
         ("map", "improvement", "Change of error"),
     ):
-        result = root / f"out/c_{kind}.png"
-        figure, shown = figures[kind], frame["views"][view]
+        result, shown = root / f"out/c_{kind}.png", frame["views"][view]
         assert (report / shown["src"]).samefile(result)
-        assert shown["box"] == figure["panels"][title]
-        assert shown["size"] == figure["size"] == list(cv2.imread(str(result)).shape[1::-1])
+        assert shown["box"] == figures[kind]["panels"][title]
+        assert shown["size"] == figures[kind]["size"] == [*Image.open(result).size]
     assert frame["scale_m"] == figures["preview"]["scale_m"]
     assert frame["map"]["footer"] == figures["improvement"]["footer"]
 
     batch(root, output=root / "plain", refine={"iterations": 0})
-    gt = read_depth(root / "gt/b.png").values
-    before, after = (
-        np.abs(read_depth(root / out / "b_depth.png").values - gt).mean()
-        for out in ("plain", "out")
+    gt, *depths = (
+        read_depth(root / f"{name}.png").values for name in ("gt/c", "plain/c_depth", "out/c_depth")
     )
-    values = frames_of(report)["b"]["values"]
-    assert values["mae_before"] == pytest.approx(before, abs=3e-3)  # the files are 16-bit
-    assert values["mae_after"] == pytest.approx(after, abs=3e-3)
-    assert values["mae_change"] == values["mae_after"] / values["mae_before"] - 1
-    assert values["mae_change"] != 0
+    errors = [np.abs(depth - gt).mean() for depth in depths]
+    before, after = (frame["values"][f"mae_{stage}"] for stage in ("before", "after"))
+    assert [before, after] == pytest.approx(errors, abs=3e-3)  # the files are 16-bit
+    assert frame["values"]["mae_change"] == after / before - 1 != 0
 
 
 def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what_changed(
@@ -75,9 +69,6 @@ def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what
     shutil.rmtree(report)
     assert done(root, html=report) == ["b", "d"]
     before, key = everything(report), {n: f["key"] for n, f in frames_of(report).items()}
-    (report / "images" / f"{key['b']}_preview.png").unlink()
-    batch(root, html=report)
-    assert before == everything(report)
 
     # a frame that is redone has new images, one that is gone has none, and a lost one stays lost
     cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
@@ -85,10 +76,10 @@ def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what
     (root / "out/b_preview.png").unlink()
     assert done(root, html=report) == ["a"]
     after, frames = everything(report), frames_of(report)
-    images = {name: name.partition("_")[0] for name in before if name.endswith(".png")}
-    assert {own for name, own in images.items() if name not in after} == {key["b"], key["d"]}
-    left = images.keys() & after.keys()
-    assert {images[name] for name in left if before[name] != after[name]} == {key["a"]}
+    images = [name for name in before if name.endswith(".png")]
+    changed = {name.partition("_")[0] for name in images if before[name] != after.get(name)}
+    assert changed == {key["a"], key["b"], key["d"]}
+    assert {name.partition("_")[0] for name in images if name in after} == {key["a"], key["c"]}
     assert (frames["b"]["key"], frames["c"]["key"]) == (None, key["c"])
     assert frames["b"]["values"]["rmse_change"] is not None
 
@@ -113,8 +104,9 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_ther
     data, frame = page_data(report), frames_of(report)["a"]
     assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
-    assert "proves nothing" in data["tables"][0]["title"]
-    assert {row[3] for row in data["tables"][0]["rows"]} == {"–"}  # no change
+    (table,) = data["tables"]
+    assert "proves nothing" in table["title"]
+    assert {row[3] for row in table["rows"]} == {"–"}  # no change
     assert "no error is measured" in data["notes"][0]
     assert any("proves nothing" in note for note in frame["notes"])
     assert {*frame["views"]} == {"first", "second", "image", "sparse"}  # no map of gains
@@ -123,14 +115,12 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_ther
     changes = {"holdout": 0.3, "propagate": "gp", "overwrite": True}
     batch(root, output=root / "other", html=report, refine=changes)
     data, frame = page_data(report), frames_of(report)["a"]
-    names = ("iterations", "layer", "lr", "update", "loss", "align", "propagate", "holdout")
-    settings = ["5", "middle", "0.01", "sign", "l1", "none", "gp", "0.3"]
-    assert [dict(data["facts"])[name] for name in names] == settings
+    facts = {"iterations": "5", "layer": "middle", "align": "none", "holdout": "0.3"}
+    assert facts.items() <= dict(data["facts"]).items()
     assert frame["values"]["rmse_change"] is not None
     assert any("at held-out points" in note for note in frame["notes"])
-    assert [each["title"] for each in data["tables"]] == [
-        "means: errors at held-out points, 4 frames"
-    ]
+    (table,) = data["tables"]
+    assert table["title"] == "means: errors at held-out points, 4 frames"
 
 
 def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
@@ -138,16 +128,12 @@ def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
 ) -> None:
     (root / "gt/b.png").unlink()
     (root / "rgb/d.png").write_bytes(b"no image")
-    summary = batch(root, html=report)
+    batch(root, html=report)
     frames = frames_of(report)
     assert frames["a"]["values"]["rmse_change"] is not None
     assert {*frames["b"]["values"].values()} == {None}
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at points used")
     assert [name for name, why in page_data(report)["without"]] == ["d"]
-    records = [replace(FrameRecord.read(root / f"out/{name}.json"), errors={}) for name in "abc"]
-    request = BatchRequest(source=root, output=root / "out", html=report, refine=refinement(root))
-    report_batch.write_batch_report(request, report, summary, records)
-    assert {*frames_of(report)["a"]["values"].values()} == {None}
 
 
 def test_a_report_may_lie_in_the_results_but_holds_nothing_and_replaces_none_unasked(

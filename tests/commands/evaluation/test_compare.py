@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,90 +21,85 @@ from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageError
-from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.measures import MEASURES
+from tests.commands.evaluation.test_evaluate import depth_file
 from tests.commands.test_tables import styled
 
 
-def run(root: Path, name: str, errors: dict[str, list[float]], **options: Any) -> str:
-    """A saved evaluation of frames at 10 m with these errors of their pixels."""
-    for frame, error in errors.items():
-        for folder, depth in ((name, 10 + np.array([error])), ("gt", np.full((1, len(error)), 10))):
-            (root / folder).mkdir(exist_ok=True)
-            write_depth(root / folder / f"{frame}.npy", depth.astype(np.float32))
+def run(root: Path, name: str, errors: Any, frames: str = "abcdefghijkl", **options: Any) -> str:
+    """A saved evaluation of frames at 10 m with these errors, or rows of errors of their pixels."""
+    for frame, row in zip(frames, np.reshape(errors, (len(errors), -1)), strict=False):
+        depth_file(root / name / f"{frame}.npy", [10 + row])
+        depth_file(root / "gt" / f"{frame}.npy", [[10] * len(row)])
     request = EvalRequest(prediction=root / name, ground_truth=root / "gt", **options)
     path = root / f"{name}.json"
     write_json(path, evaluate(request).to_json())
     return str(path)
 
 
-FIRST = {"a": [2.0, 2.0], "b": [4.0, 4.0], "c": [1.0, 1.0]}
-
-
-def test_a_lower_error_is_a_positive_gain_and_a_run_is_no_better_than_itself(
-    tmp_path: Path,
-) -> None:
-    one = run(tmp_path, "one", FIRST)
-    two = run(tmp_path, "two", {"a": [1.0, 1.0], "b": [3.0, 3.0], "c": [0.5, 0.5]})
-    comparison = compare([one, two])
-    gain = comparison.runs[1].gains["mae"]
-    assert gain.percent == pytest.approx(100 * 2.5 / 7)
-    assert gain.p_value == 2 / 8  # all three got better: two of the eight swaps differ as much
-    assert comparison_table(comparison).rows[1][4:6] == ["–", "–"]  # three frames are too few
-    assert [(each.name, each.gains == {}) for each in comparison.runs] == [
-        ("one", True),
-        ("two", False),
+def batch(folder: Path, *frames: dict[str, Scores], groups: str = "", **varied: str) -> str:
+    """The saved summary of a batch of frames with these scores of each stage."""
+    records = [
+        FrameRecord(name=f"{n}", group=groups[n : n + 1] or None, errors={"ground_truth": stages})
+        for n, stages in enumerate(frames)
     ]
-    assert comparison.runs[0].mean["mae"] == pytest.approx(7 / 3)
-    (note,) = comparison.notes
-    assert note.startswith("warning: 3 frames are too few")
+    records.append(FrameRecord(name="spoilt", status="failed"))
+    folder.mkdir()
+    summary = {"frames": [record.to_json() for record in records], "varied": varied}
+    write_json(folder / "summary.json", summary)
+    return str(folder / "summary.json")
 
-    same = compare([one, one])
-    for gain in same.runs[1].gains.values():
+
+@pytest.mark.parametrize("frames", [3, 6])
+def test_a_lower_error_is_a_gain_with_an_interval_if_frames_are_not_too_few(
+    tmp_path: Path, frames: int
+) -> None:
+    errors, factors = np.random.default_rng(0).uniform(0.5, 0.9, (2, frames))
+    better = errors * factors
+    comparison = compare([run(tmp_path, "one", errors), run(tmp_path, "two", better)])
+    first, second = comparison.runs
+    assert (first.name, first.gains, second.name) == ("one", {}, "two")
+    assert first.mean["mae"] == pytest.approx(errors.mean(), rel=1e-5)
+    gain = second.gains["mae"]
+    assert gain.percent == pytest.approx(100 * (1 - better.sum() / errors.sum()), rel=1e-5)
+    assert gain.p_value == 2 / 2**frames  # all got better: two of the swaps differ as much
+    assert (gain.low_percent < gain.percent < gain.high_percent) == (frames == 6)
+    (_, of_json) = json.loads(json.dumps(comparison.to_json()))["runs"]
+    assert (of_json["gains"]["mae"]["low_percent"] is None) == (frames == 3)
+    assert (comparison_table(comparison).rows[1][4:6] == ["–", "–"]) == (frames == 3)
+    (note,) = comparison.notes
+    assert note.startswith(f"warning: {frames} frames are too few")
+
+
+def test_p_values_are_adjusted_for_the_number_of_measures_and_runs(tmp_path: Path) -> None:
+    errors = np.random.default_rng(0).uniform(0.5, 1, 12)
+    one, two = run(tmp_path, "one", errors), run(tmp_path, "two", errors / 2)
+    every = [measure.key for measure in MEASURES]
+    for runs, columns, tests in (
+        ([one, two], ["mae"], 1),
+        ([one, two], ["rmse", "mae"], 2),
+        ([one, two, two], ["rmse", "mae"], 4),
+        ([one, two], every, len(every)),
+    ):
+        gains = compare(runs, columns=columns).runs[1].gains
+        assert [*gains] == columns
+        assert min(gain.p_adjusted for gain in gains.values()) == pytest.approx(tests * 2 / 2**12)
+    for gain in compare([one, one]).runs[1].gains.values():
         assert (gain.percent, gain.p_value, gain.p_adjusted) == (0, 1, 1)
-    (_, of_json) = json.loads(json.dumps(same.to_json()))["runs"]
-    assert (of_json["name"], of_json["gains"]["mae"]["low_percent"]) == (one, None)
     with pytest.raises(UsageError):
         compare([one])
-
-
-def test_six_frames_have_an_interval_around_the_gain_and_p_is_adjusted(tmp_path: Path) -> None:
-    errors, factors = [2.0, 5.0, 1.0, 4.0, 1.5, 3.0], [0.5, 0.8, 0.6, 0.7, 0.9, 0.55]
-    better = np.multiply(errors, factors).tolist()
-    paths = [
-        run(tmp_path, name, {f"{n:04}": [error] for n, error in enumerate(row)})
-        for name, row in (("one", errors), ("two", better))
-    ]
-    main, every = compare(paths), [measure.key for measure in MEASURES]
-    for comparison, count in ((main, 4), (compare(paths, columns=every), len(every))):
-        gains = comparison.runs[1].gains.values()
-        assert len(comparison.measures) == len(gains) == count
-        smallest = min(gains, key=lambda gain: gain.p_value)
-        assert smallest.p_adjusted == pytest.approx(min(1, count * smallest.p_value))
-    gain = main.runs[1].gains["mae"]
-    assert gain.low_percent < gain.percent < gain.high_percent
-    assert gain.p_value == 2 / 64
-    for other in compare([*paths, paths[1]]).runs[1:]:
-        assert other.gains["mae"].p_adjusted >= gain.p_adjusted > gain.p_value
-    chosen = compare(paths, columns=("delta1", "silog")).measures
-    assert [measure.key for measure in chosen] == ["delta1", "silog"]
 
 
 def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values(
     tmp_path: Path,
 ) -> None:
-    errors, paths = np.random.default_rng(0).uniform(0.5, 1, 12), []
-    for name, factor in (("a", 1.0), ("b", 0.5), ("c", 2.0)):
-        each = {f"{n}": [error] for n, error in enumerate(factor * errors)}
-        path = Path(run(tmp_path, name, each))
-        path.write_text(
-            path.read_text().replace('"exclude_sparse": false', '"exclude_sparse": true')
-        )
-        paths.append(str(path))
+    errors = np.random.default_rng(0).uniform(0.5, 1, 12)
+    factors = {"a": 1.0, "b": 0.5, "c": 2.0}
+    paths = [run(tmp_path, name, factor * errors) for name, factor in factors.items()]
     comparison = compare(paths, columns=("mae", "delta1"))
     methods, gains = methods_table(comparison), comparison_table(comparison)
-    a, b, c = (f"{factor * errors.mean():.4f}" for factor in (1, 0.5, 2))
+    a, b, c = (f"{factor * errors.mean():.4f}" for factor in factors.values())
     # all got better, or worse: two of 2^12 swaps, times four tests
     assert styled(methods) == [
         [("a", ""), (a, ""), ("100.00%", "bold")],
@@ -114,67 +110,57 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values(
     assert shown[:3] == [("–", ""), ("+50.00", "good"), ("-100.00", "bad")]
     assert shown[3:] == [("–", ""), ("+0.00", "dim"), ("+0.00", "dim")]
     assert gains.rows[1][4:] == ["+50.00", "+50.00", "0.0020"]
-    for table in (methods, gains):
+    without = replace(comparison, scoring={"exclude_sparse": True})
+    for table in (methods_table(without), comparison_table(without)):
         assert table.title.endswith("; without the pixels of sparse points")
 
 
 def test_what_not_all_runs_have_is_left_out_and_reported(tmp_path: Path) -> None:
-    rng, paths, means = np.random.default_rng(0), [], []
-    for name, size in (("c", 1.0), ("d", 0.5)):
-        errors = {f"{n:04}": (size * rng.uniform(1, 2, 4)).tolist() for n in range(9)}
-        path = Path(run(tmp_path, name, errors | ({"e": [9.0]} if name == "c" else {})))
-        record = json.loads(path.read_text())
-        scores = [frame["errors"]["ground_truth"]["after"] for frame in record["frames"][:9]]
-        scores[0]["imae"] = None
-        path.write_text(json.dumps(record))
-        means.append(np.mean([each["imae"] for each in scores[1:]]))
-        paths.append(str(path))
-        (tmp_path / "gt" / "e.npy").unlink(missing_ok=True)
+    one, two = np.random.default_rng(0).uniform(1, 2, (2, 9)) * [[1], [0.5]]
+    paths = []
+    for name, errors in (("one", [*one, 9.0]), ("two", two)):
+        frames: list[dict[str, Scores]] = [{"after": {"mae": e, "imae": e}} for e in errors]
+        frames[0]["after"]["imae"] = None
+        paths.append(batch(tmp_path / name, *frames))
     comparison = compare(paths, columns=("mae", "imae"))
     gain = comparison.runs[1].gains["imae"]
     assert (len(comparison.frames), gain.p_value) == (9, 2 / 2**8)
-    assert comparison.runs[0].mean["imae"] == pytest.approx(means[0])
-    assert gain.percent == pytest.approx(100 * (1 - means[1] / means[0]))
-    assert comparison.notes[0].endswith("left out: e")
+    assert comparison.runs[0].mean["imae"] == pytest.approx(one[1:].mean())
+    assert gain.percent == pytest.approx(100 * (1 - two[1:].mean() / one[1:].mean()))
+    assert comparison.notes[0].endswith("left out: 9")
     assert comparison.notes[1].startswith("iMAE: over 8 of 9 frames")
 
 
 def test_runs_of_other_definitions_frames_or_pixels_are_refused_or_warned_of(
     tmp_path: Path,
 ) -> None:
-    one = run(tmp_path, "one", {"a": [1.0, 1.0]})
-    (note,) = compare([one, run(tmp_path, "less", {"a": [1.0, -10.0]})]).notes
+    one = run(tmp_path, "one", [[1.0, 1.0]])
+    (note,) = compare([one, run(tmp_path, "less", [[1.0, -10.0]])]).notes
     assert note.startswith("warning: 1 frame with other numbers of scored pixels")
     assert "100.00%, 50.00%" in note
-    devkit = run(tmp_path, "three", {"a": [1.0, 1.0]}, protocol="kitti-devkit")
+    devkit = run(tmp_path, "three", [[1.0, 1.0]], protocol="kitti-devkit")
     with pytest.raises(InputError, match="definitions usual and kitti-devkit"):
         compare([one, devkit])
     (tmp_path / "gt" / "a.npy").unlink()
     with pytest.raises(InputError, match="no scored frame in common: a; and b"):
-        compare([one, run(tmp_path, "two", {"b": [1.0]})])
+        compare([one, run(tmp_path, "two", [1.0], frames="b")])
 
 
 def test_a_batch_is_compared_with_what_it_started_from_by_groups(tmp_path: Path) -> None:
-    scores: dict[str, Scores] = {
-        "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5, "pixels": 90, "coverage": 0.9},
-        "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6, "pixels": 90, "coverage": 0.9},
+    stages: dict[str, Scores] = {
+        "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5},
+        "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6},
     }
-    with_mre = {stage: own | {"mre": 0.5} for stage, own in scores.items()}
-    records = [
-        FrameRecord(name=f"{n}", group="abc"[n % 3], errors={"ground_truth": own})
-        for n, own in enumerate([with_mre, *[scores] * 8])
-    ]
-    frames = [each.to_json() for each in (*records, FrameRecord(name="9", status="failed"))]
-    (tmp_path / "x").mkdir()
-    write_json(tmp_path / "x" / "summary.json", {"command": "batch", "frames": frames})
-    comparison = compare([f"{tmp_path}/x/summary.json:before", str(tmp_path / "x")])
+    with_mre = {stage: own | {"mre": 0.5} for stage, own in stages.items()}
+    path = batch(tmp_path / "x", with_mre, *[stages] * 8, groups="abcabcabc")
+    comparison = compare([f"{path}:before", str(tmp_path / "x")])
+    assert [each.name for each in comparison.runs] == ["x:before", "x"]
     assert len(comparison.frames) == 9
     gains = comparison.runs[1].gains
-    assert list(gains) == ["rmse", "mae", "delta1"]
+    assert [*gains] == ["rmse", "mae", "delta1"]
     assert (gains["rmse"].percent, gains["delta1"].percent) == (50, pytest.approx(20))
     assert gains["mae"].p_value == 2 / 8
     assert comparison.notes[-1].startswith("warning: 3 groups of frames are too few")
-    assert [each.name for each in comparison.runs] == ["x:before", "x"]
 
 
 BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '{"measures": []}']
@@ -182,22 +168,17 @@ BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '
 
 @pytest.mark.parametrize("text", BROKEN)
 def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
-    one = run(tmp_path, "one", FIRST)
+    one = run(tmp_path, "one", [1.0])
     (tmp_path / "broken.json").write_text(text)
     for other in (str(tmp_path / "broken.json"), f"{one}:before"):
         with pytest.raises(FileFormatError, match=r"broken\.json|one\.json"):
             compare([one, other])
 
 
-def batch(folder: Path, mae: float, **varied: str) -> str:
-    """The summary of a batch of one frame whose MAE was 1 m before refinement."""
-    counts: Scores = {"pixels": 4, "coverage": 1.0}
-    stages: dict[str, Scores] = {"before": {"mae": 1.0} | counts, "after": {"mae": mae} | counts}
-    record = FrameRecord(name="a", errors={"ground_truth": stages}).to_json()
-    name = ",".join(varied.values())
-    (folder / name).mkdir()
-    write_json(folder / name / "summary.json", {"frames": [record], "varied": varied})
-    return str(folder / name)
+def refined(folder: Path, mae: float, **varied: str) -> str:
+    """A batch of one frame whose MAE was 1 m before refinement."""
+    stages: dict[str, Scores] = {"before": {"mae": 1.0}, "after": {"mae": mae}}
+    return batch(folder / ",".join(varied.values()), stages, **varied)
 
 
 @pytest.fixture
@@ -218,7 +199,7 @@ def test_numbers_lie_along_the_axis_names_make_lines_and_a_point_is_the_mean_ove
     runs = []
     for values, mae in errors.items():
         count, loss, seed = values.split()
-        runs.append(batch(tmp_path, mae, sample=count, loss=loss, seed=seed))
+        runs.append(refined(tmp_path, mae, sample=count, loss=loss, seed=seed))
     plot_comparison(compare(runs), tmp_path / "p.svg")
     above, below = figures[0].axes
     assert (below.get_xlabel(), below.get_xscale()) == ("sample", "log")
@@ -233,23 +214,24 @@ def test_numbers_lie_along_the_axis_names_make_lines_and_a_point_is_the_mean_ove
 
 
 def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
-    runs = [batch(tmp_path, 0.5, method=name) for name in ("paper", "fused")]
-    for name in ("one.png", "two.png"):
-        plot_comparison(compare(runs), tmp_path / name)
-    (_, below), ticks = figures[0].axes, figures[0].axes[1].get_xticklabels()
-    assert [tick.get_text() for tick in ticks] == ["paper", "fused"]
+    comparison = compare([refined(tmp_path, 0.5, method=name) for name in ("paper", "fused")])
+    files = tmp_path / "one.png", tmp_path / "two.png"
+    for path in files:
+        plot_comparison(comparison, path)
+    (_, below) = figures[0].axes
+    assert [tick.get_text() for tick in below.get_xticklabels()] == ["paper", "fused"]
     assert below.get_lines()[0].get_xdata().tolist() == [0, 1]
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_a_plot_needs_one_option_a_known_format_leave_to_replace_a_file_and_matplotlib(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    one, two = batch(tmp_path, 0.5, lr="1%"), batch(tmp_path, 0.5, lr="3%")
+    one, two = refined(tmp_path, 0.5, lr="1%"), refined(tmp_path, 0.5, lr="3%")
     comparison = compare([one, two])
     with pytest.raises(UsageError, match="same options"):
-        plot_comparison(compare([one, batch(tmp_path, 0.5, loss="l2")]), tmp_path / "p.png")
+        plot_comparison(compare([one, refined(tmp_path, 0.5, loss="l2")]), tmp_path / "p.png")
     with pytest.raises(UsageError, match=r"\.svg"):
         plot_comparison(comparison, tmp_path / "p.jpg")
     (tmp_path / "p.pdf").touch()

@@ -1,17 +1,12 @@
-"""Scaling of relative predictions by the papers' reference codes, and standard deviations."""
+"""Scaling of relative predictions by the papers' reference codes, and crops that do not fit."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.evaluation.scoring import scale_prediction
-from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.commands.evaluation.scoring import crop_window, scale_prediction
+from pnpdepth_cli.errors import InputError, SizeError
 
 RNG = np.random.default_rng(0)
 GT = RNG.uniform(1, 9, (40, 50)).astype(np.float32)
@@ -39,22 +34,10 @@ def test_a_fit_is_that_of_monodepth2_marigold_or_midas(scale_by: str) -> None:
     assert depth[3:] == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
-def test_a_constant_prediction_and_too_few_pixels_are_refused() -> None:
+def test_a_constant_prediction_too_few_pixels_and_too_small_a_frame_are_refused() -> None:
     with pytest.raises(InputError, match="constant"):
         scale_prediction(np.ones_like(GT), GT, "affine")
     with pytest.raises(InputError, match="needs 2 pixels"):
         scale_prediction(GT, np.zeros_like(GT), "median")
-
-
-def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
-    for folder in ("out", "gt"):
-        (tmp_path / folder).mkdir()
-    write_depth(tmp_path / "gt" / "a.npy", GT)
-    write_depth(tmp_path / "out" / "a_depth.npy", (GT + RNG.normal(0, 0.1, GT.shape)).astype("f4"))
-    write_depth(tmp_path / "out" / "a_sigma.npy", np.full(GT.shape, 0.1, np.float32))
-    result = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt"))
-    assert result.mean["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
-    assert not any("have no ground truth" in note for note in result.notes)
-    write_depth(tmp_path / "out" / "a_sigma.npy", np.ones((2, 2), np.float32))
-    with pytest.raises(InputError, match=r"a_sigma\.npy"):
-        evaluate(result.request)
+    with pytest.raises(SizeError, match=r"640×480 but this one is 304×228"):
+        crop_window("nyu", (228, 304))
