@@ -117,9 +117,9 @@ def test_a_mean_is_over_the_frames_that_have_the_value() -> None:
     assert frame_means([]) == {}
 
 
-def sigma_measures(depth: np.ndarray, gt: np.ndarray, sigma: np.ndarray) -> list[float]:
-    """The fractions within one and two standard deviations, and AUSE."""
-    images = [np.asarray(each, np.float32) for each in (depth, gt, sigma)]
+def sigma_measures(*images: np.ndarray) -> list[float]:
+    """The fractions within one and two σ, and AUSE, of prediction, ground truth and σ."""
+    images = tuple(each.astype(np.float32) for each in images)
     return [measure.formula(*images) for measure in OF_SIGMA if measure.formula]
 
 

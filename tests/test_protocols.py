@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -22,16 +21,16 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
+from tests.commands.evaluation.test_evaluate import code_image, depth_file
 from tests.data_sets import SELECTED, codes, eth3d, image, mask, void
 
 KITTI = (352, 1216)
 
 
 def nyu(root: Path) -> None:
-    (root / "depth").mkdir(parents=True)
     for name in ("0001", "0009"):
         image(root / f"image/{name}.png", 480, 640)
-        np.save(root / f"depth/{name}.npy", np.full((480, 640), 2.0, np.float32))
+        depth_file(root / f"depth/{name}.npy", np.full((480, 640), 2.0))
 
 
 def ibims(root: Path) -> None:
@@ -56,8 +55,7 @@ def kitti(root: Path) -> None:
     points[201, 601] = 5 * 256
     image(root / f"image/{SELECTED.format('image')}.png", *KITTI)
     for kind, values in (("groundtruth_depth", truth), ("velodyne_raw", points)):
-        (root / kind).mkdir()
-        cv2.imwrite(str(root / kind / f"{SELECTED.format(kind)}.png"), values)
+        code_image(root / kind / f"{SELECTED.format(kind)}.png", values)
     (root / "intrinsics").mkdir()
     text = " ".join(map(str, (700, 0, 608, 0, 700, 176, 0, 0, 1)))
     (root / f"intrinsics/{SELECTED.format('image')}.txt").write_text(text)
@@ -90,11 +88,10 @@ def read_as_batch(root: Path, protocol: str) -> dict[str, Frame]:
     return {frame.name: read_requested(request_of(request, frame)) for frame in frames}
 
 
-LARGE = pytest.param("omni-dc-eth3d", marks=pytest.mark.slow)
-"""Of 20 megapixels."""
+SLOW = {"omni-dc-eth3d": pytest.mark.slow}  # it has 20 megapixels
 
 
-@pytest.mark.parametrize("name", [*sorted(BY_HAND.keys() - {"omni-dc-eth3d"}), LARGE])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW.get(n, ())) for n in BY_HAND])
 def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_path: Path) -> None:
     maker, frames, points, pixels = BY_HAND[name]
     root = tmp_path / "data"
@@ -103,12 +100,10 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
     assert [len(each.points) for each in read.values()] == [points] * frames
     for frame, each in read.items():
         assert each.gt is not None
-        path = tmp_path / "out" / f"{frame}_depth.npy"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, np.full(each.gt.shape, 2.0, np.float32))
+        depth_file(tmp_path / "out" / f"{frame}_depth.npy", np.full(each.gt.shape, 2.0))
         height, width = each.gt.shape
         record = FrameRecord(inputs={"sparse": each.sources["sparse"]}, size=(width, height))
-        record.write(path.with_name(path.name.replace("_depth.npy", ".json")))
+        record.write(tmp_path / "out" / f"{frame}.json")
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
     assert [scores_of(frame)["pixels"] for frame in found.frames] == [pixels] * frames
 
@@ -141,9 +136,8 @@ def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) ->
 
 def test_points_behind_the_foreground_are_those_of_two_windows() -> None:
     rng = np.random.default_rng(0)
-    depth = np.where(rng.random((30, 40)) < 0.3, rng.uniform(2, 12, (30, 40)), 0)
-    rows, columns = np.nonzero(depth)
-    values = depth[rows, columns].astype(np.float32)
+    rows, columns = np.nonzero(rng.random((30, 40)) < 0.3)
+    values = rng.uniform(2, 12, len(rows)).astype(np.float32)
     points = SparsePoints(
         xy=np.stack([columns, rows], axis=1).astype(np.float32), depth=values, size=(30, 40)
     )

@@ -6,14 +6,8 @@ from dataclasses import replace
 from math import nan
 from typing import Any, Literal
 
-from pnpdepth_cli.commands.tables import (
-    Table,
-    change,
-    means_tables,
-    names_of_depths,
-    refinement_tables,
-    stage_titles,
-)
+from pnpdepth_cli.commands import tables
+from pnpdepth_cli.commands.tables import Table, refinement_tables
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 
@@ -28,7 +22,7 @@ CHANGES = [
 
 def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
     for before, after, text, style in CHANGES:
-        cell = change(before, after)
+        cell = tables.change(before, after)
         assert (cell, cell.style) == (text, style)
 
 
@@ -95,8 +89,8 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         "nearest": {"mae": 3.0, "rmse": 4.0, "frames": 3},
     }
     errors = {"ground_truth": stages, "used": stages}
-    titles = stage_titles(record_of("net", weights={"net": 1.0}))
-    (table,) = means_tables(errors, "m", titles, ("mae", "rmse"))
+    titles = tables.stage_titles(record_of("net", weights={"net": 1.0}))
+    (table,) = tables.means_tables(errors, "m", titles, ("mae", "rmse"))
     assert table.title == "means: errors against ground truth, 3 frames"
     assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
     assert [row[:3] for row in table.rows] == [
@@ -105,7 +99,7 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         ["linear interpolation of all points", "–", "–"],
         ["nearest", "3.0000 m", "4.0000 m"],
     ]
-    assert means_tables({}, "m", {}) == []
+    assert tables.means_tables({}, "m", {}) == []
 
 
 def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:
@@ -120,4 +114,4 @@ def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
         (0.25, 0.75, "fused (net 25%, compact 75%)"),
     ):
         record = record_of("net", "compact", weights={"net": net, "compact": compact})
-        assert names_of_depths(record) == ("net, aligned with the points", after)
+        assert tables.names_of_depths(record) == ("net, aligned with the points", after)

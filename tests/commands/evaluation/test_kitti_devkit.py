@@ -10,12 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pnpdepth_cli.commands.evaluation.kitti_devkit import (
-    DEVKIT_MEASURES,
-    devkit_errors,
-    devkit_mean,
-    fill_background,
-)
+from pnpdepth_cli.commands.evaluation import kitti_devkit
 from pnpdepth_cli.io.depth import read_depth
 
 SAMPLES = Path(__file__).parents[3] / "samples"
@@ -23,22 +18,16 @@ F = np.float32
 
 
 def filled_by_loops(depth: np.ndarray) -> np.ndarray:
-    """What the readme of the kit says of missing predictions, one pixel after the other."""
-    height, width = depth.shape
+    """What the readme of the kit says of missing predictions, one row or column after the other."""
     out = np.where(depth > 0, depth, F(-1))
     for row in out:
-        known = [u for u in range(width) if row[u] >= 0]
-        for a, b in pairwise(known):
-            for u in range(a + 1, b):
-                row[u] = min(row[a], row[b])
-        if known:
-            row[: known[0]] = row[known[0]]
-            row[known[-1] + 1 :] = row[known[-1]]
-    for column in out.T:
-        known = [v for v in range(height) if column[v] >= 0]
-        if known:
-            column[: known[0]] = column[known[0]]
-            column[known[-1] + 1 :] = column[known[-1]]
+        for a, b in pairwise(np.flatnonzero(row >= 0)):
+            row[a + 1 : b] = min(row[a], row[b])
+    for line in (*out, *out.T):
+        known = np.flatnonzero(line >= 0)
+        if len(known):
+            line[: known[0]] = line[known[0]]
+            line[known[-1] + 1 :] = line[known[-1]]
     return out
 
 
@@ -49,7 +38,7 @@ CODES = st.one_of(st.just(0), st.integers(0, 3), st.integers(1, 20_000))
 @given(arrays(np.uint16, (4, 5), elements=CODES))
 def test_what_is_missing_is_filled_as_by_the_loops_of_the_definition(stored: np.ndarray) -> None:
     depth = stored.astype(F) / F(256)
-    np.testing.assert_array_equal(fill_background(depth), filled_by_loops(depth))
+    np.testing.assert_array_equal(kitti_devkit.fill_background(depth), filled_by_loops(depth))
 
 
 def test_the_figures_are_those_of_the_official_program() -> None:
@@ -57,8 +46,10 @@ def test_the_figures_are_those_of_the_official_program() -> None:
     predicted = read_depth(SAMPLES / "street" / "sparse.png").values
     gt = read_depth(SAMPLES / "street" / "gt.png").values
     printed = "5.375677 11.679524 0.025707 0.039534 0.325306 0.521867 0.501333 0.289888 0.218769"
-    errors = devkit_errors(predicted, gt)
-    assert " ".join(f"{errors[measure.key]:f}" for measure in DEVKIT_MEASURES) == printed
+    errors = kitti_devkit.devkit_errors(predicted, gt)
+    assert (
+        " ".join(f"{errors[measure.key]:f}" for measure in kitti_devkit.DEVKIT_MEASURES) == printed
+    )
 
 
 def test_the_mean_over_frames_is_added_up_in_single_precision_too() -> None:
@@ -66,4 +57,4 @@ def test_the_mean_over_frames_is_added_up_in_single_precision_too() -> None:
     total = np.zeros(2, F)
     for row in values:
         total = total + row.astype(F)
-    assert devkit_mean(values).tolist() == (total / F(1000)).astype(float).tolist()
+    assert kitti_devkit.devkit_mean(values).tolist() == (total / F(1000)).astype(float).tolist()
