@@ -84,18 +84,6 @@ def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what
     assert frames["b"]["values"]["rmse_change"] is not None
 
 
-def test_weights_of_all_experts_are_shown_for_each_frame_and_in_the_mean(
-    root: Path, report: Path
-) -> None:
-    batch(root, html=report, limit=2, refine={"propagate": None})
-    shown = dict(page_data(report)["facts"])["mean weights"]
-    weights = FrameRecord.read(root / "out/a.json").weights
-    assert all(name in shown for name in weights)
-    largest = max(weights, key=weights.__getitem__)
-    notes = " ".join(frames_of(report)["a"]["notes"])
-    assert f"{largest} {weights[largest]:.0%}" in notes
-
-
 def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_there_are_none(
     root: Path, report: Path
 ) -> None:
@@ -123,17 +111,21 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_ther
     assert table["title"] == "means: errors at held-out points, 4 frames"
 
 
-def test_frames_without_the_scores_of_others_have_no_figures_beside_them(
+def test_each_frame_has_its_weights_and_the_errors_that_it_shares_with_the_others(
     root: Path, report: Path
 ) -> None:
     (root / "gt/b.png").unlink()
     (root / "rgb/d.png").write_bytes(b"no image")
-    batch(root, html=report)
-    frames = frames_of(report)
+    batch(root, html=report, refine={"propagate": None})
+    data, frames = page_data(report), frames_of(report)
     assert frames["a"]["values"]["rmse_change"] is not None
     assert {*frames["b"]["values"].values()} == {None}
-    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at points used")
-    assert [name for name, why in page_data(report)["without"]] == ["d"]
+    assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at validation points")
+    assert [name for name, why in data["without"]] == ["d"]
+    weights = FrameRecord.read(root / "out/a.json").weights
+    assert all(name in dict(data["facts"])["mean weights"] for name in weights)
+    largest = max(weights, key=weights.__getitem__)
+    assert f"{largest} {weights[largest]:.0%}" in " ".join(frames["a"]["notes"])
 
 
 def test_a_report_may_lie_in_the_results_but_holds_nothing_and_replaces_none_unasked(
