@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,45 +54,38 @@ def says(evaluation: Evaluation, text: str) -> bool:
     return any(text in note for note in evaluation.notes)
 
 
-def folders(root: Path, predictions: str, truths: str) -> Path:
+def folders(root: Path, predictions: Iterable[str], truths: Iterable[str]) -> Path:
     """Depth of 2 m in these files of out/ and gt/."""
     for folder, names in (("out", predictions), ("gt", truths)):
         (root / folder).mkdir()
-        for name in names.split():
+        for name in names:
             depth_file(root / folder / name, np.full((3, 4), 2))
     return root
 
 
 IMAGE, TRUTH = (SELECTED.format(kind) for kind in ("image", "groundtruth_depth"))
-MATCHED: list[tuple[str, str, dict[str, str | None]]] = [
-    (  # the files of a refinement, and ground truth without images
-        "b_depth.png b_preview.png b.png ä_depth.exr .hidden/c_depth.png",
-        "b.png ä.npy",
-        {"b": "b_depth.png", "ä": "ä_depth.exr"},
-    ),
-    (  # frames in folders of their own
-        "one/1_depth.png two/1_depth.png",
-        "one/1.png two/1.png two/2.png",
-        {"one/1": "1_depth.png", "two/1": "1_depth.png", "two/2": None},
-    ),
-    (
-        f"{IMAGE}_depth.png 0.depth.png",
-        f"{TRUTH}.png 0.png",
-        {"0": "0.depth.png", SELECTED.replace("_{}", ""): f"{IMAGE}_depth.png"},
-    ),
-    ("_depth.png", "_depth.png", {"_depth": "_depth.png"}),
-]
+# the frame of each ground truth, and its prediction
+MATCHED = {
+    "b.png": ("b", "b_depth.png"),
+    "ä.npy": ("ä", "ä_depth.exr"),
+    "one/1.png": ("one/1", "one/1_depth.png"),
+    "two/1.png": ("two/1", "two/1_depth.png"),
+    "two/2.png": ("two/2", "."),
+    "0.png": ("0", "0.depth.png"),
+    f"{TRUTH}.png": (SELECTED.replace("_{}", ""), f"{IMAGE}_depth.png"),
+}
 
 
-@pytest.mark.parametrize(("predictions", "truths", "expected"), MATCHED)
-def test_files_are_matched_by_name(
-    tmp_path: Path, predictions: str, truths: str, expected: dict[str, str | None]
-) -> None:
-    names = dict.fromkeys(expected)
-    for each in scored(folders(tmp_path, predictions, truths)).frames:
-        if "prediction" in each.inputs:
-            names[each.name] = Path(each.inputs["prediction"].path).name
-    assert names == expected
+def test_files_are_matched_by_name(tmp_path: Path) -> None:
+    predictions = [name for _, name in MATCHED.values() if name != "."]
+    others = ["b_preview.png", "b.png", ".hidden/c_depth.png"]  # of a refinement, and hidden
+    found = scored(folders(tmp_path, [*predictions, *others], MATCHED)).frames
+    names = dict[str, tuple[str, str]]()
+    for each in found:
+        files = {side: Path(file.path) for side, file in each.inputs.items()}
+        prediction = files.get("prediction", tmp_path / "out").relative_to(tmp_path / "out")
+        names[files["gt"].relative_to(tmp_path / "gt").as_posix()] = (each.name, str(prediction))
+    assert names == MATCHED
 
 
 UNMATCHED = [
@@ -108,7 +103,7 @@ UNMATCHED = [
 def test_what_cannot_be_matched_is_refused(
     tmp_path: Path, out: str, gt: str, first: str, second: str, error: type[Exception], message: str
 ) -> None:
-    touch(folders(tmp_path, out, gt) / "a.png")
+    touch(folders(tmp_path, out.split(), gt.split()) / "a.png")
     (tmp_path / "list.csv").write_text("image,sparse,name\na.png,out/a.png,a")
     with pytest.raises(error, match=message):
         evaluate(EvalRequest(prediction=tmp_path / first, ground_truth=tmp_path / second))
@@ -144,26 +139,27 @@ def test_images_count_alike_and_one_without_prediction_in_neither_means_nor_cove
 
 
 def test_a_failed_frame_is_reported_and_the_others_are_scored(tmp_path: Path) -> None:
-    faults: dict[str, tuple[list[float], str]] = {
-        "damaged": ([0, 0], "damaged_depth.npy"),
-        "empty": ([0, 0], "holds no valid depth"),
-        "large": ([1, 1, 1], "is 3×1 but the ground truth"),
+    faults: dict[str, tuple[list[float], list[float], str]] = {
+        "damaged": ([1, 1], [5, 5], "damaged_depth.npy"),
+        "empty": ([0, 0], [5, 5], "empty_depth.npy holds no valid depth"),
+        "large": ([1, 1, 1], [5, 5], "large_depth.npy is 3×1 but the ground truth"),
+        "unknown": ([1, 1], [0, 0], "unknown.npy"),
     }
     frame(tmp_path, [[8, 2]], [[5, 5]], "good")
-    for name, (row, _) in faults.items():
-        frame(tmp_path, [row], [[5, 5]], name)
+    for name, (prediction, gt, _) in faults.items():
+        frame(tmp_path, [prediction], [gt], name)
     (tmp_path / "out" / "damaged_depth.npy").write_bytes(b"no depth")
     depth_file(tmp_path / "out" / "extra.depth.npy", [[1]])
     result = scored(tmp_path)
-    assert says(result, "warning: 1 of 5 predictions have no ground truth")
+    assert says(result, "warning: 1 of 6 predictions have no ground truth")
     messages = {each.name: each.message or "" for each in result.frames if each.status == "failed"}
     assert messages.keys() == faults.keys()
-    for name, (_, message) in faults.items():
+    for name, (*_, message) in faults.items():
         assert message in messages[name]
         assert says(result, f"warning: frame {name} was not scored")
-        prediction, gt = tmp_path / f"out/{name}_depth.npy", tmp_path / f"gt/{name}.npy"
-        with pytest.raises(InputError, match=f"{name}_depth.npy"):
-            evaluate(EvalRequest(prediction=prediction, ground_truth=gt))
+        file, truth = tmp_path / "out" / f"{name}_depth.npy", tmp_path / "gt" / f"{name}.npy"
+        with pytest.raises(InputError, match=message):
+            evaluate(EvalRequest(prediction=file, ground_truth=truth))
     assert (result.mean["rmse"], result.interval) == (3, None)
 
 
@@ -231,19 +227,16 @@ def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
     assert says(own, "÷ 100 (from the file)")
 
 
-@pytest.mark.parametrize(("side", "option"), [("gt", "--gt-scale"), ("out", "--pred-scale")])
-def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(
-    tmp_path: Path, side: str, option: str
-) -> None:
+def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(tmp_path: Path) -> None:
     depth = np.random.default_rng(0).integers(1, 9, (6, 8))
-    (other,) = {"gt", "out"} - {side}
-    depth_file(tmp_path / other / "a.npy", depth)
-    code_image(tmp_path / side / "a.png", depth * 1000)
-    with pytest.raises(InputError, match=rf"{option} 1000 \(now 256\)"):
-        scored(tmp_path)
-    field = option[2:].replace("-", "_")
-    assert scored(tmp_path, **{field: 1000.0}).mean["rmse"] == 0
-    assert says(scored(tmp_path, **{field: 256.0}), "a scale is probably wrong")
+    for side, other, option in (("gt", "out", "gt_scale"), ("out", "gt", "pred_scale")):
+        root = tmp_path / option
+        depth_file(root / other / "a.npy", depth)
+        code_image(root / side / "a.png", depth * 1000)
+        with pytest.raises(InputError, match=rf"--{option.replace('_', '-')} 1000 \(now 256\)"):
+            scored(root)
+        assert scored(root, **{option: 1000.0}).mean["rmse"] == 0
+        assert says(scored(root, **{option: 256.0}), "a scale is probably wrong")
 
 
 def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Path) -> None:
@@ -323,27 +316,21 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
         scored(tmp_path)
 
 
-@pytest.mark.parametrize("of", ["list", "record", "nothing"])
-def test_distances_of_a_wide_camera_are_scored_as_depth(of: str, tmp_path: Path) -> None:
+def test_distances_of_a_wide_camera_are_scored_as_depth(tmp_path: Path) -> None:
     depth = np.random.default_rng(0).uniform(2, 4, (48, 64))
     x, y = (np.arange(64) - 31.5) / 32, (np.arange(48) - 23.5) / 32  # 90° across
     frame(tmp_path, depth + 1, depth * np.sqrt(1 + x**2 + y[:, None] ** 2))
-    image(tmp_path / "a.png", 48, 64)
+    request = EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt", gt_range=True)
+    with pytest.raises(InputError, match="calib"):
+        evaluate(request)
     intrinsics = np.array([[32.0, 0, 31.5], [0, 32, 23.5], [0, 0, 1]])
+    camera = CameraRecord.of(Camera(intrinsics=intrinsics), None)
+    FrameRecord(size=(64, 48), camera=camera).write(tmp_path / "out" / "a.json")
+    by_record = evaluate(request)
+    (tmp_path / "out" / "a.json").unlink()
+    image(tmp_path / "a.png", 48, 64)
     (tmp_path / "calib.txt").write_text(f"K: {intrinsics.ravel().tolist()}")
     (tmp_path / "list.csv").write_text("image,gt,calib,name\na.png,gt/a.npy,calib.txt,a")
-    if of == "record":
-        camera = CameraRecord.of(Camera(intrinsics=intrinsics), None)
-        FrameRecord(size=(64, 48), camera=camera).write(tmp_path / "out" / "a.json")
-    request = EvalRequest(
-        prediction=tmp_path / "out",
-        ground_truth=tmp_path / ("list.csv" if of == "list" else "gt"),
-        gt_range=True,
-    )
-    if of == "nothing":
-        with pytest.raises(InputError, match="calib"):
-            evaluate(request)
-    else:
-        found = evaluate(request)
+    for found in (by_record, evaluate(replace(request, ground_truth=tmp_path / "list.csv"))):
         assert found.mean["mae"] == pytest.approx(1, abs=1e-6)
         assert found.frames[0].inputs["gt"].read_as == "float32 NPY, distances"
