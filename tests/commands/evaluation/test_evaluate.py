@@ -152,11 +152,12 @@ def test_a_failed_frame_is_reported_and_the_others_are_scored(tmp_path: Path) ->
     depth_file(tmp_path / "out" / "extra.depth.npy", [[1]])
     result = scored(tmp_path)
     assert says(result, "warning: 1 of 6 predictions have no ground truth")
+    assert says(result, "warning: frame damaged was not scored")
+    assert says(result, "1 more frame like that")
     messages = {each.name: each.message or "" for each in result.frames if each.status == "failed"}
     assert messages.keys() == faults.keys()
     for name, (*_, message) in faults.items():
         assert message in messages[name]
-        assert says(result, f"warning: frame {name} was not scored")
         file, truth = tmp_path / "out" / f"{name}_depth.npy", tmp_path / "gt" / f"{name}.npy"
         with pytest.raises(InputError, match=message):
             evaluate(EvalRequest(prediction=file, ground_truth=truth))
