@@ -56,66 +56,39 @@ def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
     return count, " ".join([what, *notes])
 
 
-def test_the_colours_come_from_the_image_that_the_record_names(tmp_path: Path) -> None:
-    path = frame(tmp_path, "a")
-    count, said = written(path, tmp_path / "a.ply")
-    assert count == HEIGHT * WIDTH
-    assert "without colours" not in said
-    corner = [-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2]  # by the calibration of `written`
-    assert points_of(tmp_path / "a.ply")[0] == pytest.approx(corner, rel=1e-5)
-    row = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1][:27]
-    assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
-    with pytest.raises(OutputError, match="--overwrite"):
-        written(path, tmp_path / "a.ply")
-
-
-def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
+def test_image_camera_and_pose_come_from_the_record_unless_they_are_given(tmp_path: Path) -> None:
     path = frame(tmp_path, "a", camera=camera(5))
     assert "made up" in written(path, tmp_path / "a.ply", calib=None)[1]
     last = [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(last)
+    with pytest.raises(OutputError, match="--overwrite"):
+        written(path, tmp_path / "a.ply")
+    path = frame(tmp_path, "b")
+    count, said = written(path, tmp_path / "b.ply")
+    assert count == HEIGHT * WIDTH
+    assert "without colours" not in said
+    corner = [-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2]  # by the calibration of `written`
+    assert points_of(tmp_path / "b.ply")[0] == pytest.approx(corner, rel=1e-5)
+    row = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")[1][:27]
+    assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
 
 
-def test_frames_that_do_not_fit_each_other_or_their_records_are_refused(tmp_path: Path) -> None:
-    out, cloud = tmp_path / "out", tmp_path / "o.ply"
-    frame(out, "a", camera=camera(5))
-    path = frame(out, "b", camera=camera(None))
-    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    cv2.imwrite(str(tmp_path / "big.png"), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
-    with pytest.raises(InputError, match="b_depth"):  # it alone has no pose
-        written(out, cloud, calib=None)
-    with pytest.raises(UsageError, match="--image"):
-        written(out, cloud, image=tmp_path / "a.png")
-    with pytest.raises(InputError, match=r"p\.txt"):
-        written(out, cloud, poses=tmp_path / "p.txt")
-    with pytest.raises(SizeError, match="--image"):
-        written(path, cloud, image=tmp_path / "big.png")
-    write_depth(path, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
-    with pytest.raises(SizeError, match="b_depth"):
-        written(path, cloud, calib=None)
-
-
-def test_pixels_beyond_the_limit_and_of_a_far_plane_are_left_out(tmp_path: Path) -> None:
+def test_pixels_that_are_far_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
     depth = np.linspace(2, 8, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
     depth[:5] = 1e10
     write_depth(tmp_path / "d.exr", depth)
     count, said = written(tmp_path / "d.exr", tmp_path / "d.ply")
     assert count == (HEIGHT - 5) * WIDTH
     assert "far plane" in said
-    count, said = written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)
-    assert count == int((depth <= 5).sum())
     assert "without colours" in said
-
-
-def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
-    companions = {"sigma": "a_sigma.png", "valid": "a_valid.png"}
-    path = frame(tmp_path, "a", outputs=companions)
+    assert written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)[0] == (depth <= 5).sum()
+    path = frame(tmp_path, "a", outputs={"sigma": "a_sigma.png", "valid": "a_valid.png"})
     valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
     valid[:4] = 0
     cv2.imwrite(str(tmp_path / "a_valid.png"), valid)
     sigma = np.full((HEIGHT, WIDTH), 0.05, np.float32)
     sigma[:, :8] = 0.5
-    write_depth(tmp_path / f"a_sigma{path.suffix}", sigma)
+    write_depth(tmp_path / "a_sigma.png", sigma)
     assert written(path, tmp_path / "a.ply")[0] == (HEIGHT - 4) * WIDTH
     assert written(path, tmp_path / "b.ply", max_sigma=0.1)[0] == (HEIGHT - 4) * (WIDTH - 8)
 
@@ -134,34 +107,39 @@ def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_
 
 
 def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None:
-    poses = "1 0 0 0 0 1 0 0 0 0 1 0\n"  # three cameras at one place, of which one is wrong
-    (tmp_path / "poses.txt").write_text(3 * poses)
+    poses = tmp_path / "poses.txt"  # three cameras at one place, of which one is wrong
+    poses.write_text(3 * "1 0 0 0 0 1 0 0 0 0 1 0\n")
     for name, depth in (("a", 2.0), ("b", 2.0), ("c", 3.0)):
         frame(tmp_path / "out", name, depth)
-    values = {"poses": tmp_path / "poses.txt", "overwrite": True}
-    found = {
-        views: written(tmp_path / "out", tmp_path / "o.ply", min_views=views, **values)[0]
-        for views in (1, 2)
-    }
-    assert found == {1: 3 * HEIGHT * WIDTH, 2: 2 * HEIGHT * WIDTH}
+    for views, agreed in ((1, 3), (2, 2)):
+        output = tmp_path / f"{views}.ply"
+        count = written(tmp_path / "out", output, min_views=views, poses=poses)[0]
+        assert count == agreed * HEIGHT * WIDTH
     with pytest.raises(UsageError, match="--min-views 4 needs as many frames with poses"):
-        written(tmp_path / "out", tmp_path / "o.ply", min_views=4, **values)
+        written(tmp_path / "out", tmp_path / "4.ply", min_views=4, poses=poses)
 
 
-@pytest.mark.parametrize(
-    ("values", "error"),
-    [
-        ({"calib": None}, UsageError),
-        ({"voxel": 0.0}, UsageError),
-        ({"max_depth": 0.5}, InputError),
-        ({"min_views": 2}, UsageError),
-        ({"max_sigma": 0.1}, InputError),
-    ],
-)
-def test_what_cannot_be_done_is_an_error_and_writes_nothing(
-    tmp_path: Path, values: dict[str, Any], error: type[Exception]
-) -> None:
-    path = frame(tmp_path, "a")
-    with pytest.raises(error):
-        written(path, tmp_path / "o.ply", **values)
-    assert not (tmp_path / "o.ply").exists()
+def test_what_cannot_be_done_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
+    out, cloud = tmp_path / "out", tmp_path / "o.ply"
+    frame(out, "a", camera=camera(5))
+    b, c = frame(out, "b", camera=camera(None)), frame(tmp_path, "c")
+    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    big, resized = tmp_path / "big.png", tmp_path / "c_depth.exr"
+    cv2.imwrite(str(big), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
+    write_depth(resized, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))
+    cases: list[tuple[Path, dict[str, Any], type[Exception], str]] = [
+        (c, {"calib": None}, UsageError, "--calib"),
+        (c, {"voxel": 0.0}, UsageError, "voxel"),
+        (c, {"max_depth": 0.5}, InputError, "c_depth"),
+        (c, {"min_views": 2}, UsageError, "--min-views"),
+        (c, {"max_sigma": 0.1}, InputError, "c"),
+        (out, {"calib": None}, InputError, "b_depth"),  # it alone has no pose
+        (out, {"image": big}, UsageError, "--image"),
+        (out, {"poses": tmp_path / "p.txt"}, InputError, r"p\.txt"),
+        (b, {"image": big}, SizeError, "--image"),
+        (resized, {}, SizeError, "c_depth"),
+    ]
+    for path, values, error, named in cases:
+        with pytest.raises(error, match=named):
+            written(path, cloud, **values)
+    assert not cloud.exists()

@@ -55,7 +55,9 @@ def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_be
     assert errors[0] < 0.85 * errors[1]
 
 
-def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
+def test_shards_give_the_same_and_a_neighbours_new_points_or_poses_another_run(
+    tmp_path: Path,
+) -> None:
     root = drive_on_disk(tmp_path)
     accumulating(root)
     whole = results(root / "out")
@@ -63,11 +65,6 @@ def test_the_bytes_do_not_depend_on_the_shards(tmp_path: Path) -> None:
     for number in (1, 2, 3):
         accumulating(root, shard=(number, 3))
     assert results(root / "out") == whole
-
-
-def test_a_frame_is_done_again_when_a_neighbours_points_or_poses_change(tmp_path: Path) -> None:
-    root = drive_on_disk(tmp_path)
-    accumulating(root)
     (root / "sparse/drive_000.png").write_bytes((root / "sparse/drive_003.png").read_bytes())
     assert accumulating(root) == ["drive_000", "drive_001"]
     rows = (root / "poses.txt").read_text().splitlines()
@@ -106,51 +103,43 @@ def test_motion_leads_from_the_neighbours_camera_to_the_frames(tmp_path: Path) -
     assert of_turned.motion == ((0, -1, 0, 4), (1, 0, 0, 0), (0, 0, 1, 1))
     back = [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]]
     np.testing.assert_allclose(of_still.motion, back, atol=1e-12)
-
-
-def test_neighbours_need_images_or_poses(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="a_2: --accumulate"):
+    with pytest.raises(UsageError, match="a_2: --accumulate"):  # neither images nor poses
         linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"])
 
 
-@pytest.fixture
-def rendered(tmp_path: Path) -> Path:
-    """The drive of `samples/` without its poses, and net/ with a network."""
+@pytest.mark.parametrize("turned", [None, 0.0, 0.02])
+def test_motion_is_estimated_from_images_and_poses_that_they_contradict_get_a_warning(
+    turned: float | None, tmp_path: Path
+) -> None:
     for part in ("rgb", "sparse", "calib"):
         shutil.copytree(DRIVE / part, tmp_path / part)
     (tmp_path / "net").mkdir()
     frame_on_disk(tmp_path / "net")
-    return tmp_path
-
-
-def test_without_poses_the_motion_is_estimated_and_recorded(rendered: Path) -> None:
-    listener = RecordingListener()
-    accumulating(rendered, limit=1, poses=None, listener=listener)
-    assert "poses: estimated from the images" in listener.messages
-    record = record_of(rendered, "drive_000")
+    poses, listener = tmp_path / "steps.txt", RecordingListener()
+    turn = Rotation.from_rotvec([0, turned or 0, 0]).as_matrix()
+    step = np.column_stack([turn, [0, 0, 0.3 if turned else 0.6]])
+    np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
+    accumulating(tmp_path, listener=listener, limit=1, poses=None if turned is None else poses)
+    record, messages = record_of(tmp_path, "drive_000"), " ".join(listener.messages)
     (neighbour,) = record["neighbours"]
-    assert neighbour["poses"].startswith("estimated from the images: ")
-    assert neighbour["poses"].endswith("matches of the images")
-    assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
-    assert record["points"]["moved"] > 500
+    assert neighbour.get("contradicts_images", False) == bool(turned)
+    assert ("contradict the images" in messages) == bool(turned)
+    if turned is None:
+        assert "poses: estimated from the images" in messages
+        assert neighbour["poses"].startswith("estimated from the images: ")
+        assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
+        assert record["points"]["moved"] > 500
 
 
-@pytest.mark.parametrize(("metres", "turned"), [(0.6, 0.0), (0.3, 0.02)])
-def test_poses_that_the_images_contradict_get_a_warning(
-    metres: float, turned: float, rendered: Path
+def test_neighbours_are_sampled_and_a_frame_without_motion_or_calibration_fails(
+    tmp_path: Path,
 ) -> None:
-    listener = RecordingListener()
-    turn = Rotation.from_rotvec([0, turned, 0]).as_matrix()
-    rows = [np.eye(3, 4), *2 * [np.column_stack([turn, [0, 0, metres]])]]
-    np.savetxt(rendered / "poses.txt", np.reshape(rows, (3, 12)))
-    accumulating(rendered, listener=listener, limit=1)
-    (neighbour,) = record_of(rendered, "drive_000")["neighbours"]
-    assert neighbour.get("contradicts_images", False) == (turned > 0)
-    assert any("contradict the images" in text for text in listener.messages) == (turned > 0)
-
-
-def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
     root, listener = drive_on_disk(tmp_path, frames=2), RecordingListener()
+    shutil.copytree(root / "sparse", root / "gt")
+    accumulating(root, refine={"iterations": 1, "sample": SamplePattern(count=200)})
+    record = record_of(root, "drive_000")
+    assert record["points"]["moved"] > 20
+    assert record["neighbours"][0]["path"].endswith("gt/drive_001.png")
     poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, poses=None)
     shutil.rmtree(root / "calib")
@@ -158,15 +147,6 @@ def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: P
     ways_out = ["--poses"] * 2 + ["camera"] * 2
     messages = [record.message or "" for record in listener.records]
     assert all(way in message for message, way in zip(messages, ways_out, strict=True))
-
-
-def test_neighbours_of_sampled_frames_are_sampled(tmp_path: Path) -> None:
-    root = drive_on_disk(tmp_path, frames=2)
-    shutil.copytree(root / "sparse", root / "gt")
-    accumulating(root, refine={"iterations": 1, "sample": SamplePattern(count=200)})
-    record = record_of(root, "drive_000")
-    assert record["points"]["moved"] > 20
-    assert record["neighbours"][0]["path"].endswith("gt/drive_001.png")
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:

@@ -9,13 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.records import write_summary
@@ -60,29 +58,27 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def test_a_batch_equals_as_many_single_refinements_byte_for_byte(root: Path) -> None:
-    batch(root, refine={"holdout": 0.3, "seed": 5})
-    together = results(root / "out")
+def test_a_second_run_does_nothing_and_a_batch_equals_as_many_single_refinements(
+    root: Path,
+) -> None:
+    refine = {"holdout": 0.3, "seed": 5}
+    batch(root, refine=refine)
+    os.utime(root / "rgb/a.png", (1, 1))  # that a file was touched or moved does not matter
+    os.utime(root / "out/b_depth.png", (1, 1))
+    moved = root.rename(root.with_name("moved"))
+    together, before, listener = results(moved / "out"), times(moved / "out"), RecordingListener()
+    batch(moved, listener, refine=refine)
+    assert (listener.to_do, listener.names) == (0, [])
+    assert listener.messages[-1] == "4 frames, all of them done already"
+    assert times(moved / "out") == before
+    moved.rename(root)
     shutil.rmtree(root / "out")
     for name in NAMES:
         parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
         files = {part: root / folder / f"{name}.png" for part, folder in parts}
-        refine_image(refinement(root, output=root / "out", **files, holdout=0.3, seed=5))
+        refine_image(refinement(root, output=root / "out", **files, **refine))
     assert len(together) == 4 * len(NAMES)
     assert together == results(root / "out")
-
-
-def test_a_second_run_does_nothing_also_where_files_were_touched_or_moved(root: Path) -> None:
-    batch(root)
-    os.utime(root / "rgb/a.png", (1, 1))
-    os.utime(root / "out/b_depth.png", (1, 1))
-    moved = root.rename(root.with_name("moved"))
-    before, listener = times(moved / "out"), RecordingListener()
-    batch(moved, listener)
-    assert (listener.to_do, listener.names) == (0, [])
-    assert listener.messages[-1] == "4 frames, all of them done already"
-    assert times(moved / "out") == before
-    assert [row["name"] for row in summary(moved)["frames"]] == list(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -114,20 +110,15 @@ def test_only_what_is_missing_or_changed_is_done_again(
 
 def test_other_settings_weights_or_code_in_the_same_file_do_all_again(root: Path) -> None:
     loss, code = root / "mine.py", root / "net/my_net.py"
-    loss.write_text(
-        "def loss(predicted, measured):\n    return (predicted - measured).abs().mean()"
-    )
+    loss.write_text("def loss(one, other):\n    return (one - other).abs().mean()")
     own = load_file(root / "net/my_net.safetensors")
     torch.save({"model": own, "ema": own}, root / "w.pt")
-
     refine: dict[str, Any] = {}
     for change in (
         lambda: refine.update(normalise="bytes"),
         lambda: refine.update(loss=str(loss)),
         lambda: edit(loss, ".abs()", "**2"),
         lambda: edit(code, "2 + 3", "2.5 + 3"),
-        lambda: refine.update(model=f"{code}:Net"),
-        lambda: edit(code, "2.5 + 3", "2.6 + 3"),
         lambda: refine.update(checkpoint=root / "w.pt"),
         lambda: refine.update(checkpoint=root / "w.pt:ema"),
     ):
@@ -142,7 +133,6 @@ def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root
     listener = RecordingListener()
     counts = batch(root, listener).counts
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
-    assert [record.status for record in listener.records] == ["done", "failed", "done", "done"]
     assert "b.png" in (listener.records[1].message or "")
     assert not list((root / "out").glob("b*_*"))
     (root / "rgb/b.png").write_bytes(good)
@@ -166,44 +156,36 @@ def test_any_name_that_a_file_can_have_will_do(tmp_path: Path) -> None:
     assert done(root) == []
 
 
-@pytest.mark.parametrize("output", [".", "rgb", "..", "rgb/a.png"])
-def test_an_output_that_is_a_file_or_holds_the_frames_is_refused(root: Path, output: str) -> None:
-    with pytest.raises(OutputError):
-        batch(root, output=root / output)
-    assert not list(root.rglob(".batch*"))
-
-
-def test_a_folder_without_frames_is_an_error_and_results_inside_are_no_frames(root: Path) -> None:
+def test_results_inside_are_no_frames_and_what_holds_the_frames_is_no_output(root: Path) -> None:
     output = root / "gt" / "deep" / "out"
     batch(root, output=output, refine={"format": "exr"})
     assert done(root, output=output) == list(NAMES)
-    assert json.loads((output / "summary.json").read_text())["unmatched"] == []
+    assert summary(root / "gt/deep")["unmatched"] == []
+    for bad in (".", "rgb", "..", "rgb/a.png"):
+        with pytest.raises(OutputError):
+            batch(root, output=root / bad)
     shutil.rmtree(root / "rgb")
     (root / "rgb").mkdir()
     with pytest.raises(InputError, match="no frame"):
         batch(root)
+    assert {path.parent for path in root.rglob(".batch*")} <= {output}
 
 
-@pytest.mark.parametrize("name", ["c.json", "c_depth.png", "summary.csv", "summary.json"])
+@pytest.mark.parametrize("name", ["c.json", "c_depth.png", "summary.csv"])
 def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Path) -> None:
     (root / "out").mkdir()
     (root / "out" / name).write_text("mine")
     for _ in range(2):  # a refused run does not make the folder a batch's own
         with pytest.raises(OutputError, match=rf"{name} exists, and no batch wrote it; --over"):
             batch(root)
-    assert [path.name for path in (root / "out").iterdir()] == [name]
-    assert (root / "out" / name).read_text() == "mine"
+    assert [path.read_text() for path in (root / "out").iterdir()] == ["mine"]
     batch(root, refine={"overwrite": True})
     batch(root)  # it is the batch's own now
     assert (root / "out" / name).read_bytes() != b"mine"
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        *("../up", "/up", ".batch.lock/x", "summary", "summary.csv/x", "fine\u0301"),
-        *("ok_view", "ok_depth.png/x", "ok.json/deep/x"),
-    ],
+    "name", ["../up", "/up", ".batch.lock/x", "summary", "fine\u0301", "ok_view", "ok_depth.png/x"]
 )
 def test_a_name_without_files_of_its_own_is_refused(root: Path, name: str) -> None:
     rows = [f'rgb/a.png,sparse/a.png,"{each}"' for each in ("ok", "fin\u00e9", name)]
@@ -224,12 +206,18 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
-def test_frames_are_chosen_by_name_then_by_step_then_by_number(root: Path) -> None:
+def test_frames_are_chosen_by_name_then_by_step_then_by_number_and_measures_by_columns(
+    root: Path,
+) -> None:
     assert done(root, names="[b-d]", every=2) == ["b", "d"]
-    assert done(root, names="[a-c]", every=2, limit=1) == ["a"]
+    assert done(root, names="[a-c]", every=2, limit=1, columns=("delta1", "mae")) == ["a"]
     assert summary(root)["counts"]["pending"] == 1
-    with pytest.raises(UsageError, match=r"A\*"):
-        batch(root, names="A*")
+    header = [*rows_of(root)[0]]
+    assert header[6:8] == ["delta1_before", "mae_before"]
+    assert "rmse" not in " ".join(header)
+    for mistake in ({"names": "A*"}, {"columns": ("mse",)}):
+        with pytest.raises(UsageError, match=r"A\*|--columns"):
+            batch(root, **mistake)
 
 
 def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
@@ -248,52 +236,39 @@ def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left
     assert not list(root.rglob(".0123456789ab"))
 
 
-def test_a_network_may_diverge_and_fail_on_single_frames(root: Path) -> None:
-    add_frame(root, "e", np.zeros((50, 40, 3), np.uint8))
-    for part in ("sparse", "gt"):
-        cv2.imwrite(str(root / part / "e.png"), np.full((50, 40), 2000, np.uint16))
+def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root: Path) -> None:
     formula = "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))"
-    exponential = "torch.exp(self.decode(self.middle(self.encode(rgb))))"
-    check = "        assert rgb.shape[2] < rgb.shape[3]\n        return"
-    edit(root / "net/my_net.py", formula, exponential)
-    edit(root / "net/my_net.py", "        return", check)
-    for names in (["a", "b", "c", "d", "e"], ["e"]):
-        listener = RecordingListener()
-        counts = batch(root, listener, refine={"lr": "1e4", "depth_scale": 1000}).counts
-        assert (counts["diverged"], counts["failed"]) == (4, 1)
-        assert listener.names == names
+    edit(root / "net/my_net.py", formula, "torch.exp(self.decode(self.middle(self.encode(rgb))))")
+    assert batch(root, refine={"lr": "1e4"}).counts["diverged"] == 4
+    assert done(root, refine={"lr": "1e4"}) == []
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
 
 
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     for number in range(7):
         shutil.copy(root / "rgb/a.png", root / f"rgb/x{number}.png")
-    listener = RecordingListener()
-    batch(root, listener, limit=2, refine={"holdout": 0.2, "baselines": True})
-    result = batch(root, refine={"holdout": 0.2, "baselines": True})
+    listener, refine = RecordingListener(), {"holdout": 0.2, "baselines": True}
+    batch(root, listener, limit=2, refine=refine)
+    result = batch(root, refine=refine)
     content = summary(root)
-    rows = content.pop("frames")
+    rows, table = content.pop("frames"), rows_of(root)
     assert content == plain(asdict(result))
-    assert [row["name"] for row in rows] == list(NAMES)
+    assert [row["name"] for row in rows] == [line["name"] for line in table] == list(NAMES)
     assert content["errors"].keys() == {"ground_truth", "held_out", "validation", "used"}
     for basis, stages in content["errors"].items():
         assert {"before", "after"} <= stages.keys()
-        assert basis not in ("ground_truth", "validation") or set(BASELINES) <= stages.keys()
         for stage, means in stages.items():
             assert means.pop("frames") == 4
             for measure, mean in means.items():
                 values = [row["errors"][basis][stage][measure] for row in rows]
                 assert mean == pytest.approx(np.mean(values), rel=1e-12)
     errors = rows[1]["errors"]
-    table = rows_of(root)
-    assert [line["name"] for line in table] == list(NAMES)
     assert float(table[1]["rmse_after"]) == errors["ground_truth"]["after"]["rmse"]
     assert float(table[1]["held_out_mae_before"]) == errors["held_out"]["before"]["mae"]
     assert float(table[1]["validation_mae_linear"]) == errors["validation"]["linear"]["mae"]
     # Files that are in no frame: five are named, and all are in the summary.
     assert len(content["unmatched"]) == 7
     assert sum("rgb/x" in text for text in listener.messages) == 5
-    assert any("2 more files" in text for text in listener.messages)
 
 
 def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: Path) -> None:
@@ -324,15 +299,6 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
     assert ["4 frames count as 2 groups of frames" in note for note in told.notes] == [True]
 
 
-def test_columns_choose_the_measures_of_the_tables_of_a_batch(root: Path) -> None:
-    batch(root, columns=("delta1", "mae"), limit=1)
-    header = [*rows_of(root)[0]]
-    assert header[6:8] == ["delta1_before", "mae_before"]
-    assert not [name for name in header if "rmse" in name]
-    with pytest.raises(UsageError, match="--columns"):
-        batch(root, columns=("mse",))
-
-
 def test_frames_without_sparse_depth_need_to_be_sampled(root: Path) -> None:
     for old, new in (("rgb", "frame-{}.color.png"), ("gt", "frame-{}.depth.png")):
         for name in NAMES:
@@ -345,7 +311,6 @@ def test_frames_without_sparse_depth_need_to_be_sampled(root: Path) -> None:
     points = FrameRecord.read(root / "out/frame-a.json").points
     assert points is not None
     assert points.used == 50
-    assert batch(root, refine={"sample": SamplePattern(count=10**6)}).counts["failed"] == 4
 
 
 def test_files_of_a_run_with_other_options_do_not_stay_beside_new_ones(root: Path) -> None:

@@ -8,20 +8,18 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli import Refiner, load_network
-from pnpdepth_cli.commands.refinement.refine_image import read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.settings import Settings
 from tests.commands.batches import batch
 from tests.commands.frames import FrameOnDisk, run
-from tests.completion.unregistered import SIZE, UNREGISTERED, frame
+from tests.completion.unregistered import SIZE, UNREGISTERED
+from tests.completion.unregistered import frame as unregistered
 
 
 def write_frame(root: Path, seed: int, count: int) -> dict[str, Path]:
     """Writes a frame that is not registered into rgb/ and sparse/; returns its files."""
-    rgb, points = frame(seed, UNREGISTERED, count)
+    rgb, points = unregistered(seed, UNREGISTERED, count)
     files = {"image": root / f"rgb/{seed:03}.png", "sparse": root / f"sparse/{seed:03}.png"}
     for path in files.values():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,24 +37,17 @@ def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) ->
     return run(own, **files | {"output": folder / "out", "overwrite": True} | options)
 
 
-def test_an_unregistered_image_is_moved_and_the_record_says_so(
+def test_an_unregistered_image_is_moved_but_not_if_off_nor_by_the_papers_method(
     tmp_path: Path, frame: FrameOnDisk
 ) -> None:
-    record = refined(tmp_path / "a", frame)
-    assert record.registration is not None
-    assert record.registration["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
-    assert any(note.startswith("image: moved") for note in record.notes)
-
-
-def test_off_and_the_papers_method_leave_the_image_and_numbers_are_recorded(
-    tmp_path: Path, frame: FrameOnDisk
-) -> None:
-    assert refined(tmp_path / "a", frame, method="paper").registration is None
-    assert refined(tmp_path / "a", frame, registration="off").registration is None
-    request = RefineRequest().with_fields(**write_frame(tmp_path, 0, 500), registration="off")
-    assert read_requested(request).one_view
-    record = refined(tmp_path / "a", frame, registration=(0.9, -5.0, 3.0))
-    assert record.registration == {"zoom": 0.9, "right": -5.0, "down": 3.0}
+    moved = refined(tmp_path, frame)
+    assert moved.registration is not None
+    assert moved.registration["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
+    assert any(note.startswith("image: moved") for note in moved.notes)
+    assert refined(tmp_path, frame, method="paper").registration is None
+    assert refined(tmp_path, frame, registration="off").registration is None
+    given = refined(tmp_path, frame, registration=(0.9, -5.0, 3.0)).registration
+    assert given == {"zoom": 0.9, "right": -5.0, "down": 3.0}
 
 
 def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
@@ -74,18 +65,13 @@ def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
 
 
 def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
-    files = write_frame(tmp_path, 0, 800)
-    inputs = read_requested(RefineRequest().with_fields(**files))
+    whole = refined(tmp_path, frame, count=800).registration
     record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
-    assert inputs.image is not None
-    all_points = evidence(inputs.image, inputs.points)
-    assert all_points is not None
-    whole = estimate_registration([all_points])
-    assert whole is not None
     assert record.points is not None
     assert record.points.used == 400
+    assert whole is not None
     assert record.registration is not None
-    assert record.registration["right"] != whole.right
+    assert record.registration["right"] != whole["right"]
 
 
 def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
@@ -101,10 +87,8 @@ def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
     assert first is not None
     assert first["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
     assert others == [first] * 7
-
-
-def test_arrays_of_a_sequence_share_a_registration_that_one_alone_does_not_show() -> None:
-    frames = [frame(seed, UNREGISTERED, 80) for seed in range(8)]
+    # So do arrays of a sequence.
+    frames = [unregistered(seed, UNREGISTERED, 80) for seed in range(8)]
     network, fixed = load_network("compact"), Settings(propagate="none")
     with Refiner(network, fixed) as alone, Refiner(network, fixed) as together:
         together.share_registration(frames)
