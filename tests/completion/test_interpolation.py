@@ -48,21 +48,17 @@ def test_every_pixel_gets_a_depth_among_those_of_the_points(
 
 
 @pytest.mark.parametrize("name", FILLS)
-def test_of_points_at_one_position_the_nearest_counts_and_without_any_there_is_no_answer(
+def test_of_points_at_one_position_the_nearest_counts_and_those_beyond_the_border_do(
     name: str,
 ) -> None:
     points = scattered(30, on_grid=True)
     xy, depth = points.xy.repeat(2, 1), torch.cat([points.depth + 5, points.depth])
     assert torch.equal(FILLS[name](points_at(xy, depth, points.size)), FILLS[name](points))
-    with pytest.raises(NoPointsError):
-        FILLS[name](scattered(0))
-
-
-@pytest.mark.parametrize("name", FILLS)
-def test_points_beyond_the_border_count(name: str) -> None:
     dense = FILLS[name](points_at([(-2.0, 3.0), (12.5, 3.0)], [2.0, 8.0], (6, 10)))
     assert dense[3, 0] < 3
     assert dense[3, 9] > 7
+    with pytest.raises(NoPointsError):
+        FILLS[name](scattered(0))
 
 
 @pytest.mark.parametrize("space", SPACES)
