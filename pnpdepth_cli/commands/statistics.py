@@ -101,6 +101,8 @@ def block_length(series: Floats) -> int:
     if frames < MIN_CLUSTERS:
         return 1
     centred = series - series.mean(axis=0)
+    rounding = 1e-9 * np.abs(series).max(axis=0)
+    centred[:, np.abs(centred).max(axis=0) <= rounding] = math.nan  # equal in every frame
     with np.errstate(divide="ignore", invalid="ignore"):
         lag_one = (centred[1:] * centred[:-1]).sum(axis=0) / (centred**2).sum(axis=0)
     known = lag_one[np.isfinite(lag_one)]

@@ -144,3 +144,5 @@ def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
     assert find_clusters(["drive"] * 60, short).count == 60 // block_length(short) < 6
     assert block_length(np.column_stack([series, np.full(1000, np.nan)])) == length
     assert block_length(np.full((200, 1), np.nan)) == block_length(np.ones((200, 1))) == 1
+    rounded = 0.1 + 1e-16 * np.arange(200)[:, None]  # differences that are equal
+    assert block_length(rounded) == 1
