@@ -12,14 +12,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.errors import FileFormatError, InputError
-from pnpdepth_cli.io.file_bytes import (
-    fingerprint,
-    is_unchanged,
-    read_json,
-    read_rows,
-    sha256_of,
-    write_json,
-)
+from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, read_json, read_rows, write_json
 
 
 @dataclass
@@ -27,38 +20,29 @@ class Point:
     x: float
 
 
-def test_what_is_written_is_read_back_plain_and_in_the_same_order(tmp_path: Path) -> None:
-    inner = {"z": [None, True, -1.5e-300, 10**30], "ä": {}, "": '\u2028 "\\\n\0 \U0001f600'}
-    mapping = {"é-_": [inner, [], [[1]]], "a": inner, "0": 0.1 + 0.2}
-    others = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "t": (1, 2)}
-    write_json(tmp_path / "record.json", {**mapping, **others, "d": Point(x=float("inf"))})
-    again = read_json(tmp_path / "record.json")
-    plain = {"n": 3, "x": [0.5, None], "p": "a/b", "t": [1, 2], "d": {"x": None}}
-    assert again == {**mapping, **plain}
-    assert [list(again), list(again["a"])] == [[*mapping, *plain], list(inner)]
-
-
-def test_the_text_is_readable_and_what_json_cannot_hold_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "r.json"
-    write_json(path, {"name": "Tübingen", "δ1": 0.5})
+def test_json_is_read_back_plain_and_in_order_and_what_it_cannot_hold_leaves_the_old_file(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "record.json"
+    same = {"é-_": [{"z": [None, True, -1.5e-300, 10**30]}, []], "a": '\u2028 "\\\n\0', "0": 0.3}
+    others = {"n": np.int64(3), "x": np.array([0.5, np.nan]), "p": Path("a/b"), "d": Point(x=9)}
+    write_json(path, {**same, **others})
+    plain = {**same, "n": 3, "x": [0.5, None], "p": "a/b", "d": {"x": 9}}
+    assert list(read_json(path).items()) == list(plain.items())
+    write_json(path, {"name": "Tübingen"})
     with pytest.raises(TypeError):
         write_json(path, {"a": object()})
-    assert path.read_text("utf-8") == '{\n  "name": "Tübingen",\n  "δ1": 0.5\n}\n'
+    assert path.read_text("utf-8") == '{\n  "name": "Tübingen"\n}\n'
 
 
 @pytest.mark.parametrize(
     "content",
-    [
-        *(b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"[" * 100_000, None),
-        b'{"a": 1%s}' % (b"0" * 400),
-    ],
+    [b"{", b"[1]", b'{"a": NaN}', b"\xff\xfe", b"[" * 100_000, b'{"a": 1%s}' % (b"0" * 400)],
 )
-def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "r.json"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError if content is None else FileFormatError, match=r"r\.json") as no:
-        read_json(path)
+def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "r.json").write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"r\.json") as no:
+        read_json(tmp_path / "r.json")
     assert "\n" not in str(no.value)
 
 
@@ -74,19 +58,14 @@ def test_a_row_that_is_not_of_as_many_numbers_is_named_by_its_line(text: str, li
 def test_a_file_is_known_by_its_digest_whatever_its_times_say(tmp_path: Path) -> None:
     path = tmp_path / "f"
     path.write_bytes(b"abc")
-    os.utime(path, ns=(5, 7))
     known = fingerprint(path)
-    assert (known.size, known.mtime_ns) == (3, 7)
-    assert known.sha256 == hashlib.sha256(b"abc").hexdigest()
-    os.utime(path, ns=(5, 8))
-    assert is_unchanged(path, known)
-    time.sleep(0.02)
-    for content in (b"abd", b"abcd"):
+    assert (known.size, known.sha256) == (3, hashlib.sha256(b"abc").hexdigest())
+    time.sleep(0.02)  # times of files have steps
+    for content, same in ((b"abc", True), (b"abd", False), (b"abcd", False)):
         path.write_bytes(content)
-        os.utime(path, ns=(5, 7))
-        assert not is_unchanged(path, known)
+        os.utime(path, ns=(5, 8 if same else known.mtime_ns))
+        assert is_unchanged(path, known) is same
     path.unlink()
     assert not is_unchanged(path, known)
-    for read in (fingerprint, sha256_of):
-        with pytest.raises(InputError):
-            read(path)
+    with pytest.raises(InputError):
+        fingerprint(path)

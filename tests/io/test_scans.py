@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from pathlib import Path
 
@@ -92,14 +93,12 @@ def test_points_survive_every_format_and_what_is_no_number_is_left_to_the_gate(
         np.testing.assert_array_equal(got, points.astype(np.float32))
 
 
-@pytest.mark.parametrize("name", sorted(set(FILES) - {"kitti.bin", "scan.npy", "scan.txt"}))
-@pytest.mark.parametrize("count", ["9037", "9" * 5000, "9" * 12, "-1"])
+@pytest.mark.parametrize("name", [name for name in FILES if name.endswith((".pcd", ".ply"))])
+@pytest.mark.parametrize("count", [b"9037", b"9" * 5000, b"9" * 12, b"-1"])
 def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
-    tmp_path: Path, name: str, count: str
+    tmp_path: Path, name: str, count: bytes
 ) -> None:
-    lie = FILES[name](POINTS)
-    for word in (b"POINTS", b"vertex"):
-        lie = lie.replace(word + b" 37\n", word + f" {count}\n".encode())
+    lie = re.sub(rb"(POINTS|vertex) 37", rb"\g<1> " + count, FILES[name](POINTS))
     (tmp_path / name).write_bytes(lie)
     with pytest.raises(FileFormatError):
         read_scan(tmp_path / name)
@@ -111,6 +110,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(24)),
         ("a.bin", b"\x89PNG\r\n\x1a\n" + bytes(24)),
         ("a.bin", bin_bytes(POINTS)[:-1]),
+        ("a.bin", bytes(80)),  # of any number of fields
         ("a.npy", npy_bytes(POINTS)[:-4]),
         ("a.npy", npy_bytes(POINTS, np.int32)),
         ("a.pcd", b"VERSION 0.7\nPOINTS 3\n"),
@@ -127,21 +127,6 @@ def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, cont
     with pytest.raises(InputError) as error:
         read_scan(tmp_path / name)
     assert "\n" not in str(error.value)
-
-
-def test_a_bin_of_kitti_or_nuscenes_is_recognised_by_its_content(tmp_path: Path) -> None:
-    points, path = np.resize(POINTS, (40, 3)), tmp_path / "scan.bin"
-    numbers = np.arange(40)
-    # intensity 0 to 255, and the index of one of 32 lasers
-    nuscenes = np.column_stack([points, numbers % 256, numbers % 32]).astype("<f4").tobytes()
-    for source, encoded in {"KITTI scan": bin_bytes(points), "nuScenes scan": nuscenes}.items():
-        path.write_bytes(encoded)
-        got, read_as = read_scan(path)
-        assert np.array_equal(got, points)
-        assert read_as == source
-    path.write_bytes(bytes(80))  # of any number of fields
-    with pytest.raises(FileFormatError):
-        read_scan(path)
 
 
 @pytest.mark.parametrize("coloured", [False, True])
