@@ -14,16 +14,6 @@ from pnpdepth_cli.io.poses import poses_of_frames, read_poses, read_trajectory
 HALF = float(np.sqrt(0.5))
 
 
-def test_rows_of_kitti_are_matrices_and_rows_of_tum_quaternions(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text("1 0 0 4 0 1 0 5 0 0 1 6\n\n0 -1 0 1 1 0 0 2 0 0 1 3\n")
-    assert read_poses(path)[1].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-    # A quarter turn about y: x becomes -z, z becomes x.
-    path.write_text(f"# time x y z q\n1305.5 1 2 3 0 {HALF} 0 {HALF}\n")
-    (pose,) = read_poses(path)
-    assert pose @ [1, 0, 0, 1] == pytest.approx([1, 2, 2])
-
-
 def tum_row(time_s: float, x: float) -> str:
     return f"{time_s} {x} 0 0 0 0 0 1\n"
 
@@ -58,44 +48,51 @@ def test_poses_are_joined_by_time_else_by_order_or_number(
         poses_of_frames(tmp_path / "poses.txt", ["x"] * 9)
 
 
-def transforms(folder: Path, *frames: tuple[str, object]) -> Path:
-    listed = [{"file_path": name, "transform_matrix": pose} for name, pose in frames]
-    (folder / "transforms.json").write_text(json.dumps({"frames": listed}))
-    return folder / "transforms.json"
-
-
 def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
     # a camera at (1, 2, 3) that looks along x of the world, whose z is up
     matrix = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
-    still = np.eye(4).tolist()
-    path = transforms(tmp_path, ("images/b.jpg", matrix), ("./images/a.png", still))
-    (_, pose), how = poses_of_frames(path, ["rgb/a", "rgb/b"])
+    path, still = tmp_path / "transforms.json", np.eye(4).tolist()
+
+    def poses_of(listed: dict[str, object], *names: str) -> tuple[np.ndarray, str]:
+        frames = [{"file_path": n, "transform_matrix": pose} for n, pose in listed.items()]
+        path.write_text(json.dumps({"frames": frames}))
+        return poses_of_frames(path, names)
+
+    (_, pose), how = poses_of({"images/b.jpg": matrix, "./images/a.png": still}, "rgb/a", "rgb/b")
     assert pose @ [0, 0, 5, 1] == pytest.approx([6, 2, 3])  # 5 ahead
     assert pose @ [0, 1, 0, 1] == pytest.approx([1, 2, 2])  # 1 down
     assert "OpenGL" in how
-    path = transforms(tmp_path, ("images/cam1/a.png", matrix), ("images/cam0/a.png", still))
-    assert poses_of_frames(path, ["cam0/a", "cam1/a"])[0][:, 0, 3].tolist() == [0, 1]
+    cameras = {"images/cam1/a.png": matrix, "images/cam0/a.png": still}
+    assert poses_of(cameras, "cam0/a", "cam1/a")[0][:, 0, 3].tolist() == [0, 1]
     for name in ("a", "d"):
         with pytest.raises(InputError, match=f"'{name}'"):
-            poses_of_frames(path, [name])
+            poses_of(cameras, name)
     for wrong in ([[1, 2]], "x"):
         with pytest.raises(FileFormatError):
-            poses_of_frames(transforms(tmp_path, ("a", wrong)), ["a"])
+            poses_of({"a": wrong}, "a")
 
 
-def test_poses_of_other_kinds_are_the_same_cameras(tmp_path: Path) -> None:
-    """A camera at (1, 2, 3), turned by a quarter about z, as each kind writes it."""
-    rows = {
-        "camera-to-world": ("0 -1 0 1 1 0 0 2 0 0 1 3", "from camera"),
+TURNED = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+"""A camera at (1, 2, 3), turned by a quarter about z."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "row", "words"),
+    [
+        ("camera-to-world", "0 -1 0 1 1 0 0 2 0 0 1 3", "from camera"),
+        ("camera-to-world", f"# time x y z q\n1305.5 1 2 3 0 0 {HALF} {HALF}", "from camera"),
         # x of the world is -y of the camera
-        "world-to-camera": ("0 1 0 -2 -1 0 0 1 0 0 1 -3", "from world"),
-        "opengl": ("0 1 0 1 1 0 0 2 0 0 -1 3", "OpenGL"),  # its y and z axes are the negative ones
-    }
-    for kind, (row, words) in rows.items():
-        (tmp_path / "poses.txt").write_text(row)
-        (pose,), how = poses_of_frames(tmp_path / "poses.txt", ["a"], kind)
-        assert pose.tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-        assert words in how
+        ("world-to-camera", "0 1 0 -2 -1 0 0 1 0 0 1 -3", "from world"),
+        ("opengl", "0 1 0 1 1 0 0 2 0 0 -1 3", "OpenGL"),  # its y and z axes are the negative ones
+    ],
+)
+def test_poses_of_every_kind_are_the_same_camera(
+    tmp_path: Path, kind: str, row: str, words: str
+) -> None:
+    (tmp_path / "poses.txt").write_text(row)
+    (pose,), how = poses_of_frames(tmp_path / "poses.txt", ["a"], kind)
+    np.testing.assert_allclose(pose, TURNED, atol=1e-15)
+    assert words in how
 
 
 @pytest.mark.parametrize(
