@@ -47,18 +47,11 @@ def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
     assert decoded.tolist() == [[[100] * 3 if len(pixel) == 1 else [50, 100, 200]] * 6] * 6
 
 
-@pytest.mark.parametrize(
-    "claim",
-    [
-        *({"height": 0}, {"height": 7}, {"width": 7}, {"step": 5}, {"step": 7}),
-        *({"encoding": "rgb8"}, {"encoding": "yuv422"}),
-    ],
-)
-def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused(
-    claim: dict[str, object],
-) -> None:
-    with pytest.raises(FileFormatError):
-        image_file(image_message(**claim), "/image")
+def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused() -> None:
+    sizes = ({"height": 0}, {"height": 7}, {"width": 7}, {"step": 5}, {"step": 7})
+    for claim in (*sizes, {"encoding": "rgb8"}, {"encoding": "yuv422"}):
+        with pytest.raises(FileFormatError):
+            image_file(image_message(**claim), "/image")
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -100,15 +93,14 @@ def test_a_chunk_is_decompressed_up_to_the_limit_only(store: str, kind: str) -> 
     size = [] if store == "rosbag1" else [1 << 40]
     try:
         set_max_pixels(1000)  # so that a file has 2²⁰ bytes at most
-        for parts in (1, 2):  # of one chunk
-            good, bomb = (parts * compress(bytes(n // parts)) for n in (1 << 20, BOMB))
-            assert table[kind](good, *size) == bytes(1 << 20)  # type: ignore[operator]
-            tracemalloc.start()
-            with pytest.raises(ValueError):
-                table[kind](bomb, *size)  # type: ignore[operator]
-            assert tracemalloc.get_traced_memory()[1] < BOMB / 4
-            tracemalloc.stop()
+        assert table[kind](compress(bytes(1 << 20)), *size) == bytes(1 << 20)  # type: ignore[operator]
+        bomb = 2 * compress(bytes(BOMB // 2))
+        tracemalloc.start()
+        with pytest.raises(ValueError):
+            table[kind](bomb, *size)  # type: ignore[operator]
+        assert tracemalloc.get_traced_memory()[1] < BOMB / 4
     finally:
+        tracemalloc.stop()
         set_max_pixels(None)
 
 
@@ -120,43 +112,34 @@ def test_a_compressed_bag_is_read(tmp_path: Path) -> None:
         assert read_all(write_bag(tmp_path / f"{kind.name}.bag", compression=kind)) == plain
 
 
-@pytest.mark.parametrize(
-    "metadata",
-    [
-        "rosbag2_bagfile_information: 3",
-        "rosbag2_bagfile_information: {compression_mode: file}",
-        "a: &a [x, x]\nb: &b [*a, *a]\n" + "rosbag2_bagfile_information: {version: [*b, *b]}",
-    ],
-)
-def test_metadata_of_another_kind_compression_and_aliases_are_refused(
-    metadata: str, tmp_path: Path
+METADATA = [
+    "rosbag2_bagfile_information: 3",
+    "rosbag2_bagfile_information: {compression_mode: file}",
+    "a: &a [x, x]\nb: &b [*a, *a]\n" + "rosbag2_bagfile_information: {version: [*b, *b]}",
+]
+COMPUTED = [
+    "ALTER TABLE messages ADD COLUMN big BLOB AS (zeroblob(900000000))",
+    "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE"
+    " n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS schema_version FROM n",
+    "CREATE VIRTUAL TABLE v USING fts5(x)",
+]
+
+
+@pytest.mark.parametrize("hostile", METADATA + COMPUTED)
+def test_a_bag_with_odd_metadata_or_a_database_that_computes_is_refused(
+    hostile: str, tmp_path: Path
 ) -> None:
     bag = write_bag(tmp_path / "ros2")
-    (bag / "metadata.yaml").write_text(metadata)
+    (file,) = bag.glob("*.db3")
+    if hostile in METADATA:
+        (bag / "metadata.yaml").write_text(hostile)
+    else:
+        with closing(sqlite3.connect(file)) as connection:
+            connection.executescript(hostile)
+        with pytest.raises(FileFormatError):
+            read_all(file)
     with pytest.raises(FileFormatError):
         read_all(bag)
-
-
-@pytest.mark.parametrize(
-    "statements",
-    [
-        "ALTER TABLE messages ADD COLUMN big BLOB AS (zeroblob(900000000))",
-        "CREATE VIEW schema AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
-        " SELECT i AS schema_version FROM n",
-        "CREATE VIRTUAL TABLE v USING fts5(x)",
-    ],
-)
-def test_a_database_that_computes_what_is_read_is_refused(statements: str, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "ros2")
-    (file,) = bag.glob("*.db3")
-    with closing(sqlite3.connect(file)) as connection:
-        if "VIEW schema" in statements:
-            connection.execute("DROP TABLE schema")
-        connection.execute(statements)
-        connection.commit()
-    for path in (bag, file):
-        with pytest.raises(FileFormatError):
-            read_all(path)
 
 
 def test_an_image_has_the_camera_info_beside_it_or_the_only_one() -> None:
