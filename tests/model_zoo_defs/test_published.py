@@ -7,21 +7,23 @@ from __future__ import annotations
 
 import hashlib
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from model_zoo_defs.eigen import Eigen
-from model_zoo_defs.fcrn import FCRN
+from model_zoo_defs.fcrn import FCRN, module_of
 from model_zoo_defs.sfmlearner import DispNet
 from model_zoo_defs.sparse2dense import SparseToDense
 from model_zoo_defs.sparseconv import SparseConvNet
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
+from tests.models.weights.files import npy_of, pickled
 
 LAYOUTS = {
     "eigen": "feb3263c6005e44b",
@@ -141,3 +143,47 @@ def test_a_published_file_loads_whole(name: str, counters: bool, tmp_path: Path)
     own = load_network(name, path).module.state_dict()
     assert own.keys() == state.keys()
     assert all(torch.equal(own[name], tensor) for name, tensor in kept.items())
+
+
+# ------------------------------------------------------------------ fcrn's numpy file
+
+NORM = {"weight": "scale", "bias": "offset", "running_mean": "mean", "running_var": "variance"}
+
+
+def layers_of_fcrn() -> Iterator[tuple[str, str]]:
+    """The convolutions of NYU_ResNet-UpProj.npy with their normalisations; either may be ""."""
+    yield from (("conv1", "bn_conv1"), ("layer1", "layer1_BN"), ("ConvPred", ""))
+    for stage, letters in ((2, "abc"), (3, "abcd"), (4, "abcdef"), (5, "abc")):
+        yield f"res{stage}a_branch1", f"bn{stage}a_branch1"
+        for place in (f"{letter}_branch2{part}" for letter in letters for part in "abc"):
+            yield f"res{stage}{place}", f"bn{stage}{place}"
+    for up in ("layer2x", "layer4x", "layer8x", "layer16x"):
+        yield f"{up}_Conv", f"{up}_BN"
+        for branch in (f"{up}_br1", f"{up}_br2"):
+            yield "", f"{branch}_BN"
+            yield from ((f"{branch}_Conv{letter}", "") for letter in "ABCD")
+
+
+def test_the_arrays_of_fcrns_authors_are_read_in_torchs_order(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    network = FCRN(4)
+    expected = {
+        name: torch.from_numpy(rng.normal(size=tensor.shape).astype(np.float32))
+        for name, tensor in network.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+    arrays: dict[str, dict[str, np.ndarray]] = {}
+    for conv, norm in layers_of_fcrn():
+        if conv:  # rows, columns, channels in and out
+            kernel = expected[f"{module_of(conv)}.weight"].permute(2, 3, 1, 0)
+            arrays[conv] = {"weights": kernel.numpy()}
+            if f"{module_of(conv)}.bias" in expected:
+                arrays[conv]["biases"] = expected[f"{module_of(conv)}.bias"].numpy()
+        if norm:
+            own = module_of(norm)
+            arrays[norm] = {kind: expected[f"{own}.{n}"].numpy() for n, kind in NORM.items()}
+    load_checkpoint(
+        network, find_definition("fcrn"), npy_of(tmp_path / "x.npy", pickled(arrays, 2))
+    )
+    for name, tensor in expected.items():
+        assert torch.equal(network.state_dict()[name], tensor)

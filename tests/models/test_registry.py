@@ -55,14 +55,10 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(text: str, open_list: Pat
 
 
 def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> None:
-    (open_list / "other_nets.py").write_text(
-        ONE.replace("NAME", "theirs-object") + SEVERAL.replace("NAME", "theirs-in-a-module")
-    )
-    install(
-        open_list,
-        "an-object = other_nets:definition\na-module = other_nets\na-dict = other_nets:definitions",
-    )
-    for name in ("theirs-object", "theirs-in-a-module"):
+    one, several = ONE.replace("NAME", "theirs-object"), SEVERAL.replace("NAME", "theirs-in-a-dict")
+    (open_list / "other_nets.py").write_text(one + several)
+    install(open_list, "object = other_nets:definition\na-dict = other_nets:definitions")
+    for name in ("theirs-object", "theirs-in-a-dict"):
         assert all_definitions()[name] == find_definition(name)
 
 

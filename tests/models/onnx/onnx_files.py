@@ -15,7 +15,6 @@ def write_network(
     shape: tuple[Any, ...] = (1, 3, 32, 48),
     opset: int = 13,
     channels_last: bool = False,
-    sign: float = 1.0,
     nodes: tuple[Any, ...] = (),
     outputs: tuple[str, ...] = ("depth",),
     domain: str = "",
@@ -44,8 +43,8 @@ def write_network(
     constants = [
         weight("w1", 8, 3, 3, 3), weight("w2", 8, 8, 3, 3), weight("w3", 1, 8, 3, 3),
         numpy_helper.from_array(np.array([1, 1, 4, 4], np.float32), "by"),
-        numpy_helper.from_array(np.array(2 * sign, np.float32), "two"),
-        numpy_helper.from_array(np.array(1 * sign, np.float32), "one"),
+        numpy_helper.from_array(np.float32(2), "two"),
+        numpy_helper.from_array(np.float32(1), "one"),
     ]  # fmt: skip
     graph = helper.make_graph(
         [*body, *nodes],

@@ -202,13 +202,6 @@ WORK = {
         constant("s", np.float32([1, 1, 1000, 1000])),
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
-    "MatMul": [
-        constant("n", [-1, 1]), constant("m", [1, -1]), constant("k", [1, 1, 1, 20]),
-        helper.make_node("Tile", ["depth", "k"], ["long"]),
-        helper.make_node("Reshape", ["long", "n"], ["a1"]),
-        helper.make_node("Reshape", ["long", "m"], ["a2"]),
-        helper.make_node("MatMul", ["a1", "a2"], ["big"]),
-    ],
     "sums": [
         size_of(4096, 4096),
         helper.make_node("ConstantOfShape", ["n"], ["a1"]),

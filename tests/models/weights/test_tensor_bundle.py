@@ -39,13 +39,11 @@ def varint(value: int) -> bytes:
 
 
 def entry(dtype: int, shape: tuple[int, ...], offset: int, size: int, shard: int = 0) -> bytes:
-    """A variable's entry: type, shape, shard, offset, size, checksum."""
-    sides = b"".join(
-        b"\x12" + varint(len(side)) + side for side in (b"\x08" + varint(n) for n in shape)
-    )
-    message = b"\x08" + varint(dtype) + b"\x12" + varint(len(sides)) + sides
-    message += b"\x18" + varint(shard) + b"\x20" + varint(offset) + b"\x28" + varint(size)
-    return message + b"\x35" + b"\0\0\0\0"
+    """A variable's entry: type, shape, shard, offset, size."""
+    sides = [b"\x08" + varint(side) for side in shape]
+    dims = b"".join(b"\x12" + varint(len(side)) + side for side in sides)
+    place = b"\x18" + varint(shard) + b"\x20" + varint(offset) + b"\x28" + varint(size)
+    return b"\x08" + varint(dtype) + b"\x12" + varint(len(dims)) + dims + place
 
 
 def block(entries: list[tuple[bytes, bytes]]) -> bytes:
@@ -54,30 +52,26 @@ def block(entries: list[tuple[bytes, bytes]]) -> bytes:
     return b"".join(lines) + struct.pack("<II", 0, 1) + b"\0" + b"\0\0\0\0"
 
 
-def index_of(*blocks: bytes, handles: list[tuple[int, int]] | None = None) -> bytes:
-    """An index with these blocks of data, all of them once unless (offset, size) are given."""
-    data = b"".join(blocks)
-    ends = np.cumsum([len(part) for part in blocks])
-    handles = handles or [
-        (end - len(part), len(part) - 5) for end, part in zip(ends, blocks, strict=True)
-    ]
-    named = [(b"\xff", varint(offset) + varint(size)) for offset, size in handles]
+def index_of(*blocks: bytes, copies: int = 1) -> bytes:
+    """An index that names each of these blocks of data so often."""
+    data, handles = b"", []
+    for part in blocks:
+        handles += [(b"\xff", varint(len(data)) + varint(len(part) - 5))] * copies
+        data += part
     tables = []
-    for part in (block([]), block(named)):
+    for part in (block([]), block(handles)):
         tables.append(varint(len(data)) + varint(len(part) - 5))
         data += part
     return data + b"".join(tables).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
 
 
-def rows_of(entries: dict[str, bytes], shards: int = 1) -> list[tuple[bytes, bytes]]:
-    """The header and the entries, as they lie in blocks."""
-    header = b"\x08" + varint(shards) + b"\x1a\x02\x08\x01"
-    return [(b"", header), *((k.encode(), v) for k, v in sorted(entries.items()))]
-
-
-def bundle(folder: Path, entries: dict[str, bytes], content: bytes) -> Path:
-    (folder / "x.index").write_bytes(index_of(block(rows_of(entries))))
-    (folder / "x.data-00000-of-00001").write_bytes(content)
+def bundle(folder: Path, entries: dict[str, bytes], *contents: bytes) -> Path:
+    """A checkpoint in two blocks, with a file for each of the contents."""
+    header = b"\x08" + varint(len(contents)) + b"\x1a\x02\x08\x01"
+    rows = [(key.encode(), value) for key, value in sorted(entries.items())]
+    (folder / "x.index").write_bytes(index_of(block([(b"", header)]), block(rows)))
+    for n, content in enumerate(contents):
+        (folder / f"x.data-0000{n}-of-0000{len(contents)}").write_bytes(content)
     return folder / "x.index"
 
 
@@ -96,20 +90,16 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path:
         assert torch.equal(tensors[name], tensor)
 
 
-def test_an_index_of_many_blocks_and_two_shards_is_read_whole(tmp_path: Path) -> None:
-    arrays = {f"layer{n}/weights": np.full((n % 3, 2), n, np.float32) for n in range(40)}
+def test_variables_of_two_files_are_read(tmp_path: Path) -> None:
+    arrays = [np.full((n % 3, 2), n, np.float32) for n in range(40)]
     contents, entries = [b"", b""], {}
-    for n, (name, array) in enumerate(arrays.items()):
-        entries[name] = entry(1, array.shape, len(contents[n % 2]), array.nbytes, n % 2)
+    for n, array in enumerate(arrays):
+        entries[f"layer{n}/w"] = entry(1, array.shape, len(contents[n % 2]), array.nbytes, n % 2)
         contents[n % 2] += array.tobytes()
-    rows = rows_of(entries, shards=2)
-    (tmp_path / "x.index").write_bytes(index_of(block(rows[:9]), block(rows[9:])))
-    for n, content in enumerate(contents):
-        (tmp_path / f"x.data-0000{n}-of-00002").write_bytes(content)
-    tensors = read_checkpoint(tmp_path / "x.index")
+    tensors = read_checkpoint(bundle(tmp_path, entries, *contents))
     assert len(tensors) == 40
-    for name, array in arrays.items():
-        assert np.array_equal(tensors[name.replace("/", ".")].numpy(), array)
+    for n, array in enumerate(arrays):
+        assert np.array_equal(tensors[f"layer{n}.w"].numpy(), array)
 
 
 @pytest.mark.parametrize(
@@ -137,8 +127,7 @@ def test_names_that_grow_from_one_another_and_blocks_named_again_take_no_memory(
     rows = [varint(n) + varint(1) + varint(0) + b"a" for n in range(60_000)]
     growing = b"".join(rows) + block([])[-13:]
     data = block([(b"%06d" % n, entry(1, (1,), 0, 4)) for n in range(500)])
-    again = [(0, len(data) - 5)] * 20_000
-    files = {"a name of": index_of(growing), "overlap": index_of(data, handles=again)}
+    files = {"a name of": index_of(growing), "overlap": index_of(data, copies=20_000)}
     for message, content in files.items():
         index.write_bytes(content)
         with little():
