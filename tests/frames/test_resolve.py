@@ -18,19 +18,15 @@ from pnpdepth_cli.settings import Settings
 from tests.frames.scenes import Brightness, Nearest, frame_in_memory, member
 
 
-@pytest.mark.parametrize(
-    ("errors", "expected"),
-    [
-        ({"unit": 0.064, "imagenet": 0.062, "symmetric": 0.07, "bytes": 0.3}, ("unit", "imagenet")),
-        ({"unit": 0.06, "imagenet": 0.15, "symmetric": 0.2, "bytes": 0.3}, ("unit", None)),
-        ({"unit": 0.2, "imagenet": 0.05, "symmetric": 0.15, "bytes": 0.3}, ("imagenet", None)),
-        ({"unit": 0.2, "imagenet": 0.05, "symmetric": 0.06, "bytes": 1}, ("imagenet", "symmetric")),
-    ],
-)
-def test_0_to_1_is_kept_unless_clearly_beaten(
-    errors: dict[str, float], expected: tuple[str, str | None]
-) -> None:
-    assert choose_input_range(errors) == expected
+def test_0_to_1_is_kept_unless_clearly_beaten() -> None:
+    for unit, imagenet, symmetric, expected in (
+        (0.064, 0.062, 0.07, ("unit", "imagenet")),
+        (0.06, 0.15, 0.2, ("unit", None)),
+        (0.2, 0.05, 0.15, ("imagenet", None)),
+        (0.2, 0.05, 0.06, ("imagenet", "symmetric")),
+    ):
+        errors = {"unit": unit, "imagenet": imagenet, "symmetric": symmetric, "bytes": 0.3}
+        assert choose_input_range(errors) == expected
 
 
 def test_the_ranges_are_those_of_their_names() -> None:
@@ -51,18 +47,10 @@ def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> 
             resolve_layer(unlisted, layer)
 
 
-@pytest.mark.parametrize(
-    ("build", "is_default", "expected"),
-    [
-        (Brightness, False, (9, "none")),
-        (Brightness, True, (5, "auto")),
-        (Nearest, False, (9, "none")),
-        (Nearest, True, (0, "none")),
-    ],
-)
-def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone(
-    build: type[Brightness | Nearest], is_default: bool, expected: tuple[int, str]
-) -> None:
-    asked, network = Settings(iterations=9, align="none", layer="layer"), member(build).network
-    found = resolve_member(network, frame_in_memory(), asked, is_default=is_default).settings
-    assert (found.iterations, found.align) == expected
+def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone() -> None:
+    asked, frame = Settings(iterations=9, align="none", layer="layer"), frame_in_memory()
+    for build, method in ((Brightness, (5, "auto")), (Nearest, (0, "none"))):
+        for is_default, expected in ((True, method), (False, (9, "none"))):
+            network = member(build).network
+            found = resolve_member(network, frame, asked, is_default=is_default).settings
+            assert (found.iterations, found.align) == expected

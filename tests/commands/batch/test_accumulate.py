@@ -74,33 +74,27 @@ def test_shards_give_the_same_and_a_neighbours_new_points_or_poses_another_run(
 
 def linked(root: Path, rows: list[str], poses: str = "") -> list[FrameFiles]:
     """The frames of a list with neighbours, and these poses."""
-    (root / "list.csv").write_text("\n".join(["name,sparse,camera,calib", *rows]) + "\n")
+    (root / "list.csv").write_text("\n".join(["name,sparse,camera,calib", *rows]))
     (root / "p.txt").write_text(poses)
     for name in ("s.png", "calib.txt"):
-        (root / name).write_bytes(b"")
-    request = BatchRequest(
-        source=root / "list.csv", output=root / "out", refine=RefineRequest(), accumulate=2,
-        poses=root / "p.txt" if poses else None,
-    )  # fmt: skip
+        (root / name).touch()
+    files = {"source": root / "list.csv", "poses": root / "p.txt" if poses else None}
+    request = BatchRequest(**files, output=root / "out", refine=RefineRequest(), accumulate=2)
     return [*find_frames(request).frames]
 
 
-STILL, TURNED = "1 0 0 0 0 1 0 0 0 0 1 0\n", "0 -1 0 4 1 0 0 0 0 0 1 1\n"
-
-
-def test_frames_of_another_sequence_or_camera_are_no_neighbours(tmp_path: Path) -> None:
+def test_neighbours_are_of_one_sequence_and_camera_and_motion_leads_to_the_frames_camera(
+    tmp_path: Path,
+) -> None:
     kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_3", 3), ("a_4", 3)]
     rows = [f"{name},s.png,{camera},calib.txt" for name, camera in kinds]
-    frames = linked(tmp_path, rows, 5 * STILL)
-    assert [[each.files.name for each in frame.neighbours] for frame in frames] == [
-        ["a_2"], ["a_1"], [], ["a_4"], ["a_3"],
-    ]  # fmt: skip
-
-
-def test_motion_leads_from_the_neighbours_camera_to_the_frames(tmp_path: Path) -> None:
-    frames = linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"], STILL + TURNED)
-    (of_turned,), (of_still,) = (each.neighbours for each in frames)
+    still, turned = "1 0 0 0 0 1 0 0 0 0 1 0\n", "0 -1 0 4 1 0 0 0 0 0 1 1\n"
+    frames = linked(tmp_path, rows, still + turned + 3 * still)
+    names = [[each.files.name for each in frame.neighbours] for frame in frames]
+    assert names == [["a_2"], ["a_1"], [], ["a_4"], ["a_3"]]
+    (of_turned,), (of_still,) = (each.neighbours for each in frames[:2])
     assert of_turned.motion == ((0, -1, 0, 4), (1, 0, 0, 0), (0, 0, 1, 1))
+    assert of_still.motion is not None
     back = [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]]
     np.testing.assert_allclose(of_still.motion, back, atol=1e-12)
     with pytest.raises(UsageError, match="a_2: --accumulate"):  # neither images nor poses

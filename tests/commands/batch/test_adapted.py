@@ -29,29 +29,25 @@ def batch(drive: Path, *more: str) -> int:
     return run(["batch", str(drive), "-o", str(drive.parent / "out"), *NETWORK, "--adapt", *more])
 
 
-def test_better_weights_are_used_for_every_frame_and_found_again(
-    drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("is_better", [True, False])
+def test_weights_are_kept_used_for_every_frame_and_found_again_if_they_are_better(
+    is_better: bool,
+    drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(adapting.Learnt, "is_better", True)
+    monkeypatch.setattr(adapting.Learnt, "is_better", is_better)
     assert batch(drive) == 0
-    weights = drive.parent / "out/adapted/drive.safetensors"
-    records = [json.loads(path.read_text()) for path in (drive.parent / "out").glob("drive_*.json")]
-    assert [record["model"]["checkpoint"] for record in records] == [str(weights)] * 8
-    before = weights.stat().st_mtime_ns
+    out, weights = drive.parent / "out", drive.parent / "out/adapted/drive.safetensors"
+    records = [json.loads(path.read_text()) for path in out.glob("drive_*.json")]
+    uses = [record["model"]["checkpoint"] == str(weights) for record in records]
+    assert uses == [is_better] * 8
+    before = {path: path.stat().st_mtime_ns for path in weights.parent.iterdir()}
+    assert (weights in before) == is_better
     capsys.readouterr()
     assert batch(drive) == 0
     assert "8 frames, all of them done already" in capsys.readouterr().err
-    assert weights.stat().st_mtime_ns == before
-
-
-def test_weights_that_are_not_better_are_neither_kept_nor_used(
-    drive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(adapting.Learnt, "is_better", False)
-    assert batch(drive) == 0
-    assert [path.name for path in (drive.parent / "out/adapted").iterdir()] == ["drive.json"]
-    record = json.loads((drive.parent / "out/drive_000.json").read_text())
-    assert record["model"]["checkpoint"] != str(drive.parent / "out/adapted/drive.safetensors")
+    assert {path: path.stat().st_mtime_ns for path in weights.parent.iterdir()} == before
 
 
 def test_a_network_without_points_cannot_be_adapted(drive: Path) -> None:
