@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -18,8 +17,7 @@ from tests.test_readme import run as run_python
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-SHOWN = dict(re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```', PAGE, flags=re.DOTALL | re.MULTILINE))
+SHOWN = titled_blocks(ROOT / "docs" / "extending.md")
 
 
 @pytest.fixture

@@ -43,10 +43,8 @@ def shown_commands(page: Path) -> list[list[str]]:
 
 def titled_blocks(page: Path) -> dict[str, str]:
     """The files that a page shows, by their name."""
-    text = page.read_text(encoding="utf-8")
-    return dict(
-        re.findall(r'^```(?:python|csv) title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE)
-    )
+    pattern = r'^```\w+ title="([^"]+)"\n(.*?)^```'
+    return dict(re.findall(pattern, page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE))
 
 
 def named(page: Path) -> str:

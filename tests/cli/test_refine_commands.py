@@ -144,21 +144,3 @@ def test_a_second_run_does_only_what_is_missing_and_failed_frames_stop_no_combin
     assert "(1 new)" in capsys.readouterr().err
     counts = [each["counts"] for each in summaries().values()]
     assert [(each["done"], each["failed"]) for each in counts] == [(1, 1)] * 2
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["colour=red"], "choose from sample, model"),
-        (["lr=1%,,3%"], "empty"),
-        (["lr=fast"], "lr must be"),
-        (["lr=1%,1%"], "twice"),
-        (["lr=1%,3%", "--lr", "1%"], "--lr is varied"),
-    ],
-)
-def test_what_cannot_be_varied_is_wrong_usage(
-    root: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
-) -> None:
-    assert run(arguments("--vary", *more)) == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-    assert not Path("out").exists()

@@ -10,11 +10,11 @@ from pnpdepth_cli.points import SparsePoints
 SIZE = (48, 64)
 
 
-def scene_depth(left: int = 10) -> Tensor:
-    """Depth (H, W) in metres: a floor, a wall, and a box from column `left` on."""
+def scene_depth() -> Tensor:
+    """Depth (H, W) in metres: a floor, a wall and a box."""
     y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
     depth = torch.minimum(60 / (y - 10).clamp_min(1), 4 + 0.02 * x)
-    depth[20:40, left : left + 20] = 1.4
+    depth[20:40, 10:30] = 1.4
     return depth
 
 
