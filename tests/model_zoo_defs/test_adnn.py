@@ -1,4 +1,4 @@
-"""adnn: SAME padding against a table, the solve against one in dense numpy, the authors' npz."""
+"""adnn: the solve against one in dense numpy, and the authors' variables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model_zoo_defs._same_padding import same_padding
 from model_zoo_defs.adnn import Adnn
 from pnpdepth_cli.errors import CheckpointError
 from pnpdepth_cli.models.network import load_network
@@ -99,16 +98,3 @@ def test_the_authors_variables_load_from_a_numpy_file_into_their_parameters(tmp_
     np.save(tmp_path / "adnn.npy", arrays | {"global_step": np.array(3)}, allow_pickle=True)
     with pytest.raises(CheckpointError):
         load_network("adnn", tmp_path / "adnn.npy")
-
-
-# (length, kernel, stride): padding at both ends
-TENSORFLOWS = {
-    (114, 3, 2): (0, 1), (113, 3, 2): (1, 1), (5, 3, 1): (1, 1), (228, 7, 2): (2, 3),
-    (9, 2, 2): (0, 1), (8, 1, 2): (0, 0), (1, 3, 2): (1, 1), (6, 5, 3): (1, 1),
-    (228, 11, 2): (4, 5), (1, 11, 2): (5, 5),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", TENSORFLOWS)
-def test_same_padding_is_tensorflows(case: tuple[int, int, int]) -> None:
-    assert same_padding(*case) == TENSORFLOWS[case]

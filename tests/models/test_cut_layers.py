@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.cut_layers import (
@@ -22,24 +23,19 @@ from pnpdepth_cli.settings import Settings
 IMAGE = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
 
 
-class Net(nn.Module):
+def net() -> nn.Sequential:
     """A front to 1/4 of the image's size, then two layers to 1/2."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
+    torch.manual_seed(0)
+    layers = {
         # 16 channels at 1/4 of the size are as many numbers as the prediction has.
-        self.front = nn.Conv2d(3, 16, 3, stride=4, padding=1)
-        self.middle = nn.Conv2d(16, 4, 3, padding=1)
-        self.relu = nn.ReLU(inplace=True)
-        self.squash = nn.Sigmoid()
-        self.up = nn.ConvTranspose2d(4, 4, 4, stride=2, padding=1)
-        self.head = nn.ConvTranspose2d(4, 1, 4, stride=2, padding=1)
-        self.requires_grad_(False)  # as networks are loaded
-
-    def forward(self, rgb: Tensor) -> Tensor:
-        z = self.squash(self.front(rgb))
-        return self.head(self.up(self.relu(self.middle(z))))  # type: ignore[no-any-return]
+        "front": nn.Conv2d(3, 16, 3, stride=4, padding=1),
+        "squash": nn.Sigmoid(),
+        "middle": nn.Conv2d(16, 4, 3, padding=1),
+        "relu": nn.ReLU(inplace=True),
+        "up": nn.ConvTranspose2d(4, 4, 4, stride=2, padding=1),
+        "head": nn.ConvTranspose2d(4, 1, 4, stride=2, padding=1),
+    }
+    return nn.Sequential(OrderedDict(layers)).requires_grad_(False)  # as networks are loaded
 
 
 def layers_of(network: nn.Module) -> tuple[str, ...]:
@@ -47,18 +43,18 @@ def layers_of(network: nn.Module) -> tuple[str, ...]:
 
 
 def test_the_last_layer_of_each_resolution_from_the_bottleneck_on_is_listed() -> None:
-    assert layers_of(Net()) == ("relu", "up")
+    assert layers_of(net()) == ("relu", "up")
 
 
 def test_a_front_without_gradient_is_reported() -> None:
-    network = Net()
-    network.front.forward = torch.no_grad()(network.front.forward)  # type: ignore[method-assign]
+    network = net()
+    network[0].forward = torch.no_grad()(network[0].forward)  # type: ignore[method-assign]
     with pytest.raises(ModelError):
         layers_of(network)
 
 
 def test_a_layer_that_runs_twice_or_gives_no_map_is_not_listed() -> None:
-    network = Net()
+    network = net()
     network.relu = network.squash = nn.ReLU(inplace=True)
     assert layers_of(network) == ("middle", "up")
     assert layers_of(nn.Identity()) == ()

@@ -40,8 +40,7 @@ def test_any_image_fits_any_policy_and_depth_comes_back_in_its_size(
     resized = frame.rgb_to_network(torch.rand(1, 3, height, width))
     assert tuple(resized.shape) == (1, 3, *frame.network)
     if isinstance(policy, Multiple):
-        assert frame.network[0] % policy.of == 0
-        assert frame.network[1] % policy.of == 0
+        assert [side % policy.of for side in frame.network] == [0, 0]
         assert max(frame.resized) <= (policy.longest or max(height, width))
     else:
         assert frame.network == (policy.height, policy.width)
@@ -67,11 +66,8 @@ def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(
     there = frame.points_to_network(every_pixel(*size))
     assert there.size == frame.network
     assert len(there) == math.prod(frame.crop[2:])  # those outside the crop are dropped
-    rows, columns = frame.resized
-    away_from_edges = (there.xy > 2).all(1) & (
-        there.xy < torch.tensor([columns - 3, rows - 3])
-    ).all(1)
-    points = there.select(away_from_edges)
+    last = torch.tensor(frame.resized[::-1]) - 3
+    points = there.select((there.xy > 2).all(1) & (there.xy < last).all(1))  # not at edges
     pixel = points.depth - 1
     for axis, expected in enumerate((pixel % size[1], pixel // size[1])):
         read = points.sample(network[:, axis : axis + 1])

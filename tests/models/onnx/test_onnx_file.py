@@ -91,33 +91,42 @@ def test_a_free_size_is_a_multiple_of_the_patches_of_a_vision_transformer(tmp_pa
     assert load_network(str(path), None).definition.size == Multiple(14)
 
 
-def test_what_is_no_network_that_is_covered_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "net.onnx"
     refused(path)
     path.touch()
     os.truncate(path, 2**31 + 1)  # without a byte on the disk
     refused(path)
     named = write_network(path).read_bytes()
-    no_text = (named.replace(word, b"\xff" + word[1:]) for word in (b"Sigmoid", b"dec/up", b"w1"))
-    for content in (b"not a network", b"", *no_text):
+    for content in (b"not a network", b"", named.replace(b"Sigmoid", b"\xffigmoid")):
         path.write_bytes(content)
         refused(path)
-    quantised = helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"])
-    message = refused(write_network(path, nodes=(quantised,), outputs=("scale",)))
-    assert "DynamicQuantizeLinear" in message
-    assert "com.microsoft.Add" in refused(write_network(path, domain="com.microsoft"))
-    refused(write_network(path, opset=99))
-    refused(write_network(path, shape=(1, 4, "h", None)))
-    for shape in ((1, 4, 32, 48), (2, 3, 32, 48), (1, 3, 32)):
-        assert "×".join(map(str, shape)) in refused(write_network(path, shape=shape))
+
+
+QUANTISED = helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", "zero"])
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"nodes": (QUANTISED,), "outputs": ("scale",)}, "DynamicQuantizeLinear"),
+        ({"domain": "com.microsoft"}, "com.microsoft.Add"),
+        ({"opset": 99}, "99"),
+        ({"shape": (1, 4, 32, 48)}, "1×4×32×48"),
+        ({"shape": (2, 3, 32, 48)}, "2×3×32×48"),
+        ({"shape": (1, 3, 10**6, 10**6)}, "pixels"),
+    ],
+)
+def test_a_network_that_is_not_covered_is_refused(
+    stated: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with little():
+        assert message in refused(write_network(tmp_path / "net.onnx", **stated))
 
 
 def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None:
     path = write_network(tmp_path / "net.onnx", outputs=("g", "depth"))
-    message = refused(path)
-    assert " 2 outputs" in message
-    assert "depth" in message
-    assert f"{path}:g" in message
+    assert f"2 outputs; name the depth as {path}:g" in refused(path)
     refused(path, f"{path}:x")
     for name in ("depth", "g"):
         network = load_network(f"{path}:{name}", None)
@@ -224,11 +233,6 @@ def test_far_more_memory_or_arithmetic_than_networks_have_is_refused_before(
         refused(path)
 
 
-def test_an_image_size_beyond_the_budget_is_refused(tmp_path: Path) -> None:
-    with little():
-        assert "pixels" in refused(write_network(tmp_path / "x.onnx", shape=(1, 3, 10**6, 10**6)))
-
-
 def beside(path: Path, *, copies: int = 0, dims: Any = (8, 3, 3, 3), **entry: object) -> Path:
     """A network whose first weights, and so many more, lie in a file beside it."""
     (path.parent / "weights.bin").write_bytes(bytes(range(216)) * 4)
@@ -247,22 +251,18 @@ def beside(path: Path, *, copies: int = 0, dims: Any = (8, 3, 3, 3), **entry: ob
     return edited(path, change)
 
 
-OUTSIDE = ["../secret.bin", "../../../../../../etc/passwd", "/etc/passwd", "link.bin", "", "fifo"]
-
-
 @pytest.mark.parametrize(
-    "entry",
+    ("field", "value"),
     [
-        *({"location": location} for location in OUTSIDE),
-        *({"offset": n} for n in (-4, 4, 2**62, "x")),
-        *({"length": n} for n in (-1, 4, 2**62)),
-        {"dims": (2**31, 2**31)},
-        {"copies": 1000},
+        *(("location", path) for path in ("../secret.bin", "/etc/passwd", "link.bin", "", "fifo")),
+        *(("offset", number) for number in (-4, 4, 2**62, "x")),
+        *(("length", number) for number in (-1, 4, 2**62)),
+        ("dims", (2**31, 2**31)),
+        ("copies", 1000),
     ],
-    ids=lambda entry: f"{next(iter(entry.items()))}"[:40],
 )
 def test_weights_beside_the_model_stay_there_and_are_read_once(
-    entry: dict[str, Any], tmp_path: Path
+    field: str, value: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "secret.bin").write_bytes(bytes(864))
     folder = tmp_path / "models"
@@ -270,12 +270,11 @@ def test_weights_beside_the_model_stay_there_and_are_read_once(
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     os.mkfifo(folder / "fifo")
     with little():
-        refused(beside(folder / "x.onnx", **entry))
+        refused(beside(folder / "x.onnx", **{field: value}))
 
 
 def test_weights_beside_the_model_are_those_of_one_file(tmp_path: Path) -> None:
-    path = beside(tmp_path / "x.onnx", copies=1)
-    (tmp_path / "one.onnx").write_bytes(onnx.load(str(path)).SerializeToString())
-    files = (str(path), str(tmp_path / "one.onnx"))
-    one, two = (load_network(file, None).module(IMAGE) for file in files)
-    assert torch.equal(one, two)
+    two = beside(tmp_path / "x.onnx", copies=1)
+    (tmp_path / "one.onnx").write_bytes(onnx.load(str(two)).SerializeToString())
+    one, other = (load_network(str(each), None) for each in (tmp_path / "one.onnx", two))
+    assert torch.equal(one.module(IMAGE), other.module(IMAGE))

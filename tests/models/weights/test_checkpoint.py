@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -16,13 +17,10 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from pnpdepth_cli.models.hugging_face import hf_definition
-from pnpdepth_cli.models.torch_export import exported_definition
+from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
 from tests.models.weights.files import npy_of, pickled, refused
 from tests.models.weights.test_tensor_bundle import bundle, entry
-
-LARGE = 100 << 30  # bytes
 
 
 class Net(nn.Module):
@@ -158,24 +156,18 @@ def test_a_file_cut_anywhere_is_refused(suffix: str, tmp_path: Path) -> None:
 # ------------------------------------------------------------------ files larger than memory
 
 
-def large_file(path: Path, head: bytes = b"") -> Path:
-    """A sparse file of 100 GB, which takes no space."""
-    with path.open("wb") as file:
-        file.write(head)
-        file.truncate(len(head) + LARGE)
-    return path
-
-
 def test_files_that_memory_cannot_hold_are_refused_before_they_are_read(tmp_path: Path) -> None:
-    header = json.dumps({"a": {"dtype": "F32", "shape": [25 << 30], "data_offsets": [0, LARGE]}})
-    head = struct.pack("<Q", len(header)) + header.encode()
-    for suffix in (".safetensors", ".pt", ".npy", ".index"):
-        refused(large_file(tmp_path / f"y{suffix}", head))
-    index = bundle(tmp_path, {"a": entry(1, (25 << 30,), 0, LARGE)}, b"")
-    large_file(tmp_path / "x.data-00000-of-00001")
-    refused(index)
-    with pytest.raises(ModelError):
-        exported_definition(large_file(tmp_path / "x.pt2"))
-    large_file(tmp_path / "config.json")
-    with pytest.raises(ModelError):
-        hf_definition(tmp_path)
+    large = 100 << 30  # bytes, which take no space
+    stated = {"a": {"dtype": "F32", "shape": [large // 4], "data_offsets": [0, large]}}
+    header = json.dumps(stated).encode()
+    bundle(tmp_path, {"a": entry(1, (large // 4,), 0, large)}, b"")
+    for name in ("y.safetensors", "y.pt", "y.npy", "y.index", "y.pt2", "config.json"):
+        (tmp_path / name).write_bytes(struct.pack("<Q", len(header)) + header)
+    for path in tmp_path.iterdir():
+        if path.name != "x.index":
+            os.truncate(path, path.stat().st_size + large)
+    for name in ("y.safetensors", "y.pt", "y.npy", "y.index", "x.index"):
+        refused(tmp_path / name)
+    for spec in (tmp_path / "y.pt2", tmp_path):
+        with pytest.raises(ModelError, match="bytes"):
+            find_definition(str(spec))
