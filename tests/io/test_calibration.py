@@ -27,10 +27,7 @@ Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
 PLAIN = """# a comment
 K: [[500.5, 0, 320], [0, 501, 240],
     [0, 0, 1]]
-R:
-  - [0, -1, 0]
-  - [0, 0, -1]
-  - [1, 0, 0]
+R: [0, -1, 0, 0, 0, -1, 1, 0, 0]
 t: [0.1, -0.2, -0.3]   # metres
 distortion: [-0.02, 0.01, -0.003, 0.001]
 size: [640, 480]
@@ -45,9 +42,7 @@ distortion_model: {model}
 distortion_coefficients: {{rows: 1, cols: 5, data: {data}}}
 rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
 """
-TOPIC = """header:
-  frame_id: camera
-height: 480
+TOPIC = """height: 480
 width: 640
 distortion_model: plumb_bob
 d: [-0.1, 0.02, 0.001, -0.002, 0.01]

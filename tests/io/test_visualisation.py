@@ -11,8 +11,6 @@ from PIL import Image
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.visualisation import UNKNOWN, depth_scale, improvement, preview
 
-BLUE, ORANGE = [25, 90, 190], [220, 105, 0]
-
 
 def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
     """The panels of a figure by title."""
@@ -26,12 +24,10 @@ def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
 def test_a_preview_has_its_panels_in_columns_and_depth_in_the_colours_of_one_scale(
     tmp_path: Path, height: int, width: int, columns: int
 ) -> None:
-    rng, path = np.random.default_rng(0), tmp_path / "p.png"
+    path, rgb = tmp_path / "p.png", np.random.default_rng(0).random((height, width, 3), np.float32)
     depth = np.linspace(2, 8, height * width, dtype=np.float32).reshape(height, width)
-    columns_of, rows_of = rng.integers(0, width, 9), rng.integers(0, height, 9)
-    xy = np.stack([columns_of, rows_of], axis=1).astype(np.float32)
-    before, sparse = depth * 1.2, depth[rows_of, columns_of]
-    rgb = rng.random((height, width, 3), dtype=np.float32)
+    before, xy = depth * 1.2, np.float32([[3, 0], [7, 9], [20, 5]])
+    sparse = depth[[0, 9, 5], [3, 7, 20]]
     content = preview(rgb, xy, sparse, before, depth, path)
     panels, scale = panels_of(path, content), depth_scale(sparse, before, depth)
     assert content.size[0] <= 1600
@@ -58,14 +54,13 @@ def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Pat
 
 def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -> None:
     # |6 - 5| = |4 - 5|: unchanged
-    rows = ([6, 5, 6, 6], [5, 6, 4, 5], [5, 5, 5, 0])
-    maps = (np.array([row], np.float32) for row in rows)
+    maps = np.array([[[6, 5, 6, 6]], [[5, 6, 4, 5]], [[5, 5, 5, 0]]], np.float32)
     content = improvement(None, *maps, tmp_path / "i.png", "inches")
     shown = panels_of(tmp_path / "i.png", content)["Change of error"]
-    colours = shown[0, :: shown.shape[1] // 4].tolist()
-    assert colours[:2] == [BLUE, ORANGE]
-    assert len(set(colours[2])) == len(set(colours[3])) == 1
-    assert colours[3][0] < 80 < 150 < colours[2][0]
+    better, worse, equal, unknown = shown[0, :: shown.shape[1] // 4].tolist()
+    assert (better, worse) == ([25, 90, 190], [220, 105, 0])  # blue and orange
+    assert len(set(equal)) == len(set(unknown)) == 1
+    assert unknown[0] < 80 < 150 < equal[0]
     assert content.ends == ("worse by 1 inches or more", "better by 1 inches or more")
     assert content.footer == "33.3 % of 3 pixels improved, 33.3 % worse"
     assert content.unknown == "no ground truth"
