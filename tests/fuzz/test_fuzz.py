@@ -75,16 +75,6 @@ def problem(event: str, arguments: tuple[Any, ...], folder: Path) -> str | None:
     return None
 
 
-@pytest.fixture
-def problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What commands cause in a working folder of their own that none may."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    return []
-
-
 def exit_code(command: str) -> object:
     with pytest.raises(SystemExit) as end:
         main(command.split())
@@ -94,9 +84,12 @@ def exit_code(command: str) -> object:
 
 
 def test_no_damaged_file_causes_a_traceback_a_hang_or_much_memory(
-    problems: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    commands, codes = write_files(), Counter[object]()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    commands, codes, problems = write_files(), Counter[object](), list[str]()
     for file, command in commands.items():  # imports and caches are nobody's cost
         assert exit_code(command) in (0, 7), (file, capfd.readouterr())
     watching = [True]

@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import OpenEXR
 import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -68,8 +67,8 @@ PIXELS = np.array([[-1, 256]])
 ANYTHING, A = {"anything": METRES}, {"A": METRES.astype(np.float16)}
 GREY = {"R": METRES, "G": METRES, "B": METRES, "A": np.ones_like(METRES)}
 UNSIGNED = {"Z": np.array([[512, 0]], np.uint32)}
-BOTTOM_UP = METRES[::-1]
-PFM = b"Pf\n3 2\n-1.0\n" + BOTTOM_UP.astype("<f4").tobytes()
+LITTLE = b"Pf\n3 2\n-1.0\n" + METRES[::-1].astype("<f4").tobytes()
+BIG = b"Pf\n3 2\n1.0\n" + METRES[::-1].astype(">f4").tobytes()
 UNKNOWN = "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown"
 FACTOR = "PFM, scale factor 0.25 of its header not applied"
 
@@ -77,10 +76,7 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
 @pytest.mark.parametrize(
     ("name", "values", "expected", "source"),
     [
-        *(
-            ("d.npy", METRES.astype(kind), KNOWN, f"{np.dtype(kind)} NPY")
-            for kind in (np.float16, np.float64, ">f4")
-        ),
+        *(("d.npy", METRES.astype(k), KNOWN, f"{np.dtype(k)} NPY") for k in ("<f2", "<f8", ">f4")),
         *(("d.npy", METRES.reshape(s), KNOWN, "float32 NPY") for s in [(2, 3, 1), (1, 1, 2, 3)]),
         ("d.npy", PIXELS.astype(np.int16), [[0, 1]], "int16 NPY ÷ 256"),
         ("d.npy", np.maximum(PIXELS, 0).astype(np.uint64), [[0, 1]], "uint64 NPY ÷ 256"),
@@ -93,7 +89,7 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
         ("d.exr", ones("R", "G", "B", "depth"), [[4] * 3] * 2, "EXR channel depth"),
         ("d.exr", ones("V.Combined.R", "V.Depth.Z"), [[2] * 3] * 2, "EXR channel V.Depth.Z"),
         ("d.tiff", METRES, KNOWN, "32-bit float TIFF"),
-        ("d.pfm", PFM, KNOWN, "PFM"),
+        *(("d.pfm", rows, KNOWN, "PFM") for rows in (LITTLE, BIG)),
         ("d.pfm", b"Pf\n1 1\n-0.25\n" + np.float32(2).tobytes(), [[2]], FACTOR),
         ("d.png", np.array([[65535, 256, 65535]], np.uint16), [[0, 1, 0]], UNKNOWN),
     ],
@@ -120,9 +116,8 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
         *(("d.exr", ones(*names)) for names in (("R", "G", "B"), ("depth", "Z"))),
         *((f"d.{suffix}", np.zeros((3, 4), np.uint8)) for suffix in ("png", "tif", "jpg", "webp")),
         ("d.png", np.zeros((3, 4, 4), np.uint16)),
+        *(("d.tif", np.zeros((3, 4), kind)) for kind in (np.float64, np.int32)),
         ("d.tif", np.zeros((3, 4, 3), np.float32)),
-        ("d.tif", np.zeros((3, 4), np.float64)),
-        ("d.tif", np.zeros((3, 4), np.int32)),
         ("d.pfm", b"PF\n1 1\n-1\n" + bytes(12)),
         *(("d.pfm", b"Pf\n2 1\n-1\n" + bytes(count)) for count in (7, 9)),
         *(("d.pfm", b"Pf\n" + head + b"\n" + bytes(8)) for head in (b"2 1\n0", b"2 0\n-1")),
@@ -142,41 +137,18 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
     assert not (tmp_path / "trace").exists()
 
 
-DEPTH = np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32)
-
-
-def valid_file(path: Path) -> Path:
-    """A file of `DEPTH`, of the kind that its name says."""
-    stem = path.stem
-    if stem == "depth":
-        write_depth(path, DEPTH)
-    elif stem == "tiles":
-        header = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
-        write_exr(path, {"Z": DEPTH}, **header)
-    elif path.suffix == ".exr":
-        write_exr(path, {"Z": DEPTH}, compression=getattr(OpenEXR, f"{stem}_COMPRESSION"))
-    else:
-        path.write_bytes(b"Pf\n53 40\n1.0\n" + DEPTH[::-1].astype(">f4").tobytes())
-    return path
-
-
-KINDS = ("big-endian.pfm", "PIZ.exr", "DWAA.exr", "tiles.exr")
-
-
-@pytest.mark.parametrize("name", [*(f"depth{suffix}" for suffix in DEPTH_SUFFIXES), *KINDS])
-def test_the_file_is_read_and_every_truncation_is_refused_in_one_line(
-    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("suffix", DEPTH_SUFFIXES)
+def test_every_truncation_of_a_depth_file_is_refused_in_one_line(
+    suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = valid_file(tmp_path / name)
-    assert read_depth(path).values == pytest.approx(DEPTH, rel=0.01, abs=0.002)
+    path = tmp_path / f"d{suffix}"
+    write_depth(path, np.random.default_rng(5).uniform(0.5, 80, (40, 53)).astype(np.float32))
     content = path.read_bytes()
     for length in [*range(0, len(content), max(1, len(content) // 60)), len(content) - 1]:
         path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError) as caught:
+        with pytest.raises(FileFormatError, match=f"^{path}") as caught:
             read_depth(path)
-        assert str(caught.value).startswith(str(path)), length
         assert "\n" not in str(caught.value)
-    # OpenEXR complains on its own; standard output is for data.
     said = capfd.readouterr()
     assert said.out == ""
-    assert said.err == "" or name.endswith(".exr")
+    assert said.err == "" or suffix == ".exr"  # OpenEXR complains on its own
