@@ -1,4 +1,4 @@
-"""Outputs are whole or absent, and of one run at a time."""
+"""Outputs are whole or absent, and written in turn."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import InputError, OutputError, StorageError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import (
     atomic_folder,
     atomic_path,
     in_turn,
-    lock_folder,
     make_folder,
     remove_leftovers,
 )
@@ -96,17 +95,6 @@ def test_a_folder_is_replaced_whole_or_not_at_all_and_leftovers_of_kills_go(
     assert [path.name for path in folder.iterdir()] == ["before" if fails else "after"]
     assert remove_leftovers(tmp_path) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine", "report"]
-
-
-def test_a_shard_does_not_run_beside_a_whole_run_nor_where_there_is_no_folder(
-    tmp_path: Path,
-) -> None:
-    with lock_folder(tmp_path), pytest.raises(OutputError), lock_folder(tmp_path, (1, 2)):
-        pass
-    with lock_folder(tmp_path, (1, 2)):  # it is free again
-        pass
-    with pytest.raises(StorageError), lock_folder(tmp_path / "no"):
-        pass
 
 
 def test_in_turn_one_waits_for_the_other(tmp_path: Path) -> None:

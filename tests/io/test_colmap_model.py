@@ -100,8 +100,8 @@ def test_points_project_as_in_pycolmap_for_every_camera_model(name: str, tmp_pat
 def test_a_photo_is_found_by_the_longest_name_that_ends_its_path(tmp_path: Path) -> None:
     write_text_model(tmp_path, names=("left/1.png", "right/1.png", "2.png"))
     model = read_model(tmp_path)
-    for path, name in (("/photos/right/1.png", "right/1.png"), ("anywhere/2.png", "2.png")):
-        assert name_in_model(model, Path(path)) == name
+    assert name_in_model(model, Path("/photos/right/1.png")) == "right/1.png"
+    assert name_in_model(model, Path("anywhere/2.png")) == "2.png"
     for name in ("1.png", "9.png"):
         with pytest.raises(InputError):
             name_in_model(model, Path("/photos") / name)

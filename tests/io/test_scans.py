@@ -3,13 +3,14 @@ from __future__ import annotations
 import io
 import re
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.scans import read_scan, write_cloud
 
 POINTS = np.random.default_rng(3).normal(0, 20, (37, 3)).astype(np.float32)
@@ -93,15 +94,12 @@ def test_points_survive_every_format_and_what_is_no_number_is_left_to_the_gate(
         np.testing.assert_array_equal(got, points.astype(np.float32))
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if name.endswith((".pcd", ".ply"))])
-@pytest.mark.parametrize("count", [b"9037", b"9" * 5000, b"9" * 12, b"-1"])
-def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
-    tmp_path: Path, name: str, count: bytes
-) -> None:
-    lie = re.sub(rb"(POINTS|vertex) 37", rb"\g<1> " + count, FILES[name](POINTS))
-    (tmp_path / name).write_bytes(lie)
-    with pytest.raises(FileFormatError):
-        read_scan(tmp_path / name)
+def lies() -> Iterator[tuple[str, bytes]]:
+    """Files with a count of points that they do not hold."""
+    for name in FILES:
+        for count in (b"9037", b"9" * 5000, b"9" * 12, b"-1"):
+            if name.endswith((".pcd", ".ply")):
+                yield name, re.sub(rb"(POINTS|vertex) 37", rb"\g<1> " + count, FILES[name](POINTS))
 
 
 @pytest.mark.parametrize(
@@ -120,6 +118,7 @@ def test_a_count_of_points_that_the_file_does_not_hold_is_refused(
         ("a.ply", b"ply\nend_header\n"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n"),
         ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red")),
+        *lies(),
     ],
 )
 def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, content: bytes) -> None:
