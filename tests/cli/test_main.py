@@ -20,7 +20,7 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights import read_checkpoint
 from tests.bags import write_bag
-from tests.commands.scan_frames import scan_on_disk
+from tests.commands.frames import scan_on_disk
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 GT = SAMPLES / "indoor" / "gt.png"

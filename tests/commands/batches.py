@@ -16,9 +16,11 @@ from pnpdepth_cli.commands.batch.records import BatchSummary
 from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.io.depth import write_depth
 from tests.commands.frames import frame_on_disk
 
 NAMES = ("a", "b", "c", "d")
+STEP_M = 0.1
 
 
 class RecordingListener:
@@ -32,13 +34,12 @@ class RecordingListener:
         self.stopped, self._on_frame = stopped, on_frame
         self.messages: list[str] = []
         self.records: list[FrameRecord] = []
-        self.to_do = 0
 
     def say(self, text: str) -> None:
         self.messages.append(text)
 
     def begin(self, to_do: int) -> None:
-        self.to_do = to_do
+        """Nothing to show."""
 
     def frame(self, record: FrameRecord) -> None:
         self.records.append(record)
@@ -55,6 +56,35 @@ def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES) -> Path:
     image = cv2.imread(str(frame_on_disk(root / "net").image))
     for number, name in enumerate(names):
         add_frame(root, name, np.roll(image, number, axis=1))
+    return root
+
+
+def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
+    """rgb/ sparse/ calib/ of so many frames, poses.txt, and net/ with a network.
+
+    Every frame is 0.1 m ahead of the one before; there are two walls and a floor.
+    """
+    (root / "net").mkdir(parents=True)
+    image = cv2.imread(str(frame_on_disk(root / "net").image))
+    for part in ("rgb", "sparse", "calib"):
+        (root / part).mkdir()
+    y, x = np.mgrid[:46, :62]
+    right, down = (x - 30.5) / 60, (y - 22.5) / 60
+    rows = []
+    for number in range(frames):
+        with np.errstate(divide="ignore"):
+            floor = np.where(down > 0, 1.5 / down, np.inf)
+            left = np.where(right < 0, -1 / right, np.inf)
+        depth = np.minimum(np.minimum(floor, left), 5 - STEP_M * number)
+        known = np.random.default_rng(number).permutation(depth.size)[:points]
+        sparse = np.zeros(depth.size, np.float32)
+        sparse[known] = depth.flatten()[known]
+        name = f"drive_{number:03}"
+        write_depth(root / f"sparse/{name}.png", sparse.reshape(depth.shape), scale=1000)
+        cv2.imwrite(str(root / f"rgb/{name}.png"), np.roll(image, number, axis=1))
+        (root / f"calib/{name}.txt").write_text("K: [60, 0, 30.5, 0, 60, 22.5, 0, 0, 1]")
+        rows.append(f"1 0 0 0 0 1 0 0 0 0 1 {STEP_M * number}")
+    (root / "poses.txt").write_text("\n".join(rows) + "\n")
     return root
 
 
@@ -120,8 +150,3 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         else:
             contents[name] = path.read_bytes()
     return contents
-
-
-def times(folder: Path) -> dict[str, int]:
-    """When each result was written."""
-    return {name: (folder / name).stat().st_mtime_ns for name in results(folder)}

@@ -18,6 +18,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
 
 HEIGHT, WIDTH = 24, 32
+STILL = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
 def frame(folder: Path, name: str, depth: float = 2.0, **record: Any) -> Path:
@@ -35,10 +36,8 @@ def frame(folder: Path, name: str, depth: float = 2.0, **record: Any) -> Path:
 def camera(right: float | None) -> CameraRecord:
     """A camera that is so far to the right in the world; None: its pose is unknown."""
     pose = None if right is None else [[1.0, 0, 0, right], [0, 1, 0, 0], [0, 0, 1, 0]]
-    intrinsics = [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
-    return CameraRecord(
-        intrinsics=intrinsics, lens="radial-tangential", source="made up", pose=pose
-    )
+    lens, intrinsics = "radial-tangential", [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
+    return CameraRecord(intrinsics=intrinsics, lens=lens, source="made up", pose=pose)
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -93,37 +92,34 @@ def test_pixels_that_are_far_not_valid_or_not_sure_are_left_out(tmp_path: Path) 
     assert written(path, tmp_path / "b.ply", max_sigma=0.1)[0] == (HEIGHT - 4) * (WIDTH - 8)
 
 
-def test_frames_are_one_cloud_in_the_world_frame_in_which_voxels_merge_them(tmp_path: Path) -> None:
-    for name in "ab":
-        frame(tmp_path / "out", name)
-    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 100 0 1 0 0 0 0 1 0\n")
-    poses = {"poses": tmp_path / "poses.txt"}
-    assert written(tmp_path / "out", tmp_path / "w.ply", **poses)[0] == 2 * HEIGHT * WIDTH
-    points = points_of(tmp_path / "w.ply")
-    first, second = np.split(points, 2)
-    assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
-    merged = written(tmp_path / "out", tmp_path / "b.ply", voxel=0.5, **poses)[0]
-    assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
-
-
-def test_pixels_that_too_few_views_agree_on_are_left_out(tmp_path: Path) -> None:
-    poses = tmp_path / "poses.txt"  # three cameras at one place, of which one is wrong
-    poses.write_text(3 * "1 0 0 0 0 1 0 0 0 0 1 0\n")
+def test_frames_are_one_cloud_in_the_world_in_which_views_agree_and_voxels_merge(
+    tmp_path: Path,
+) -> None:
+    out, cloud, poses = tmp_path / "out", tmp_path / "o.ply", tmp_path / "poses.txt"
     for name, depth in (("a", 2.0), ("b", 2.0), ("c", 3.0)):
-        frame(tmp_path / "out", name, depth)
+        frame(out, name, depth)
+    # Three cameras at one place, of which one is wrong.
+    poses.write_text(3 * STILL)
+    asked = {"poses": poses, "overwrite": True}
     for views, agreed in ((1, 3), (2, 2)):
-        output = tmp_path / f"{views}.ply"
-        count = written(tmp_path / "out", output, min_views=views, poses=poses)[0]
-        assert count == agreed * HEIGHT * WIDTH
+        assert written(out, cloud, min_views=views, **asked)[0] == agreed * HEIGHT * WIDTH
     with pytest.raises(UsageError, match="--min-views 4 needs as many frames with poses"):
-        written(tmp_path / "out", tmp_path / "4.ply", min_views=4, poses=poses)
+        written(out, cloud, min_views=4, **asked)
+    # The second one is far to the right.
+    poses.write_text(STILL + "1 0 0 100 0 1 0 0 0 0 1 0\n" + STILL)
+    assert written(out, cloud, **asked)[0] == 3 * HEIGHT * WIDTH
+    points = points_of(cloud)
+    first, second, _ = np.split(points, 3)
+    assert second == pytest.approx(first + np.array([100, 0, 0]), abs=1e-4)
+    merged = written(out, cloud, voxel=0.5, **asked)[0]
+    assert merged == len(np.unique(np.floor(points / 0.5), axis=0))
 
 
 def test_what_cannot_be_done_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
     out, cloud = tmp_path / "out", tmp_path / "o.ply"
     frame(out, "a", camera=camera(5))
     b, c = frame(out, "b", camera=camera(None)), frame(tmp_path, "c")
-    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    (tmp_path / "p.txt").write_text(3 * STILL)
     big, resized = tmp_path / "big.png", tmp_path / "c_depth.exr"
     cv2.imwrite(str(big), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
     write_depth(resized, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))

