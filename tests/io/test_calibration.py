@@ -190,8 +190,7 @@ def test_the_cameras_of_rectified_images_follow_p_and_r(
 ) -> None:
     raw = read_calibration(write(tmp_path, TOPIC.replace("---", f"p: {p}\nr: {r}\n---")))
     assert list(raw.rectified) == list(cameras)
-    for name, (camera, pose) in raw.rectified.items():
-        turn, x = cameras[name]
+    for (camera, pose), (turn, x) in zip(raw.rectified.values(), cameras.values(), strict=True):
         assert camera.intrinsics.tolist() == [[9, 0, 3], [0, 8, 2], [0, 0, 1]]
         assert pose.rotation.tolist() == (turn or np.eye(3).tolist())
         assert pose.translation.tolist() == [x, 0, 0]

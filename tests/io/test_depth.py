@@ -164,24 +164,17 @@ def test_a_header_says_whether_rows_are_of_a_scan(
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "error"),
+    ("content", "error"),
     [
-        *(("s.csv", text, FileFormatError) for text in ("1 2 3\n4 5\n", "1 2 3 4\n", "1 2\n3 4\n")),
-        *(("s.csv", text, FileFormatError) for text in ("u v w\n1 2 3\n", "1,5;2,5;3,5\n")),
-        ("s.csv", "1 2 3\n", SizeError),
-        ("none.csv", None, InputError),
-        ("s.npy", [[1, 1, 2]], FileFormatError),
-        ("s.npy", [[0.0] * 3] * 5, NoPointsError),
-        ("s.txt", "# nothing\n", NoPointsError),
+        *((text, FileFormatError) for text in ("1 2 3\n4 5\n", "1 2 3 4\n", "1 2\n3 4\n")),
+        *((text, FileFormatError) for text in ("u v w\n1 2 3\n", "1,5;2,5;3,5\n")),
+        ("1 2 3\n", SizeError),
+        *((text, NoPointsError) for text in ("0 0 0\n" * 5, "# nothing\n")),
     ],
 )
 def test_what_is_no_sparse_depth_is_refused_by_its_name(
-    tmp_path: Path, name: str, content: object, error: type[PnpDepthError]
+    tmp_path: Path, content: str, error: type[PnpDepthError]
 ) -> None:
-    path = tmp_path / name
-    if isinstance(content, list):
-        np.save(path, content)
-    elif content is not None:
-        path.write_text(str(content))
-    with pytest.raises(error, match=name):
-        read_sparse(path)
+    (tmp_path / "s.csv").write_text(content)
+    with pytest.raises(error, match=r"s\.csv"):
+        read_sparse(tmp_path / "s.csv")

@@ -9,8 +9,8 @@ import struct
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -152,18 +152,15 @@ READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha25
 
 @pytest.mark.parametrize("read", READERS)
 def test_a_device_a_pipe_and_a_sparse_file_of_terabytes_are_refused_unread(
-    read: Any, tmp_path: Path
+    read: Callable[[Path], object], tmp_path: Path
 ) -> None:
-    pipe, huge = tmp_path / "pipe.bin", tmp_path / "huge.png"
+    pipe, huge = tmp_path / "pipe.bin", tmp_path / "huge.bin"
     os.mkfifo(pipe)
-    for path in (pipe,) if read is read_scan else (Path("/dev/zero"), pipe):
+    huge.touch()
+    os.truncate(huge, 1 << 42)
+    for path in (Path("/dev/zero"), pipe, *([huge] if read is not sha256_of else [])):
         with little(), pytest.raises(InputError):
             read(path)
-    with huge.open("wb") as file:
-        file.truncate(1 << 42)
-    if read not in (sha256_of, read_scan):
-        with little(), pytest.raises(FileFormatError):
-            read(huge)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".exr", ".pfm", ".tiff", ".npy", ".npz"])
