@@ -37,21 +37,7 @@ def output_for(depth: Tensor, space: str, scale: float, shift: float) -> Tensor:
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-@pytest.mark.parametrize(("count", "seed"), [(30, 0), (2000, 2)])
-def test_20_percent_gross_outliers_move_the_fit_by_less_than_2_percent(
-    space: str, kind: str, count: int, seed: int
-) -> None:
-    d = scene(count, seed)
-    noise = torch.randn(count, generator=torch.Generator().manual_seed(seed + 100))
-    x = output_for(d * (1 + 0.01 * noise), space, 1.0 if space == "log" else 0.4, 0.0)
-    clean = align(x, points_of(d), (space,), kind).depth(x)
-    moved = align(x, points_of(spoiled(d)), (space,), kind).depth(x)
-    assert float((moved / clean - 1).abs().max()) < 0.02
-
-
-@pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-def test_the_fit_is_its_own_biweight_least_squares_and_its_errors_are_those_of_its_depth(
+def test_a_fit_despite_outliers_is_its_own_biweight_least_squares_with_errors_of_its_depth(
     space: str, kind: str
 ) -> None:
     rng = np.random.default_rng(7)
@@ -61,6 +47,8 @@ def test_the_fit_is_its_own_biweight_least_squares_and_its_errors_are_those_of_i
     to_space = {"depth": lambda v: v, "inverse": np.reciprocal, "log": np.log}[space]
     x = to_space(true) * (1 if space == "log" else 2.5) + (0.3 if kind == "affine" else 0.0)
     fit = align(torch.from_numpy(x), points, (space,), kind)
+    # A fifth of gross outliers moves the depth by no more than 2 %.
+    assert np.allclose(fit.depth(torch.from_numpy(x)), true, rtol=0.02)
     y = to_space(d)
     # 4.685 and 1.4826 give 95 % efficiency, and the standard deviation, of normal errors.
     off = np.abs(y - fit.scale * x - fit.shift)

@@ -89,15 +89,10 @@ def test_images_of_other_scenes_are_not_moved(count: int, frames: int) -> None:
 def test_points_that_were_found_in_the_image_show_nothing() -> None:
     rgb, _ = frame(0)
     contrast = np.abs(np.diff(rgb.mean(-1), axis=1))[:, :-1] > 0.1
-    rows, columns = np.nonzero(contrast)
     rng = np.random.default_rng(0)
-    chosen = rng.choice(len(rows), 300, replace=False)
-    points = SparsePoints(
-        xy=torch.from_numpy(np.stack([columns, rows], axis=1)[chosen].astype(np.float32)),
-        depth=torch.from_numpy(rng.uniform(1, 5, 300).astype(np.float32)),
-        size=SIZE,
-    )
-    assert evidence(rgb, points) is None
+    found = rng.choice(np.argwhere(contrast)[:, ::-1].astype(np.float32), 300, replace=False)
+    depth = torch.from_numpy(rng.uniform(1, 5, 300).astype(np.float32))
+    assert evidence(rgb, SparsePoints(xy=torch.from_numpy(found), depth=depth, size=SIZE)) is None
 
 
 def test_scan_lines_few_points_and_points_without_an_edge_show_nothing() -> None:

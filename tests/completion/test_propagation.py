@@ -105,10 +105,8 @@ def test_a_large_image_has_at_every_second_pixel_the_depth_of_that_pixel_alone(
     y, x = torch.meshgrid(torch.arange(641.0), torch.arange(801.0), indexing="ij")
     prediction = 2 + x / 801 + (y / 641).square()
     points = random_points(prediction * (1 + 0.3 * torch.sin(x / 200)), 30)
-    pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(6)) * torch.tensor(
-        [400.0, 320.0]
-    )
-    pixels = 2 * pixels.round()
+    random = torch.rand(200, 2, generator=torch.Generator().manual_seed(6))
+    pixels = 2 * (random * torch.tensor([400.0, 320.0])).round()
     depth = propagate(prediction, points, None, kind=kind)
     alone = propagate_at(prediction, points, None, pixels, kind=kind)
     column, row = pixels.long().unbind(1)

@@ -47,9 +47,5 @@ def frame(
     far = np.flatnonzero(~beside) if gap_px else depth.size
     chosen = np.random.default_rng(seed).choice(far, count, replace=False)
     rows, columns = np.unravel_index(chosen, depth.shape)
-    points = SparsePoints(
-        xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
-        depth=torch.from_numpy(depth[rows, columns]),
-        size=SIZE,
-    )
-    return rgb, points
+    xy = torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32))
+    return rgb, SparsePoints(xy=xy, depth=torch.from_numpy(depth[rows, columns]), size=SIZE)
