@@ -86,15 +86,13 @@ def test_a_crop_is_the_largest_in_the_middle_and_a_longest_side_is_not_enlarged(
 def test_a_prior_keeps_its_depths_and_is_unknown_beside_unknown_pixels_and_padding(
     size: Fixed | Multiple | Near,
 ) -> None:
-    frame = FrameMap.fit(size, 50, 70)
-    prior = torch.full((1, 1, 50, 70), 3.0)
+    frame, prior = FrameMap.fit(size, 50, 70), torch.full((1, 1, 50, 70), 3.0)
+    whole = frame.prior_to_network(prior)
+    expected = torch.zeros(1, 1, *frame.network)
+    expected[..., : frame.resized[0], : frame.resized[1]] = 3.0
+    torch.testing.assert_close(whole, expected)
     prior[..., 20:30, 20:30] = 0.0
-    mapped = frame.prior_to_network(prior)
-    assert tuple(mapped.shape[-2:]) == frame.network
-    known = mapped[mapped > 0]
-    assert torch.allclose(known, torch.full_like(known, 3.0))
-    assert 0 < len(known) < mapped.numel()
-    full = frame.prior_to_network(torch.full((1, 1, 50, 70), 3.0))
-    inside = torch.zeros_like(full)
-    inside[..., : frame.resized[0], : frame.resized[1]] = 3.0
-    torch.testing.assert_close(full, inside)
+    partly = frame.prior_to_network(prior)
+    unknown = partly == 0
+    torch.testing.assert_close(partly, whole.masked_fill(unknown, 0.0))
+    assert 0 < int(unknown.sum() - (whole == 0).sum()) < partly.numel() / 4

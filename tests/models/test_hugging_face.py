@@ -14,7 +14,7 @@ from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import CheckpointError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Near
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Near, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.hugging_face import hf_definition
 from pnpdepth_cli.models.network import load_network
@@ -23,12 +23,10 @@ from tests.models.weights.files import little
 
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
-IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 HALF = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
 ASPECT = {"keep_aspect_ratio": True, "do_resize": True}
-SQUARE = {"height": 56, "width": 56}
 PROCESSING: dict[str, dict[str, Any]] = {
-    "depth_anything": {**IMAGENET, **ASPECT, "size": SQUARE, "ensure_multiple_of": 14},
+    "depth_anything": {**HALF, **ASPECT, "size": 56, "ensure_multiple_of": 14},
     "dpt": {**HALF, "size": {"height": 64, "width": 64}},
     "zoedepth": {**HALF, **ASPECT, "size": {"height": 64, "width": 96}, "ensure_multiple_of": 32},
     "glpn": {"size_divisor": 32, "do_rescale": True},
@@ -37,24 +35,13 @@ PROCESSING: dict[str, dict[str, Any]] = {
 """A preprocessor_config.json by the type of the network."""
 
 
-def described(folder: Path, name: str) -> Path:
-    """A folder without weights, which are read when the network is built."""
-    folder.mkdir()
-    (folder / "config.json").write_text(json.dumps({"model_type": name}))
-    (folder / "preprocessor_config.json").write_text(json.dumps(PROCESSING[name]))
-    (folder / "model.safetensors").touch()
-    return folder
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return described(tmp_path / "net", "glpn")
-
-
-def changed(folder: Path, name: str, change: dict[str, Any]) -> Path:
-    settings = json.loads((folder / name).read_text())
-    (folder / name).write_text(json.dumps(settings | change))
-    return folder
+    """A folder without weights, which are read when the network is built."""
+    (tmp_path / "config.json").write_text('{"model_type": "glpn"}')
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(PROCESSING["glpn"]))
+    (tmp_path / "model.safetensors").touch()
+    return tmp_path
 
 
 def prepared(folder: Path, processing: dict[str, Any]) -> ModelDefinition:
@@ -62,46 +49,46 @@ def prepared(folder: Path, processing: dict[str, Any]) -> ModelDefinition:
     return hf_definition(folder)
 
 
-def test_the_folder_says_what_the_numbers_mean_and_how_the_image_is_resized(tmp_path: Path) -> None:
-    folder = described(tmp_path / "a", "depth_anything")
-    assert hf_definition(folder).size == Near(of=14, height=56, width=56)
-    definition = hf_definition(changed(folder, "config.json", {"depth_estimation_type": "metric"}))
-    assert (definition.output_kind, definition.default_alignment) == ("depth", "none")
-    assert hf_definition(described(tmp_path / "d", "dpt")).size == Fixed(64, 64)
-    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
-    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
+def changed(folder: Path, change: dict[str, Any]) -> Path:
+    """The folder with settings of its config.json replaced."""
+    settings = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(settings | change))
+    return folder
+
+
+def test_a_folder_says_what_the_numbers_mean(folder: Path) -> None:
+    relative = hf_definition(changed(folder, {"model_type": "depth_anything"}))
+    assert (relative.output_kind, relative.default_alignment) == ("inverse", "auto")
+    metric = hf_definition(changed(folder, {"depth_estimation_type": "metric"}))
+    assert (metric.output_kind, metric.default_alignment) == ("depth", "none")
+
+
+def normalised(mean: float, std: float) -> Normalisation:
+    return Normalisation(mean=(mean, mean, mean), std=(std, std, std))
 
 
 @pytest.mark.parametrize(
-    ("processing", "size"),
+    ("processing", "expected"),
     [
         ({"size": {"shortest_edge": 30}}, Fixed(30, 30)),
         ({**ASPECT, "size": 9, "ensure_multiple_of": 1 / 64}, Near(of=64, height=9, width=9)),
         ({"do_resize": False, "size": 56}, Near(of=32)),
         ({"size_divisor": 1 << 16}, Near(of=1 << 16)),
+        ({"size": 9, "do_normalize": True, "rescale_factor": 1 / 127.5}, normalised(0.25, 0.25)),
+        ({"size": 9, "do_normalize": False, "rescale_factor": 2 / 255}, normalised(0.0, 0.5)),
+        ({"size": 9, "image_mean": [51] * 3, "do_rescale": False}, normalised(0.2, 0.5 / 255)),
     ],
 )
-def test_the_size_is_fixed_or_near_one_or_a_multiple(
-    processing: dict[str, Any], size: Fixed | Near, folder: Path
+def test_the_image_is_resized_and_normalised_as_the_folder_says(
+    processing: dict[str, Any], expected: object, folder: Path
 ) -> None:
-    assert prepared(folder, processing).size == size
+    definition = prepared(folder, processing)
+    assert expected in (definition.size, definition.normalisation)
 
 
-@pytest.mark.parametrize(
-    ("processing", "mean", "std"),
-    [
-        ({"do_normalize": True, "rescale_factor": 1 / 127.5}, 0.25, 0.25),
-        ({"image_mean": [0.25] * 3, "do_normalize": False, "rescale_factor": 2 / 255}, 0.0, 0.5),
-        ({"image_mean": [51] * 3, "image_std": [102] * 3, "do_rescale": False}, 0.2, 0.4),
-    ],
-)
-def test_normalisation_is_that_of_an_image_from_0_to_1(
-    processing: dict[str, Any], mean: float, std: float, folder: Path
-) -> None:
-    normalisation = prepared(folder, {"size_divisor": 32} | processing).normalisation
-    assert normalisation is not None
-    assert normalisation.mean == pytest.approx((mean,) * 3)
-    assert normalisation.std == pytest.approx((std,) * 3)
+def test_a_size_near_one_is_that_of_transformers() -> None:
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
+    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
 
 
 def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
@@ -235,7 +222,7 @@ def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
     change: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     folder = saved(tmp_path / "net", "glpn")
-    changed(folder, "config.json", change)
+    changed(folder, change)
     with (
         little(megabytes=900, seconds=30),
         pytest.raises((CheckpointError, ModelError), match=message),
@@ -248,5 +235,5 @@ def test_code_in_a_folder_is_never_run(tmp_path: Path) -> None:
     marker, folder = tmp_path / "ran", saved(tmp_path / "net", "glpn")
     (folder / "code.py").write_text(f"open({str(marker)!r}, 'w')")
     code = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
-    load_network(str(changed(folder, "config.json", {"auto_map": code})), None)
+    load_network(str(changed(folder, {"auto_map": code})), None)
     assert not marker.exists()
