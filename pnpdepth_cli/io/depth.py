@@ -87,7 +87,9 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     depth_format = format_of_content(data)
     if depth_format is None:
         kind = kind_of(data)
-        raise no_depth(path, "a file of an unknown kind" if kind is None else f"an 8-bit {kind}")
+        if kind is not None:
+            raise no_depth(path, f"an 8-bit {kind}")
+        raise FileFormatError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)
     if stored.values.dtype.kind == "b" and not is_mask:
         raise FileFormatError(f"{path} holds bool values; depth is float or integer")

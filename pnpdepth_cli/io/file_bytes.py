@@ -313,9 +313,11 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
         rows = np.array(lines, np.float64)
     except ValueError:
         count = max(3, len(lines[0]))
-        bad = (n for n, line in numbered[bool(header) :] if not _is_numbers(line, count))
-        number = next(bad, numbered[-1][0])
-        raise FileFormatError(f"{path}, line {number}: not {count} numbers") from None
+        bad = (each for each in numbered[bool(header) :] if not _is_numbers(each[1], count))
+        number, line = next(bad, numbered[-1])
+        raise FileFormatError(
+            f"{path}, line {number}: {line[:80]!r} is not {count} numbers"
+        ) from None
     if not rows.size:
         return np.empty((0, 3)), header
     if rows.shape[1] < 3:
