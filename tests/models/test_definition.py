@@ -15,7 +15,6 @@ from pnpdepth_cli.models.definition import (
     Fixed,
     ModelDefinition,
     Multiple,
-    Near,
     Normalisation,
     graph_definition,
 )
@@ -67,14 +66,12 @@ def test_an_image_of_a_graph_has_three_channels_first_or_last(
         *((Multiple, "of", value) for value in (0, 1.5, "8", True, None)),
         (partial(Fixed, width=8), "height", 0),
         (partial(Fixed, 8, 8), "fit", "zoom"),
-        (partial(Near, of=8), "height", True),
         (Normalisation, "std", (0.5, 0.5, 0.0)),
         (definition, "name", 5),
         (definition, "input_kind", "depth"),
         (definition, "size", 32),
         (definition, "build", "net"),
         (definition, "layers", ("a", 3)),
-        (definition, "checkpoint", "net.pt"),
         *((definition, hook, "x") for hook in ("read_checkpoint", "arguments", "output", "verify")),
     ],
 )

@@ -82,6 +82,11 @@ def test_a_crop_is_the_largest_in_the_middle_and_a_longest_side_is_not_enlarged(
     assert FrameMap.fit(Multiple(32, longest=640), 100, 200).resized == (100, 200)
 
 
+def test_a_size_near_one_is_that_of_transformers() -> None:
+    assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
+    assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
+
+
 @pytest.mark.parametrize("size", [Multiple(32), Fixed(20, 30), Fixed(20, 30, "crop"), Near(of=16)])
 def test_a_prior_keeps_its_depths_and_is_unknown_beside_unknown_pixels_and_padding(
     size: Fixed | Multiple | Near,

@@ -87,16 +87,11 @@ def test_a_network_that_is_no_better_than_the_median_depth_is_named(
 # ------------------------------------------------------------------ loading
 
 
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    tensors = {"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}
-    save_file(tensors, tmp_path / "own.safetensors")
-    return tmp_path / "own.safetensors"
-
-
 def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_chance(
-    weights: Path,
+    tmp_path: Path,
 ) -> None:
+    weights = tmp_path / "own.safetensors"
+    save_file({"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}, weights)
     bare = definition(build=lambda: nn.Conv2d(1, 1, 1))
     owned = replace(bare, checkpoint=weights)
     for spec, checkpoint in ((owned, None), (bare, weights)):

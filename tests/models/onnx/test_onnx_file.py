@@ -45,10 +45,6 @@ def constant(name: str, values: Any) -> Any:
     return helper.make_node("Constant", [], [name], value=tensor)
 
 
-def size_of(*sides: int) -> Any:
-    return constant("n", list(sides))
-
-
 def cut_everywhere(network: Network, x: torch.Tensor) -> torch.Tensor:
     """The network's output, which is the same to the bit when it is cut at any node."""
     with torch.no_grad():
@@ -201,7 +197,9 @@ def test_graphs_that_are_broken_or_not_covered_are_refused(
 
 
 WORK = {
-    "a constant": [size_of(100_000, 100_000), helper.make_node("ConstantOfShape", ["n"], ["big"])],
+    "a constant": [
+        constant("n", [100_000, 100_000]), helper.make_node("ConstantOfShape", ["n"], ["big"]),
+    ],
     "constants": [
         constant("d0", [1.0]),
         *(helper.make_node("Concat", [f"d{n}"] * 2, [f"d{n + 1}"], axis=0) for n in range(34)),
@@ -212,7 +210,7 @@ WORK = {
         helper.make_node("Resize", ["depth", "", "s"], ["big"], mode="linear"),
     ],
     "sums": [
-        size_of(4096, 4096),
+        constant("n", [4096, 4096]),
         helper.make_node("ConstantOfShape", ["n"], ["a1"]),
         *(helper.make_node("ReduceSum", ["a1"], [f"r{n}"], keepdims=0) for n in range(2000)),
         helper.make_node("Sum", [f"r{n}" for n in range(2000)], ["big"]),

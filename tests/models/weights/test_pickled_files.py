@@ -175,7 +175,6 @@ def test_arrays_of_every_type_order_and_shape_are_read_by_name(code: str, tmp_pa
     [
         [1, 2],
         {"a": {"b": "text"}},
-        {"a": np.array(["x", "y"])},
         {"a": np.array([{}, 1], dtype=object)},
         RING,
         {"a": torch.nn.Identity()},
