@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -150,3 +151,16 @@ def test_every_truncation_of_a_depth_file_is_refused_in_one_line(
     said = capfd.readouterr()
     assert said.out == ""
     assert said.err == "" or suffix == ".exr"  # OpenEXR complains on its own
+
+
+def test_an_exr_of_several_parts_or_with_a_crop_of_its_display_is_refused(tmp_path: Path) -> None:
+
+    header = {"type": OpenEXR.scanlineimage}
+    parts = [OpenEXR.Part(dict(header), {name: METRES}, name) for name in ("left", "right")]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "parts.exr"))
+    window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
+    write_exr(tmp_path / "crop.exr", {"Z": METRES}, displayWindow=window)
+    for name in ("parts.exr", "crop.exr"):
+        with pytest.raises(FileFormatError, match=name):
+            read_depth(tmp_path / name)

@@ -1,19 +1,45 @@
-"""The scene renderer: known depth in every kind of scene, the same bytes for the same seed."""
+"""The scene renderer: exact depth, the same bytes for the same seed, resuming, sample files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("embreex", reason="embreex is not installed (extra [train])")
 
-from model_zoo_defs.training.rendering import render
+
+from model_zoo_defs.training.rendering import render, shapes
+from model_zoo_defs.training.rendering.materials import Palette
+from model_zoo_defs.training.rendering.shading import seen
+from model_zoo_defs.training.rendering.shapes import Group
 from model_zoo_defs.training.scenes import scenes
+from model_zoo_defs.training.scenes.world import Sky, World, looking
 
 pytestmark = pytest.mark.slow
 
 HEIGHT, WIDTH = 48, 64
+
+
+def test_the_depth_of_a_slanted_floor_solves_its_plane_equation() -> None:
+    palette, group = Palette(np.random.default_rng(0)), Group()
+    floor = [(-90, -90, 0), (90, -90, 0), (90, 90, 0), (-90, 90, 0)]
+    group.add(shapes.quads([floor]), palette.new("plain"))
+    mesh, materials = group.merged()
+    white, grey = (1.0, 1.0, 1.0), (0.5, 0.5, 0.5)
+    sky = Sky(
+        zenith=white, horizon=white, clouds=0.0, ambient_up=grey, ambient_down=grey, haze_m=0.0,
+        occlusion_m=1.0,
+    )  # fmt: skip
+    world = World(mesh=mesh, face_material=materials, table=palette.frozen(), lights=(), sky=sky)
+    turn, size = (0.4, -0.7, 0.05), (HEIGHT, WIDTH)
+    view = looking((0.3, -0.2, 1.5), turn, fov_deg=70, shift=(0.1, 0), size=size)
+    _, depth = seen(world, view, np.random.default_rng(0))
+    _, directions = view.grid()
+    expected = (-1.5 / directions[:, 2].astype(float)).reshape(HEIGHT, WIDTH)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(depth, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", scenes.KINDS)
