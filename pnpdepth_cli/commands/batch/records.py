@@ -341,7 +341,7 @@ def _notes(records: Sequence[FrameRecord]) -> list[str]:
     if len(records) < 2:
         return []
     by_name = groups_by_name([record.name for record in records])
-    groups = [each.group or name or each.name for each, name in zip(records, by_name, strict=True)]
+    groups = [each.group or name for each, name in zip(records, by_name, strict=True)]
     errors = [[each.errors[GT][AFTER].get(key) for key in _MAIN] for each in records]
     return find_clusters(groups, np.array(errors, np.float64)).notes()
 
