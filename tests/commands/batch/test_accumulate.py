@@ -18,6 +18,7 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.scans import read_scan
 from tests.commands.batches import STEP_M, RecordingListener, batch, done, drive_on_disk, results
 from tests.commands.frames import frame_on_disk
@@ -51,6 +52,18 @@ def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_be
     assert second["points"]["held_out"] == alone["points"]["held_out"] == 30
     errors = [each["errors"]["held_out"]["after"]["mae"] for each in (second, alone)]
     assert errors[0] < 0.85 * errors[1]
+
+
+def test_points_of_neighbours_are_sampled_from_their_ground_truth(tmp_path: Path) -> None:
+    root = drive_on_disk(tmp_path, frames=2)
+    parts = "rgb/{0}.png,sparse/{0}.png,calib/{0}.txt,1000"
+    rows = ["image,gt,calib,gt_scale", *map(parts.format, ("drive_000", "drive_001"))]
+    (root / "list.csv").write_text("\n".join(rows))
+    sample = {"iterations": 0, "sample": SamplePattern(count=50)}
+    accumulating(root, source=root / "list.csv", refine=sample)
+    points = record_of(root, "drive_000")["points"]
+    assert 20 < points["moved"] <= 50
+    assert points["used"] == 50 + points["moved"]
 
 
 def test_shards_give_the_same_and_a_neighbours_new_points_or_poses_another_run(

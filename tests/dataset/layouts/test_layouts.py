@@ -47,6 +47,21 @@ def at_x(x: float) -> tuple[tuple[float, ...], ...]:
     return ((1, 0, 0, x), *AT_START[1:])
 
 
+STATED = {  # codes per metre of sparse depth and ground truth, of one view, of other sizes
+    "kitti-depth": (256, 256, True, False),
+    "kitti-raw": (None, 256, False, False),
+    "7scenes": (None, 1000, False, False),
+    "void": (256, 256, True, False),
+    "ibims": (None, 1310.7, False, False),
+    "scannet": (None, 1000, False, True),
+    "arkitscenes": (1000, 1000, True, True),
+    "stray-scanner": (1000, None, True, False),
+    "record3d": (None, None, True, False),
+    "tum": (None, 5000, True, False),
+}
+"""What the descriptions of the data sets say; of the others nothing."""
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_layout_is_guessed_and_no_other_takes_it(name: str, tmp_path: Path) -> None:
     root = tmp_path / "set"
@@ -54,6 +69,9 @@ def test_a_layout_is_guessed_and_no_other_takes_it(name: str, tmp_path: Path) ->
     make(root)
     frames = read_frames(root)
     assert [frame.name for frame in frames] == names
+    own = frames[0]
+    stated = (own.sparse_scale, own.gt_scale, own.one_view, own.gt_other_size)
+    assert stated == STATED.get(name, (None, None, False, False))
     assert repr(frames) == repr(read_frames(root, name))
     assert [other for other, layout in LAYOUTS.items() if layout.matches(root)] == [name]
 
