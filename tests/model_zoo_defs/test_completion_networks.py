@@ -9,12 +9,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchmarks.frames import kitti_dc
+from benchmarks.frames import frame_pixels, kitti_dc, points_on_grid
 from model_zoo_defs.latefusion import Encoder
 from model_zoo_defs.nconv import NConv
 from model_zoo_defs.pncnn import Pncnn
 from model_zoo_defs.sparseconv import SparseConv
 from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import load_network
 
 
@@ -40,10 +41,11 @@ def test_published_weights_give_about_the_published_errors_on_kitti(
 ) -> None:
     network = load_network(name, shared_data / "weights" / weights)
     frame = next(iter(kitti_dc(shared_data)))
-    assert frame.sensor is not None
+    points = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
+    fit = FrameMap.fit(network.definition.size, *frame.gt.shape)
     with torch.no_grad():
-        output = network.module(torch.from_numpy(frame.sensor)[None, None])
-    scores = score(network.depth_of(output)[0, 0], torch.from_numpy(frame.gt))
+        output = network.module(*network.arguments_of(None, fit.points_to_network(points)))
+    scores = score(fit.depth_to_image(network.depth_of(output)), torch.from_numpy(frame.gt))
     assert scores.mae == pytest.approx(mae, rel=0.1)
     assert scores.rmse == pytest.approx(rmse, rel=0.1)
 
