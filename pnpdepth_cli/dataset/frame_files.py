@@ -328,3 +328,8 @@ def groups_by_name(names: Sequence[str]) -> list[str]:
     if all(stem != name for stem, name in zip(stems, names, strict=True)):
         return stems
     return [name.rpartition("/")[0] for name in names]
+
+
+def groups_of(names: Sequence[str], stated: Sequence[str | None]) -> list[str]:
+    """Returns the sequence of each frame: the one that the data set states, else by its name."""
+    return [own or name for own, name in zip(stated, groups_by_name(names), strict=True)]

@@ -20,7 +20,7 @@ from pnpdepth_cli.dataset.frame_files import (
     Unmatched,
     as_pose,
     file_of,
-    groups_by_name,
+    groups_of,
     name_problem,
 )
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
@@ -151,10 +151,9 @@ def _with_poses(
 
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
     """Returns the indices of the frames of each sequence, which one camera took, in order."""
-    by_name = groups_by_name([frame.name for frame in frames])
+    groups = groups_of([frame.name for frame in frames], [frame.group for frame in frames])
     sequences: dict[tuple[str, int | None], list[int]] = {}
-    for index, (frame, name) in enumerate(zip(frames, by_name, strict=True)):
-        group = name if frame.group is None else frame.group
+    for index, (frame, group) in enumerate(zip(frames, groups, strict=True)):
         sequences.setdefault((group, frame.camera), []).append(index)
     return {
         group if camera is None else f"{group}_{camera}": indices

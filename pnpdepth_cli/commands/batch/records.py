@@ -31,7 +31,7 @@ from pnpdepth_cli.commands.batch.find_frames import (
 from pnpdepth_cli.commands.refinement.refine_request import GROUPS, Outputs, RefineRequest
 from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table, stage_titles, write_text
-from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_by_name
+from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_of
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.file_record import FileRecord
@@ -340,8 +340,7 @@ def _notes(records: Sequence[FrameRecord]) -> list[str]:
     """How many frames with ground truth count as independent."""
     if len(records) < 2:
         return []
-    by_name = groups_by_name([record.name for record in records])
-    groups = [each.group or name for each, name in zip(records, by_name, strict=True)]
+    groups = groups_of([each.name for each in records], [each.group for each in records])
     errors = [[each.errors[GT][AFTER].get(key) for key in _MAIN] for each in records]
     return find_clusters(groups, np.array(errors, np.float64)).notes()
 

@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRe
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.statistics import Clusters, find_clusters
 from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of, some_names
-from pnpdepth_cli.dataset.frame_files import groups_by_name
+from pnpdepth_cli.dataset.frame_files import groups_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
@@ -130,8 +130,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     known = np.asarray(np.isfinite(values).all(axis=0))
     values[:, ~known] = math.nan
     # the tests, over frames that count as independent
-    by_name = zip(names, groups_by_name(names), strict=True)
-    groups = [runs[0].groups[name] or group for name, group in by_name]
+    groups = groups_of(names, [runs[0].groups[name] for name in names])
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [
         frame_means(dict(zip(keys, row, strict=True)) for row in of_run)

@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.pipeline import THREADS, in_order, versions
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.tables import Table, count_of, some_names
-from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_by_name, one_of_each
+from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_of, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
@@ -183,9 +183,10 @@ def _pair_frames(
             f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
             f" and are not scored: {some_names(extra)}"
         )
+    groups = groups_of(names, [frame.group for frame in frames])
     return [
-        _pair(replace(frame, group=frame.group or group), predictions.get(frame.name))
-        for frame, group in zip(frames, groups_by_name(names), strict=True)
+        _pair(replace(frame, group=group), predictions.get(frame.name))
+        for frame, group in zip(frames, groups, strict=True)
     ], notes
 
 
