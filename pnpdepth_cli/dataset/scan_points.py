@@ -21,7 +21,7 @@ from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
-from pnpdepth_cli.io.file_bytes import sha256_of
+from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
@@ -117,7 +117,7 @@ def read_scan_points(
         camera=replace(camera, source=f"calibration of {path.name}"),
         record=FileRecord(
             path=str(path),
-            sha256=sha256_of(path),
+            sha256=fingerprint(path).sha256,
             read_as=reading.source,
             calibration=str(named),
             camera=options.camera,
