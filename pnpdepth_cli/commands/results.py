@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.refinement.refine_request import endings_of
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
@@ -87,9 +88,10 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 
 def _frame(name: str, depth: Path) -> ResultFrame:
-    path = _beside(depth, ".json")
+    endings = endings_of(depth.suffix)
+    path = _beside(depth, endings["record"])
     record = FrameRecord() if path is None else FrameRecord.read(path)
-    files = {"sigma": f"_sigma{depth.suffix}", "valid": "_valid.png"}
+    files = {kind: endings[kind] for kind in ("sigma", "valid")}
     if path is not None:  # others are of other runs
         files = {kind: ending for kind, ending in files.items() if kind in record.outputs}
     companions = {kind: _beside(depth, ending) for kind, ending in files.items()}
