@@ -308,12 +308,13 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     numbered = [(number, _SEPARATOR.sub(" ", text)) for number, text in numbered_lines(data)]
     header = numbered[0][1].replace('"', "").lower().split() if numbered else []
     header = header if header[:3] in _HEADERS else []
-    lines = [line.split() for _, line in numbered[bool(header) :]]
+    numbered = numbered[bool(header) :]
+    lines = [line.split() for _, line in numbered]
     try:
         rows = np.array(lines, np.float64)
     except ValueError:
         count = max(3, len(lines[0]))
-        bad = (each for each in numbered[bool(header) :] if not _is_numbers(each[1], count))
+        bad = (each for each in numbered if not _is_numbers(each[1], count))
         number, line = next(bad, numbered[-1])
         raise FileFormatError(
             f"{path}, line {number}: {line[:80]!r} is not {count} numbers"

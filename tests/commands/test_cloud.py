@@ -37,7 +37,7 @@ def camera(right: float | None) -> CameraRecord:
     """A camera that is so far to the right in the world; None: its pose is unknown."""
     pose = None if right is None else [[1.0, 0, 0, right], [0, 1, 0, 0], [0, 0, 1, 0]]
     lens, intrinsics = "radial-tangential", [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
-    return CameraRecord(intrinsics=intrinsics, lens=lens, source="made up", pose=pose)
+    return CameraRecord(intrinsics=intrinsics, lens=lens, source="of the test", pose=pose)
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -57,7 +57,7 @@ def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
 
 def test_image_camera_and_pose_come_from_the_record_unless_they_are_given(tmp_path: Path) -> None:
     path = frame(tmp_path, "a", camera=camera(5))
-    assert "made up" in written(path, tmp_path / "a.ply", calib=None)[1]
+    assert "of the test" in written(path, tmp_path / "a.ply", calib=None)[1]
     last = [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(last)
     with pytest.raises(OutputError, match="--overwrite"):
