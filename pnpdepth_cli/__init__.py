@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _NAMES = (
     *("load_network", "refine", "score", "Refiner", "Refined", "Settings", "Scores", "Split"),
     *("Network", "ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near", "SparsePoints"),
-    *("PnpDepthError", "UsageError", "InputError", "SizeError", "NoPointsError", "ModelError"),
-    *("LayerError", "CheckpointError", "DivergedError", "DeviceError"),
+    *("PnpDepthError", "UsageError", "InputError", "NoPointsError", "ModelError"),
+    *("DivergedError", "DeviceError"),
 )
 """The public names, which `api` has."""
 

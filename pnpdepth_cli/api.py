@@ -12,15 +12,12 @@ from torch import nn
 from pnpdepth_cli.core.metrics import Scores as Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.core.split import Split as Split
-from pnpdepth_cli.errors import CheckpointError as CheckpointError
 from pnpdepth_cli.errors import DeviceError as DeviceError
 from pnpdepth_cli.errors import DivergedError as DivergedError
 from pnpdepth_cli.errors import InputError as InputError
-from pnpdepth_cli.errors import LayerError as LayerError
 from pnpdepth_cli.errors import ModelError as ModelError
 from pnpdepth_cli.errors import NoPointsError as NoPointsError
 from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
-from pnpdepth_cli.errors import SizeError as SizeError
 from pnpdepth_cli.errors import UsageError as UsageError
 from pnpdepth_cli.frames.frame import Refined as Refined
 from pnpdepth_cli.frames.frame import Registration
@@ -58,8 +55,7 @@ def load_network(
         device: torch device, such as "cpu" or "cuda:1".
 
     Raises:
-        ModelError: There is no such network, or it cannot be built.
-        CheckpointError: The weights cannot be read or do not fit.
+        ModelError: There is no such network, it cannot be built, or its weights do not fit.
         DeviceError: The device cannot be used.
     """
     path = None if checkpoint is None else Path(checkpoint)
@@ -121,14 +117,13 @@ def score(
         thresholds: Thresholds of δ1, δ2 and δ3.
 
     Raises:
-        SizeError: The shapes differ.
-        InputError: The unit is not given, and may be another than metres.
+        InputError: The shapes differ, or the unit is not given and may be another than metres.
     """
     arrays = [
         in_metres(depth, "the predicted depth"),
         in_metres(ground_truth, "the ground truth", unit),
     ]
     if arrays[0].shape != arrays[1].shape:
-        raise SizeError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
+        raise InputError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
     predicted, known = (torch.from_numpy(values) for values in arrays)
     return score_tensors(predicted, known, thresholds)

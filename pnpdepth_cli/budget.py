@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError, ModelError
 
 _MOST_PIXELS = 64_000_000  # of the largest common cameras
 _MOST_FILE_BYTES = 1 << 30
@@ -63,7 +63,7 @@ def check_claim(
     size: int,
     most: int,
     *,
-    error: Callable[[str], Exception] = FileFormatError,
+    error: Callable[[str], Exception] = InputError,
     way_out: str = "",
 ) -> None:
     """Raises the error if a file claims more than may be taken, or less than nothing.
@@ -75,13 +75,14 @@ def check_claim(
         raise error(f"{claim}, more than {most:,}{f'; {way_out}' if way_out else ''}")
 
 
-def check_network_file(path: Path, kind: str, error: Callable[[str], Exception]) -> None:
-    """Raises the error if an existing file of a network, or of its weights, is too large.
+def check_network_file(path: Path, kind: str) -> None:
+    """Raises ModelError if an existing file of a network, or of its weights, is too large.
 
     The kind names the file in the message, as in "checkpoint".
     """
     size = path.stat().st_size
-    check_claim(f"{kind} {path} has {size:,} bytes", size, budget().max_decoded_bytes, error=error)
+    claim = f"{kind} {path} has {size:,} bytes"
+    check_claim(claim, size, budget().max_decoded_bytes, error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

@@ -34,17 +34,9 @@ class StorageError(OutputError):
 
 
 class InputError(PnpDepthError):
-    """A file with image or depth data is invalid."""
+    """A file is missing, damaged or of another kind, or files do not fit each other."""
 
     exit_code = 3
-
-
-class FileFormatError(InputError):
-    """A file is not of the expected format."""
-
-
-class SizeError(InputError):
-    """Image, sparse depth and ground truth differ in size."""
 
 
 class NoPointsError(InputError):
@@ -52,17 +44,9 @@ class NoPointsError(InputError):
 
 
 class ModelError(PnpDepthError):
-    """The network or its definition is invalid."""
+    """The network, its definition, its layer or its weights cannot be used."""
 
     exit_code = 4
-
-
-class LayerError(ModelError):
-    """The network cannot be cut at the layer."""
-
-
-class CheckpointError(ModelError):
-    """The weights cannot be used."""
 
 
 class DivergedError(PnpDepthError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from pnpdepth_cli.errors import SizeError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,7 +45,7 @@ class FramePart:
         return 2 if self.halved else self.blocks
 
     def apply(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Returns the part of an image (H, W) or (H, W, C). Raises SizeError if it is too small."""
+        """Returns the part of an image (H, W) or (H, W, C). Raises InputError if it is smaller."""
         top, left, height, width = self._window((image.shape[0], image.shape[1]))
         # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
         small = image[1::2, 1::2] if self.halved else _block_means(image, self.blocks)
@@ -75,7 +75,7 @@ class FramePart:
             return 0, 0, height, width
         rows, columns = self.crop
         if rows > height or columns > width:
-            raise SizeError(
+            raise InputError(
                 f"the protocol needs {columns}×{rows} pixels but the frame has"
                 f" {width}×{height}{f' at 1/{self.factor}' * (self.factor > 1)}"
             )

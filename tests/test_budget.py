@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from pnpdepth_cli.budget import budget, check_claim, set_max_pixels
-from pnpdepth_cli.errors import FileFormatError, ModelError
+from pnpdepth_cli.errors import InputError, ModelError
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -
 
 def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:
     check_claim("a has 5 bytes", 5, 5)
-    with pytest.raises(FileFormatError, match=r"^a has bytes, more than 5; make it smaller$"):
+    with pytest.raises(InputError, match=r"^a has bytes, more than 5; make it smaller$"):
         check_claim("a has bytes", -1, 5, way_out="make it smaller")
     with pytest.raises(ModelError):
         check_claim("a has 6 bytes", 6, 5, error=ModelError)

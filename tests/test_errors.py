@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pnpdepth_cli.errors import LayerError, ModelError, describe, wrap_user_errors
+from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 
 
 def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> None:
@@ -21,7 +21,7 @@ def test_an_exception_inside_is_blamed_on_one_line_and_kept_as_the_cause() -> No
 @pytest.mark.parametrize(
     "error",
     [
-        LayerError("our own"),
+        ModelError("our own"),
         KeyboardInterrupt(),
         MemoryError(),
         torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB"),

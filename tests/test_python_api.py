@@ -44,8 +44,8 @@ def test_the_public_names_are_these() -> None:
     assert {*pnp.__all__} == {
         *("load_network", "refine", "score", "Refiner", "Refined", "Settings", "Scores", "Split"),
         *("Network", "ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"),
-        *("SparsePoints", "PnpDepthError", "UsageError", "InputError", "SizeError", "ModelError"),
-        *("NoPointsError", "LayerError", "CheckpointError", "DivergedError", "DeviceError"),
+        *("SparsePoints", "PnpDepthError", "UsageError", "InputError", "ModelError"),
+        *("NoPointsError", "DivergedError", "DeviceError"),
         "__version__",
     }
     assert all(getattr(pnp, name) is not None for name in pnp.__all__)
@@ -138,10 +138,10 @@ def test_depth_that_may_be_in_another_unit_needs_one(
         (np.zeros((4, 4, 3)), np.ones((4, 4, 1)), pnp.InputError, "sparse"),
         ("photo.png", np.ones((4, 4)), pnp.InputError, "image"),
         (np.zeros((4, 4, 3)), [[1, 2], [3]], pnp.InputError, "sparse"),
-        (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.SizeError, "image"),
+        (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.InputError, "image"),
         (np.zeros((4, 4, 3)), np.zeros((4, 4)), pnp.NoPointsError, "sparse"),
         (np.zeros((4, 4, 3)), np.array([[9.0, 9, 1]]), pnp.NoPointsError, "image"),
-        (None, np.ones((5, 3)), pnp.SizeError, "image"),
+        (None, np.ones((5, 3)), pnp.InputError, "image"),
     ],
 )
 def test_arrays_that_cannot_be_used_are_named(
@@ -203,7 +203,7 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
         (lambda network: LOSSES["no_such.py"], pnp.UsageError),
         (lambda network: pnp.Refiner(network).share_registration([np.ones(3)]), pnp.InputError),
         (lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")]), pnp.InputError),
-        (lambda network: pnp.score(np.ones((2, 2)), np.ones((2, 3))), pnp.SizeError),
+        (lambda network: pnp.score(np.ones((2, 2)), np.ones((2, 3))), pnp.InputError),
     ],
 )
 def test_wrong_arguments_have_an_error_of_their_kind(

@@ -15,7 +15,7 @@ from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import camera_of_exif, camera_of_file, image_of_size
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.plausible import far_values
-from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
@@ -153,7 +153,7 @@ def _camera(
     of_record, _ = frame.camera_and_pose
     if of_record is not None:
         if frame.record.size != (size[1], size[0]):
-            raise SizeError(
+            raise InputError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"
             )

@@ -80,8 +80,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         cut there. notes: what was assumed, fitted or verified.
 
     Raises:
-        ModelError: The network cannot be run or verified.
-        CheckpointError: Its weights cannot be loaded.
+        ModelError: The network cannot be run or verified, or its weights cannot be loaded.
         DeviceError: The device is missing or too small.
         InputError: The image cannot be read.
     """
@@ -164,7 +163,7 @@ def list_layers(
 
     Raises:
         UsageError: The definition lists no layers.
-        ModelError, CheckpointError, DeviceError: As in loading.
+        ModelError, DeviceError: As in loading.
     """
     network = load_network(choice.model, choice.checkpoint, choice.device)
     submodules = [name for name, _ in network.module.named_modules() if name]

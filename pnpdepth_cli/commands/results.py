@@ -13,7 +13,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.refine_request import endings_of
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
-from pnpdepth_cli.errors import FileFormatError, InputError, SizeError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 
@@ -41,12 +41,12 @@ class ResultFrame:
 
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
-        """The camera that the record holds, and its pose. Raises FileFormatError if damaged."""
+        """The camera that the record holds, and its pose. Raises InputError if damaged."""
         camera = self.record.camera
         try:
             return (None, None) if camera is None else camera.read()
         except ValueError as error:
-            raise FileFormatError(
+            raise InputError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
             ) from error
 
@@ -61,10 +61,10 @@ class ResultFrame:
         return depth, (depth > 0) & (self.of_size(self.valid, depth) > 0)
 
     def of_size(self, path: Path, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the mask or standard deviation in a file. Raises SizeError if it is another."""
+        """Returns the mask or standard deviation in a file. Raises InputError if it is another."""
         values = read_rgb(path).values[..., 0] if path == self.valid else read_depth(path).values
         if values.shape != depth.shape:
-            raise SizeError(f"{path} is not of the size of {self.depth}")
+            raise InputError(f"{path} is not of the size of {self.depth}")
         return values
 
 

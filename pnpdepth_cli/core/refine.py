@@ -23,7 +23,7 @@ from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blur, step_size
-from pnpdepth_cli.errors import DivergedError, LayerError, ModelError, wrap_user_errors
+from pnpdepth_cli.errors import DivergedError, ModelError, wrap_user_errors
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
@@ -66,8 +66,8 @@ def refine(
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
             then.
-        ModelError: The first prediction is not finite at any point.
-        LayerError: The depth does not depend on z.
+        ModelError: The first prediction is not finite at any point, or the depth does not depend
+            on z.
     """
     # z_0 = f_front(x)
     with torch.no_grad():
@@ -105,7 +105,7 @@ def refine(
         with torch.enable_grad():
             gradient = gradient_at(z, loss * scale)
         if gradient is None:
-            raise LayerError(
+            raise ModelError(
                 f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
                 " the prediction does not depend on it or the network's forward runs under"
                 " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"

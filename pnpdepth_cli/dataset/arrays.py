@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
-from pnpdepth_cli.errors import FileFormatError, SizeError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
@@ -54,13 +54,13 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
     """Returns (H, W, 3) in 0..1 of the image that has this size: upright, or as COLMAP reads it.
 
     Raises:
-        SizeError: It has neither.
+        InputError: It has neither.
     """
     rgb = read_image(source)
     if rgb.shape[:2] != size and isinstance(source, Path):
         rgb = read_rgb(source, upright=False).values
     if rgb.shape[:2] != size:
-        raise SizeError(
+        raise InputError(
             f"{source} is {rgb.shape[1]}×{rgb.shape[0]} but its depth {size[1]}×{size[0]}; give the"
             " image of this depth with --image"
         )
@@ -84,7 +84,7 @@ def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim != 2:
-        raise FileFormatError(f"{path}: mask or confidence is (H, W), not of shape {values.shape}")
+        raise InputError(f"{path}: mask or confidence is (H, W), not of shape {values.shape}")
     return values
 
 
@@ -92,12 +92,12 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
     """Returns the depth (H, W) with 0 where any of the masks is 0.
 
     Raises:
-        SizeError: A mask has another size.
+        InputError: A mask has another size.
     """
     for path in masks:
         mask = read_levels(path) > 0
         if mask.shape != depth.shape:
-            raise SizeError(
+            raise InputError(
                 f"mask {path} is {mask.shape[1]}×{mask.shape[0]} but the ground truth is"
                 f" {depth.shape[1]}×{depth.shape[0]}"
             )
@@ -106,10 +106,10 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
 
 
 def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Raises SizeError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
+    """Raises InputError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
     if abs(own[1] * size[0] / (own[0] * size[1]) - 1) > _ASPECT_TOLERANCE:
         turned = abs(own[0] * size[0] / (own[1] * size[1]) - 1) <= _ASPECT_TOLERANCE
-        raise SizeError(
+        raise InputError(
             f"{what} is {own[1]}×{own[0]} and the image {size[1]}×{size[0]}: they do not show the"
             " same view" + ("; one is turned by 90°, turn it back" if turned else "")
         )
@@ -128,7 +128,7 @@ def move_depth(
     No depth is interpolated: in an image that is larger, `size` (H, W), most pixels stay unknown.
 
     Raises:
-        SizeError: The two have different aspect ratios.
+        InputError: The two have different aspect ratios.
     """
     check_same_view(str(path), depth.shape[:2], size)
     rows, columns = np.nonzero(depth)
@@ -160,8 +160,7 @@ def camera_of_file(
     """Returns the camera of a calibration file for an image (H, W) of this file, and warnings.
 
     Raises:
-        InputError: The file is no calibration.
-        SizeError: It is of another image.
+        InputError: The file is no calibration, or is of another image.
     """
     camera = read_calibration(path, number).camera
     notes = check_size(path, camera, size, image)
@@ -174,18 +173,18 @@ def check_size(
     """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
 
     Raises:
-        SizeError: They cannot belong together.
+        InputError: They cannot belong together.
     """
     name = f"{image} is" if image else "the image is"
     if camera.size is not None and camera.size != size:
         height, width = camera.size
-        raise SizeError(
+        raise InputError(
             f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
             " image at that size"
         )
     x, y = camera.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
-        raise SizeError(
+        raise InputError(
             f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
             f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
         )

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pnpdepth_cli import choices
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.protocols import WHOLE, ForegroundFilter, FramePart
 from pnpdepth_cli.settings import option
@@ -227,9 +227,9 @@ class Unmatched:
 
 
 def _check_path(path: Path) -> None:
-    """FileFormatError for a path that no file can have: an index file may hold any text."""
+    """InputError for a path that no file can have: an index file may hold any text."""
     if not _can_be_named(str(path)):
-        raise FileFormatError(f"{str(path)!r}: no file can have this name; correct the list")
+        raise InputError(f"{str(path)!r}: no file can have this name; correct the list")
 
 
 def _can_be_named(text: str) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LENSES
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, what_applies
 from pnpdepth_cli.io.file_bytes import Fingerprint, one_line, plain, read_json, write_json
 from pnpdepth_cli.points import METRES
@@ -209,13 +209,13 @@ class FrameRecord:
             source: The file, for messages.
 
         Raises:
-            FileFormatError: It is none.
+            InputError: It is none.
         """
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)
         except (msgspec.ValidationError, OverflowError, UsageError) as error:
-            raise FileFormatError(
+            raise InputError(
                 f"{source} is no record of a frame as this version writes it"
                 f" ({one_line(str(error))}); remove it, and run again"
             ) from error

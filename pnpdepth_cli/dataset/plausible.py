@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError
+from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.depth import metres, scale_warning
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.points import in_frame
@@ -65,8 +65,7 @@ def scan_returns(
         scale: Numbers per metre that the user states; used where metres are implausible.
 
     Raises:
-        FileFormatError: Many coordinates are none of a scan.
-        InputError: The points are implausible in metres.
+        InputError: Many coordinates are none of a scan, or are implausible in metres.
         NoPointsError: No point is left.
     """
     counts, keep = dict[str, int](), np.ones(len(xyz), bool)
@@ -89,7 +88,7 @@ def scan_returns(
     odd = ~finite.all(axis=1) | (np.abs(known) > _FARTHEST_M).any(axis=1)
     if np.count_nonzero(odd & keep) > _BROKEN * len(xyz):
         first = int(np.flatnonzero(odd & keep)[0])
-        raise FileFormatError(
+        raise InputError(
             f"{path}: {np.count_nonzero(odd & keep):,} of {len(xyz):,} points have a coordinate"
             f" that is none of a scan (number {first + 1:,}:"
             f" {' '.join(f'{n:.3g}' for n in xyz[first])} m); its numbers are probably not stored"
@@ -257,8 +256,7 @@ def check_pixels(
     """Returns which points (N, 2) of a list lie in an image (H, W), and lines for a person.
 
     Raises:
-        FileFormatError: The coordinates are no pixels.
-        SizeError: They are those of an image that was turned.
+        InputError: The coordinates are no pixels, or those of an image that was turned.
         NoPointsError: None lies in the image.
     """
     # Coordinates that are relative to the image.
@@ -266,20 +264,20 @@ def check_pixels(
     outside = len(xy) - int(np.count_nonzero(inside))
     if len(xy) >= _FEW and bool((np.abs(xy) <= 1).all()) and min(size) > 2:
         low = "−1" if bool((xy < 0).any()) else "0"
-        raise FileFormatError(
+        raise InputError(
             f"{path}: the coordinates of all {len(xy):,} points are within {low}…1, so they are"
             f" relative to the image; multiply them by {width} and {height} to make them pixels"
         )
     # Coordinates of an image that was turned.
     if outside > _SWAPPED * len(xy) and bool(in_frame(xy, (width, height)).all()):
-        raise SizeError(
+        raise InputError(
             f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image,"
             f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
         )
     # Coordinates of a scan.
     below = int((xy < -0.5).any(axis=1).sum())
     if len(xy) >= _FEW and below > _BELOW_ZERO * len(xy):
-        raise FileFormatError(
+        raise InputError(
             f"{path}: {below:,} of {len(xy):,} points have coordinates below 0, down to"
             f" {xy.min():.3g}, which are no pixels; if these are x y z of a scan, give --calib"
         )

@@ -17,7 +17,7 @@ from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
-from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.depth import describe_range
@@ -72,15 +72,14 @@ def read_scan_points(
         scale: Numbers of the scan per metre; used where metres are implausible.
 
     Raises:
-        InputError: A file cannot be read.
-        SizeError: Calibration and image do not fit together.
+        InputError: A file cannot be read, or calibration and image do not fit together.
         NoPointsError: No point is visible.
     """
     # The calibration must be of the image.
     calibration, named = _calibration_of(path, options)
     size = size or calibration.camera.size
     if size is None:
-        raise SizeError(f"{named} does not give the image's size; give --image")
+        raise InputError(f"{named} does not give the image's size; give --image")
     warnings = check_size(named, calibration.camera, size, image)
     # The returns of the scan.
     stored, source = read_scan(path)

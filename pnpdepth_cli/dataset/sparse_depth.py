@@ -197,8 +197,8 @@ def read_colmap_points(
         unit_scale: Metres per unit of the model. None: depth is in its units.
 
     Raises:
-        InputError: The model cannot be read, or lacks the image.
-        SizeError: The photo does not show the camera's view.
+        InputError: The model cannot be read or lacks the image, or the photo does not show the
+            camera's view.
         NoPointsError: No point is left.
     """
     # The image in the model, whose camera must have the photo's view.

@@ -95,7 +95,7 @@ class OpenNetwork:
         self._encoded.clear()
 
     def cut(self) -> Split:
-        """Returns the network cut at the layer, open. Raises LayerError if it has no such layer."""
+        """Returns the network cut at the layer, open. Raises ModelError if it has no such layer."""
         if self._split is None:
             self._split = self._open.enter_context(self.network.cut_at(self.layer))
         return self._split

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
 from pnpdepth_cli.frames.frame import (
     Frame,
@@ -277,7 +277,7 @@ def _points(
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
     if values.shape[1] == 3 and values.shape != size:
         if size is None:
-            raise SizeError("rows of x, y and depth need an image for the size of the frame")
+            raise InputError("rows of x, y and depth need an image for the size of the frame")
         column = in_metres(values[:, 2], "the sparse depth", unit)
         known = np.isfinite(values).all(axis=1) & (column > 0)
         xy, depth = values[known, :2].astype(np.float32), column[known]
@@ -285,7 +285,7 @@ def _points(
     else:
         # Anything else is a depth map, of which the known pixels are points.
         if size is not None and values.shape != size:
-            raise SizeError(f"the sparse depth map is {values.shape} but the image is {size}")
+            raise InputError(f"the sparse depth map is {values.shape} but the image is {size}")
         size = values.shape[0], values.shape[1]
         values = in_metres(values, "the sparse depth", unit)
         rows, columns = np.nonzero(np.isfinite(values) & (values > 0))

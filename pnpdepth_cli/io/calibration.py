@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, parse_yaml, read_json, read_text
 from pnpdepth_cli.io.poses import check_pose, numbers_in, pose_of_matrix
 
@@ -99,13 +99,13 @@ class _Fields:
     def numbers(self, name: str, count: int | None = None) -> list[float]:
         """Returns the finite numbers of a value; so many, if there is a count."""
         if name not in self.values:
-            raise FileFormatError(f"{self.path} has no {name}; it is incomplete or of another kind")
+            raise InputError(f"{self.path} has no {name}; it is incomplete or of another kind")
         numbers = numbers_in(self.values[name])
         if numbers is None or not (np.abs(numbers) <= _LARGEST).all():
             fact = f"{name} is not made of numbers that a camera has"
-            raise FileFormatError(f"{self.path}: {fact}; correct it")
+            raise InputError(f"{self.path}: {fact}; correct it")
         if count is not None and len(numbers) != count:
-            raise FileFormatError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
+            raise InputError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
         return numbers
 
     def matrix(self, name: str, *shape: int) -> Floats:
@@ -126,8 +126,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
             Kalibr's, None for cam0.
 
     Raises:
-        FileFormatError: A matrix is missing, or is not made of numbers that a camera can have.
-        InputError: The file cannot be read.
+        InputError: The file cannot be read, or a matrix is missing or not made of numbers that a
+            camera can have.
         UsageError: There is no such camera.
     """
     # Files that name their kind, by their own names or by words in them.
@@ -156,7 +156,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         return _kitti(fields, camera, "KITTI", pose_of_matrix(path, name, fields.numbers(name)))
     if unknown := sorted(set(fields.values) - set(_PLAIN)):
         fact = f"{unknown[0]!r} is not part of a calibration"
-        raise FileFormatError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
+        raise InputError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
     return _single(fields, camera, source)
 
 
@@ -166,7 +166,7 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
     `camera` is the number of a camera of a camchain, None for cam0.
     """
     if not isinstance(content, Mapping):
-        raise FileFormatError(f"{path} is not a calibration; give OpenCV's, ROS's or Kalibr's YAML")
+        raise InputError(f"{path} is not a calibration; give OpenCV's, ROS's or Kalibr's YAML")
     chain = {str(k): v for k, v in content.items() if isinstance(v, Mapping) and "intrinsics" in v}
     if chain:
         name = f"cam{0 if camera is None else camera}"
@@ -175,7 +175,7 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
         fields = _Fields(path, chain[name])
         if (model := fields.text("camera_model", "pinhole")) != "pinhole":
             fact = f"{name} is of model {one_line(model)[:20]}"
-            raise FileFormatError(f"{path}: {fact}; calibrate it as a pinhole camera")
+            raise InputError(f"{path}: {fact}; calibrate it as a pinhole camera")
         return _single(fields, None, f"Kalibr camchain, {name}")
     kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
     plain = {name: content[name] for name in content if name != "R"}  # the rectification
@@ -273,7 +273,7 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
         fx, fy, cx, cy = numbers
         numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
     if len(numbers) not in (9, 16):
-        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers, not 4, 9 or 16")
+        raise InputError(f"{path}: {name} has {len(numbers)} numbers, not 4, 9 or 16")
     matrix = np.reshape(numbers, (math.isqrt(len(numbers)), -1))[:3, :3]
     lens, distortion = _lens(fields)
     if distortion:
@@ -307,14 +307,14 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
     lens = _LENSES.get(model)
     if lens is None:
         known, model = ", ".join(_LENSES), one_line(model)[:30]
-        raise FileFormatError(f"{fields.path}: distortion model {model!r} is none of {known}")
+        raise InputError(f"{fields.path}: distortion model {model!r} is none of {known}")
     name = fields.first(_DISTORTIONS)
     coefficients = () if name is None else tuple(fields.numbers(name))
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _COEFFICIENTS[lens]:
         fact = f"{len(coefficients)} coefficients of {lens} distortion"
-        raise FileFormatError(f"{fields.path}: {fact}, which has {_COEFFICIENTS[lens]}")
+        raise InputError(f"{fields.path}: {fact}, which has {_COEFFICIENTS[lens]}")
     return lens, coefficients
 
 
@@ -323,16 +323,16 @@ def _named_values(path: Path, text: str) -> _Fields:
     before, *parts = _FIELD.split(_COMMENT.sub("", text))
     names, values = parts[::2], parts[1::2]
     if before.strip():
-        raise FileFormatError(f"{path}: {one_line(before)[:60]!r} has no name before it")
+        raise InputError(f"{path}: {one_line(before)[:60]!r} has no name before it")
     if len(set(names)) < len(names):
-        raise FileFormatError(f"{path} has a name twice ({one_line(', '.join(names))}); keep one")
+        raise InputError(f"{path} has a name twice ({one_line(', '.join(names))}); keep one")
     return _Fields(path, dict(zip(names, values, strict=True)))
 
 
 def _check_intrinsics(path: Path, matrix: Floats) -> Floats:
     bottom = np.array_equal(matrix[2], [0, 0, 1])
     if not (bottom and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
-        raise FileFormatError(f"{path}: the intrinsics are not fx s cx, 0 fy cy, 0 0 1")
+        raise InputError(f"{path}: the intrinsics are not fx s cx, 0 fy cy, 0 0 1")
     return matrix
 
 

@@ -111,8 +111,7 @@ def read_model(path: Path) -> ColmapModel:
     """Returns the sparse model in a folder, or in its 0/, sparse/0/ or sparse/.
 
     Raises:
-        InputError: There is none.
-        FileFormatError: It is damaged or cut short.
+        InputError: There is none, or it is damaged or cut short.
     """
     files = model_files(find_model(path))
     states = tuple((file, size_of_regular_file(file), file.stat().st_mtime_ns) for file in files)

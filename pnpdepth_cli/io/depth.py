@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, OutputError, SizeError
+from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_rows
 from pnpdepth_cli.io.formats import (
@@ -89,10 +89,10 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
         kind = kind_of(data)
         if kind is not None:
             raise no_depth(path, f"an 8-bit {kind}")
-        raise FileFormatError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
+        raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)
     if stored.values.dtype.kind == "b" and not is_mask:
-        raise FileFormatError(f"{path} holds bool values; depth is float or integer")
+        raise InputError(f"{path} holds bool values; depth is float or integer")
     return stored
 
 
@@ -105,14 +105,14 @@ def depth_from_stored(
     not of the size (H, W) of their image.
 
     Raises:
-        FileFormatError: The numbers are no image of one channel, or exceed the budget.
+        InputError: The numbers are no image of one channel, or exceed the budget.
     """
     values: NDArray[np.generic] = stored.values
     while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):  # as networks give it
         values = values[0] if len(values) == 1 else values[..., 0]
     if values.ndim != 2:
         fact = f"has the shape {stored.values.shape}"
-        raise FileFormatError(f"{path} {fact}; a depth image is (H, W)")
+        raise InputError(f"{path} {fact}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(stored.reading.source))
@@ -148,13 +148,13 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
     Raises:
         OutputError: The suffix is unknown, the file cannot be written, or a depth is too large for
             16 bits or so small that it would become 0.
-        SizeError: The depth is not (H, W).
+        InputError: The depth is not (H, W).
     """
     depth_format = format_of_suffix(path.suffix)
     if depth_format is None:
         raise OutputError(f"{path}: the suffix for depth is one of {', '.join(DEPTH_SUFFIXES)}")
     if depth.ndim != 2 or 0 in depth.shape:
-        raise SizeError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
+        raise InputError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
     values: NDArray[np.generic] = known_metres(depth)
     text = dict[str, str]()
     if depth_format.integer:
@@ -192,7 +192,7 @@ def read_sparse(
 
     Raises:
         NoPointsError: No depth is known.
-        SizeError: The file is a list, and no size was given.
+        InputError: The file is a list, and no size was given.
     """
     check_scale(scale)
     stored, header = _load_list(path)
@@ -225,16 +225,18 @@ def _from_rows(
     path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
 ) -> tuple[Points, Reading]:
     if rows.dtype.kind != "f":
-        raise FileFormatError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
+        raise InputError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
     if rows.shape[1] != 3:
         fact = f"{rows.shape[1]} numbers a row are not x, y and depth"
-        raise FileFormatError(f"{path}: {fact}; if they are x y z of a scan, give --calib")
+        raise InputError(f"{path}: {fact}; if they are x y z of a scan, give --calib")
     depth = known_metres(rows[:, 2])
     known = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
     if not known.any():
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     if size is None:
-        raise SizeError(f"{path} is a list of points, which needs an image to say the frame's size")
+        raise InputError(
+            f"{path} is a list of points, which needs an image to say the frame's size"
+        )
     if lost := len(rows) - int(np.count_nonzero(known)):
         source += f", without {lost:,} rows that have no depth above 0 or no pixel"
     xy = rows[known, :2].astype(np.float32)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.budget import budget, check_claim
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
 _LONGEST_TEXT = 1 << 20
@@ -42,8 +42,8 @@ def read_bytes(path: Path) -> bytes:
     """Returns the whole content of a regular file.
 
     Raises:
-        InputError: There is no such file, or it is a folder, a device or a pipe.
-        FileFormatError: It is empty, or larger than the budget.
+        InputError: There is no such file; it is a folder, a device or a pipe; or it is empty, or
+            larger than the budget.
     """
     size, limit = size_of_regular_file(path), budget().max_file_bytes
     check_claim(f"{path} has {size:,} bytes", size, limit, way_out=_SMALLER)
@@ -52,7 +52,7 @@ def read_bytes(path: Path) -> bytes:
     except OSError as error:
         raise cannot_read(path, error) from error
     if not data:
-        raise FileFormatError(f"{path} is empty (0 bytes); copy or create it again")
+        raise InputError(f"{path} is empty (0 bytes); copy or create it again")
     return data
 
 
@@ -65,13 +65,13 @@ def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
 
 
 def read_text(path: Path) -> str:
-    """Returns a calibration or the like. Raises FileFormatError if it is larger than any is."""
+    """Returns a calibration or the like. Raises InputError if it is larger than any is."""
     size = size_of_regular_file(path)
     check_claim(f"{path} has {size:,} bytes", size, _LONGEST_TEXT, way_out="give another file")
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path} is not a text file; give another") from error
+        raise InputError(f"{path} is not a text file; give another") from error
 
 
 def size_of_regular_file(path: Path) -> int:
@@ -103,9 +103,9 @@ def cannot_read(path: Path, error: OSError | ValueError) -> InputError:
     return InputError(f"{one_line(path)} cannot be read ({reason}); check the path")
 
 
-def damaged(path: Path, kind: str, fact: str) -> FileFormatError:
+def damaged(path: Path, kind: str, fact: str) -> InputError:
     """Returns the error for a file that ends early or is corrupt."""
-    return FileFormatError(f"{path}: {kind} {one_line(fact)}; copy or create the file again")
+    return InputError(f"{path}: {kind} {one_line(fact)}; copy or create the file again")
 
 
 def one_line(text: object) -> str:
@@ -117,13 +117,13 @@ def one_line(text: object) -> str:
 def check_pixel_count(
     path: Path, width: int, height: int, *, pixel_bytes: int = 1, file_bytes: int | None = None
 ) -> None:
-    """Raises FileFormatError for an image without pixels, or with more than the budget.
+    """Raises InputError for an image without pixels, or with more than the budget.
 
     To be called with what the header of a file claims, before so many bytes are decoded for each
     pixel; with `file_bytes` where few bytes of the format claim any size.
     """
     if width < 1 or height < 1:
-        raise FileFormatError(f"{path} has no pixels ({width}x{height}); create it again")
+        raise InputError(f"{path} has no pixels ({width}x{height}); create it again")
     count = width * height
     check_value_count(path, count, value_bytes=pixel_bytes)
     if file_bytes is not None:
@@ -132,7 +132,7 @@ def check_pixel_count(
 
 
 def check_value_count(path: Path, count: int, *, value_bytes: int = 1) -> None:
-    """Raises FileFormatError for an array of more values than the budget."""
+    """Raises InputError for an array of more values than the budget."""
     limits, decoded = budget(), count * value_bytes
     check_claim(f"{path} has {count:,} values", count, limits.max_pixels, way_out=_SMALLER)
     claim = f"{path} has {count:,} values of {decoded:,} bytes"
@@ -219,9 +219,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = parse_json(data)
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not valid JSON ({one_line(error)})") from error
+        raise InputError(f"{path} is not valid JSON ({one_line(error)})") from error
     if not isinstance(content, dict):
-        raise FileFormatError(f"{path} holds no JSON object at its top level; create it again")
+        raise InputError(f"{path} holds no JSON object at its top level; create it again")
     return content
 
 
@@ -266,7 +266,7 @@ def parse_yaml(path: Path, text: str) -> object:
     process on damaged files.
 
     Raises:
-        FileFormatError: The text is too long, has aliases, or is not YAML.
+        InputError: The text is too long, has aliases, or is not YAML.
         UsageError: PyYAML is not installed.
     """
     try:
@@ -274,7 +274,7 @@ def parse_yaml(path: Path, text: str) -> object:
     except ImportError:
         raise UsageError(f"reading {path} needs PyYAML: pip install 'pnpdepth[ros]'") from None
     if len(text) > _LONGEST_YAML:
-        raise FileFormatError(f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}")
+        raise InputError(f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}")
 
     class Loader(yaml.BaseLoader):  # type: ignore[misc]
         """BaseLoader without aliases, which can make a small file large."""
@@ -287,7 +287,7 @@ def parse_yaml(path: Path, text: str) -> object:
     try:
         return next(yaml.load_all(_OPENCV_HEADER.sub("", text), Loader), None)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not valid YAML ({one_line(error)})") from error
+        raise InputError(f"{path} is not valid YAML ({one_line(error)})") from error
 
 
 def _is_numbers(line: str, count: int) -> bool:
@@ -303,7 +303,7 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     A first line that begins with x y depth or x y z is a header; "#" begins a comment.
 
     Raises:
-        FileFormatError: A line is not made of as many numbers as the first.
+        InputError: A line is not made of as many numbers as the first.
     """
     numbered = [(number, _SEPARATOR.sub(" ", text)) for number, text in numbered_lines(data)]
     header = numbered[0][1].replace('"', "").lower().split() if numbered else []
@@ -316,11 +316,9 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
         count = max(3, len(lines[0]))
         bad = (each for each in numbered if not _is_numbers(each[1], count))
         number, line = next(bad, numbered[-1])
-        raise FileFormatError(
-            f"{path}, line {number}: {line[:80]!r} is not {count} numbers"
-        ) from None
+        raise InputError(f"{path}, line {number}: {line[:80]!r} is not {count} numbers") from None
     if not rows.size:
         return np.empty((0, 3)), header
     if rows.shape[1] < 3:
-        raise FileFormatError(f"{path} has lines of {rows.shape[1]} numbers; give 3 or more")
+        raise InputError(f"{path} has lines of {rows.shape[1]} numbers; give 3 or more")
     return rows, header

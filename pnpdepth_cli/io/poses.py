@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Extrinsics
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import (
     one_line,
     parse_yaml,
@@ -46,7 +46,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
     """Returns the pose of the scanner in the camera's coordinates.
 
     Raises:
-        FileFormatError: The file holds no pose.
+        InputError: The file holds no pose.
     """
     text = read_text(path)
     numbers = numbers_in(re.sub(r"#.*", "", text))
@@ -56,7 +56,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
         return pose_of_quaternion(path, numbers[:3], numbers[3:])
     if len(numbers) in (12, 16):
         return pose_of_matrix(path, "the matrix", numbers)
-    raise FileFormatError(f"{path} holds {len(numbers)} numbers; a pose has 7, 12 or 16")
+    raise InputError(f"{path} holds {len(numbers)} numbers; a pose has 7, 12 or 16")
 
 
 def numbers_in(value: object) -> list[float] | None:
@@ -76,12 +76,12 @@ def numbers_in(value: object) -> list[float] | None:
 
 
 def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
-    """Returns the pose of a 3×4 or 4×4 matrix by rows. Raises FileFormatError if it is none."""
+    """Returns the pose of a 3×4 or 4×4 matrix by rows. Raises InputError if it is none."""
     if len(numbers) not in (12, 16):
-        raise FileFormatError(f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16")
+        raise InputError(f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16")
     matrix = np.reshape(numbers, (-1, 4))
     if len(numbers) == 16 and not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise FileFormatError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
+        raise InputError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
     return check_pose(path, name, matrix[:3, :3], matrix[:3, 3])
 
 
@@ -89,21 +89,21 @@ def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) 
     """Returns the pose of a translation and a quaternion x y z w."""
     length = float(np.linalg.norm(xyzw))
     if len(xyzw) != 4 or not abs(length - 1) < 0.01:
-        raise FileFormatError(f"{path}: the quaternion has length {length:.3g} instead of 1")
+        raise InputError(f"{path}: the quaternion has length {length:.3g} instead of 1")
     if len(translation) != 3:
-        raise FileFormatError(f"{path}: a translation has 3 numbers, not {len(translation)}")
+        raise InputError(f"{path}: a translation has 3 numbers, not {len(translation)}")
     rotation = rotation_of(np.roll(xyzw, 1))
     return check_pose(path, "the quaternion", rotation, np.array(translation))
 
 
 def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
-    """Returns the pose. Raises FileFormatError if it holds no rotation, or is of no sensor."""
+    """Returns the pose. Raises InputError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
         off, turns = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation) > 0
         why = f"R·Rᵀ is off by {off:.2g}" if turns else "determinant −1: a left-handed scan?"
-        raise FileFormatError(f"{path}: {name} is no rotation ({why}); correct it")
+        raise InputError(f"{path}: {name} is no rotation ({why}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
-        raise FileFormatError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
+        raise InputError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
     return Extrinsics(rotation, translation)
 
 
@@ -138,7 +138,7 @@ def _pose_of_transform(path: Path, content: object) -> Extrinsics:
             numbers = numbers_in([x, y, z, qx, qy, qz, qw])
             if numbers is not None and len(numbers) == 7:
                 return pose_of_quaternion(path, numbers[:3], numbers[3:])
-    raise FileFormatError(f"{path} holds no matrix, no tx ty tz qx qy qz qw, no ROS transform")
+    raise InputError(f"{path} holds no matrix, no tx ty tz qx qy qz qw, no ROS transform")
 
 
 def read_poses(path: Path) -> Floats:
@@ -148,8 +148,7 @@ def read_poses(path: Path) -> Floats:
     x y z w (TUM RGB-D benchmark); `#` begins a comment.
 
     Raises:
-        FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The file cannot be read.
+        InputError: The file cannot be read, or a row has other numbers or no rotation.
     """
     return _rows(path)[1]
 
@@ -171,8 +170,7 @@ def poses_of_frames(
             transforms.json, else "camera-to-world".
 
     Raises:
-        FileFormatError: A row has other numbers, or its rotation is none.
-        InputError: The rows do not fit the frames.
+        InputError: A row has other numbers or no rotation, or the rows do not fit the frames.
     """
     if path.suffix.lower() == ".json":
         poses, how = _poses_of_nerfstudio(path, names), "joined by name"
@@ -209,7 +207,7 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
             if not np.isfinite(poses[index]).all() or not is_rotation(poses[index, :, :3]):
                 raise ValueError(f"the pose of {name} is no rotation")
     except (LookupError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path} is no transforms.json ({one_line(error)})") from error
+        raise InputError(f"{path} is no transforms.json ({one_line(error)})") from error
     return poses
 
 
@@ -247,7 +245,7 @@ def _rows(path: Path) -> tuple[Floats, Floats]:
     """The numbers (N, 12 or 8) of the rows and their poses (N, 3, 4); at least one."""
     rows, _ = read_rows(path, read_bytes(path))
     if not len(rows) or rows.shape[1] not in (_KITTI_COLUMNS, _TUM_COLUMNS):
-        raise FileFormatError(f"{path} has no rows of 12 numbers (KITTI) or 8 (TUM)")
+        raise InputError(f"{path} has no rows of 12 numbers (KITTI) or 8 (TUM)")
     if rows.shape[1] == _KITTI_COLUMNS:
         poses = rows.reshape(-1, 3, 4)
     else:
@@ -255,7 +253,7 @@ def _rows(path: Path) -> tuple[Floats, Floats]:
         poses = np.concatenate([turns, rows[:, 1:4, None]], axis=2)
     for number, pose in enumerate(poses, start=1):
         if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
-            raise FileFormatError(f"{path}: row {number} holds no rotation")
+            raise InputError(f"{path}: row {number} holds no rotation")
     return rows, poses
 
 
@@ -299,5 +297,5 @@ def read_trajectory(path: Path) -> Trajectory:
     """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
     rows, poses = _rows(path)
     if rows.shape[1] != _TUM_COLUMNS or not np.isfinite(rows[:, 0]).all():
-        raise FileFormatError(f"{path} has no rows of time, position and quaternion x y z w")
+        raise InputError(f"{path} has no rows of time, position and quaternion x y z w")
     return trajectory_of(rows[:, 0], poses)

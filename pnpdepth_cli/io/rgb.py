@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.formats import kind_of
 from pnpdepth_cli.io.formats.images import (
@@ -59,14 +59,14 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     if data[4:8] == b"ftyp":
         if data[8:12] in (b"avif", b"avis") or not _reads_heic():
             hint = "pip install 'pnpdepth[heic]' reads HEIC, or save it as JPEG"
-            raise FileFormatError(f"{path} is a HEIC or AVIF photo; {hint}")
+            raise InputError(f"{path} is a HEIC or AVIF photo; {hint}")
         kind = "HEIF"
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
-        raise FileFormatError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
+        raise InputError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     note, white = None, 255.0
     with open_image(path, data, kind) as image:
         if kind == "TIFF" and image.mode in ("I", "F"):
-            raise FileFormatError(f"{path} is no image; save it with 8 or 16 bits, none below 0")
+            raise InputError(f"{path} is no image; save it with 8 or 16 bits, none below 0")
         wide = ";16" in raw_mode(image)
         image.load()  # which applies the orientation of a TIFF
         orientation = orientation_of(image)
@@ -167,7 +167,7 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
     """Returns R, G and B (H, W, 3) as an EXR stores them; its only channel is repeated.
 
     Raises:
-        FileFormatError: It is damaged, beyond the budget, or holds no single image.
+        InputError: It is damaged, beyond the budget, or holds no single image.
     """
     channels = read_exr_channels(path, data)
     reds = [name for name in channels if name.rpartition(".")[2] == "R"]
@@ -178,7 +178,7 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
         names = grey * 3
     if not channels.keys() >= {*names}:
         listing = ", ".join(channels)
-        raise FileFormatError(f"{path} has no one image in ({listing}); export R, G and B")
+        raise InputError(f"{path} has no one image in ({listing}); export R, G and B")
     return np.stack([channels[name] for name in names], axis=2)
 
 
@@ -209,8 +209,8 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     """Returns frame `index` from 0, (H, W, 3) float32 in 0..1, as it is stored: not turned.
 
     Raises:
-        InputError: There is no such file, or the video is shorter.
-        FileFormatError: It is no MP4 or MOV file, cannot be decoded, or exceeds the budget.
+        InputError: There is no such file, it is no MP4 or MOV file, cannot be decoded, exceeds the
+            budget, or is shorter.
     """
     size_of_regular_file(path)
     opened = path, path.stat().st_mtime_ns
@@ -244,7 +244,7 @@ def _decode_video(path: Path) -> Iterator[Pixels]:
 
     with path.open("rb") as file:
         if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
-            raise FileFormatError(f"{path} is not an MP4 or MOV video; convert it")
+            raise InputError(f"{path} is not an MP4 or MOV video; convert it")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise damaged(path, "video", "cannot be decoded")

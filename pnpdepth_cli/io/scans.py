@@ -18,7 +18,7 @@ from tempfile import TemporaryFile
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of
@@ -55,15 +55,15 @@ def read_scan(path: Path) -> tuple[Points, str]:
         read, for a person.
 
     Raises:
-        FileFormatError: The file is damaged or ambiguous.
+        InputError: The file is damaged or ambiguous.
     """
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise FileFormatError(f"{path} is not a scan; give a file of {', '.join(_READERS)}")
+        raise InputError(f"{path} is not a scan; give a file of {', '.join(_READERS)}")
     data = read_bytes(path)
     kind = kind_of(data)
     if kind not in (None, "NPY"):
-        raise FileFormatError(f"{path} is a {kind} file, not a scan; check what is given as scan")
+        raise InputError(f"{path} is a {kind} file, not a scan; check what is given as scan")
     return read(path, data)
 
 
@@ -71,7 +71,7 @@ def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
     fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
         fact = f"{len(data):,} bytes are no multiple of {fields} float32 numbers a point"
-        raise FileFormatError(f"{path}: {fact}; it is cut short, or points have other fields")
+        raise InputError(f"{path}: {fact}; it is cut short, or points have other fields")
     points = np.frombuffer(data, "<f4").reshape(-1, fields)
     return _first_columns(points), _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
 
@@ -90,7 +90,7 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     most = max(explained.values())  # which multiples of the true count reach, too
     if most < _LEAST_EXPLAINED:
         fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
-        raise FileFormatError(f"{path} does not tell {fact}; save its x, y, z as NPY (N, 3)")
+        raise InputError(f"{path} does not tell {fact}; save its x, y, z as NPY (N, 3)")
     return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
@@ -111,11 +111,11 @@ def _explained_variance(
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
     """The first columns of (N, 3 or more) floats."""
     if kind_of(data) != "NPY":
-        raise FileFormatError(f"{path} is not an NPY file; save it with numpy.save")
+        raise InputError(f"{path} is not an NPY file; save it with numpy.save")
     array = parse_npy(path, data)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
         fact = f"holds {array.dtype} of shape {array.shape}"
-        raise FileFormatError(f"{path} {fact}; a scan is (N, 3 or more) floats, x y z first")
+        raise InputError(f"{path} {fact}; a scan is (N, 3 or more) floats, x y z first")
     return _first_columns(array), "NPY scan"
 
 

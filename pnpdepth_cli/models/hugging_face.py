@@ -21,7 +21,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.errors import CheckpointError, ModelError, describe
+from pnpdepth_cli.errors import ModelError, describe
 from pnpdepth_cli.models.definition import (
     UNTUNED_DEFAULTS,
     Fixed,
@@ -113,8 +113,8 @@ def hf_definition(folder: Path) -> ModelDefinition:
         folder: Folder with config.json, preprocessor_config.json and model.safetensors.
 
     Raises:
-        ModelError: A file is missing or wrong, or the type of network is not known.
-        CheckpointError: Its weights are missing, or are pickles.
+        ModelError: A file is missing or wrong, the type of network is not known, or its weights are
+            missing or pickles.
     """
     # The type of network, which must be known.
     config = _read(folder / "config.json", dict[str, object])
@@ -136,7 +136,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         raise ModelError(f"{file}: it says no size")
     weights = folder / "model.safetensors"
     if not weights.is_file():
-        raise CheckpointError(
+        raise ModelError(
             f"{folder} has no {weights.name}; have transformers load the network and write it by"
             " save_pretrained"
         )
@@ -220,7 +220,7 @@ def _build(folder: Path) -> nn.Module:
     # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:
-        raise CheckpointError(
+        raise ModelError(
             f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
             f" ({', '.join(sorted(missing)[:4])})"
         )

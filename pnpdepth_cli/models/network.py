@@ -14,7 +14,6 @@ from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import (
-    CheckpointError,
     DeviceError,
     ModelError,
     UsageError,
@@ -55,7 +54,7 @@ class Network:
         """Returns the network cut at a layer, to be opened by `with`.
 
         Raises:
-            LayerError: The network has no such layer.
+            ModelError: The network has no such layer.
         """
         return Split(self.module, layer, static_graph=self.definition.static_graph)
 
@@ -218,8 +217,8 @@ def load_network(
         device: Name of a torch device.
 
     Raises:
-        ModelError: There is no such network, or it cannot be built.
-        CheckpointError: Its weights are missing, or do not fit.
+        ModelError: There is no such network, it cannot be built, or its weights are missing or do
+            not fit.
         DeviceError: The device is missing or too small.
         UsageError: A checkpoint is named for a network that brings its own weights.
     """
@@ -268,13 +267,13 @@ def _load_weights(
         return []
     if path is None:
         if module.state_dict():
-            raise CheckpointError(
+            raise ModelError(
                 f"network {name!r} comes without weights; name a checkpoint, or, where"
                 " its build loads them itself, say complete=True in a definition"
             )
         return []
     if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
-        raise CheckpointError(
+        raise ModelError(
             f"checkpoint {path} does not exist, as the package has the weights of few networks;"
             f" take {path.name} from the repository, and name it as the checkpoint"
         )

@@ -52,7 +52,7 @@ def exported_definition(file: Path, **stated: object) -> ModelDefinition:
     """
     if not file.is_file():
         raise ModelError(f"exported program {file} does not exist")
-    check_network_file(file, "exported program", ModelError)
+    check_network_file(file, "exported program")
     try:
         program, tensors = _read(file)
         graph = _graph(program, tensors)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.pixels import DropCounter, Floats, Points, pixel_index
@@ -179,11 +179,11 @@ def sample_points(
     Raises:
         NoPointsError: The depth map or the pattern leaves no point.
         UsageError: More points are asked for than are known.
-        SizeError: Image and depth differ in size.
+        InputError: Image and depth differ in size.
     """
     size = (depth.shape[0], depth.shape[1])
     if image is not None and image.shape[:2] != size:
-        raise SizeError(
+        raise InputError(
             f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
         )
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))

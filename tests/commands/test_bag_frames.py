@@ -16,7 +16,7 @@ from pnpdepth_cli.commands.requests import FramesRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.scan_points import read_scan_points
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
@@ -195,7 +195,7 @@ def test_a_bag_that_is_cut_short_is_one_line(kind: str, part: float, tmp_path: P
     file = next(bag.glob("*.db3")) if bag.is_dir() else bag
     data = file.read_bytes()
     file.write_bytes(data[: int(part * len(data))])
-    with pytest.raises(FileFormatError) as caught:
+    with pytest.raises(InputError) as caught:
         written(bag, tmp_path / "frames")
     assert "\n" not in str(caught.value)
 

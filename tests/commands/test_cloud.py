@@ -12,7 +12,7 @@ import pytest
 from pnpdepth_cli.commands.cloud import write_depth_cloud
 from pnpdepth_cli.commands.requests import CloudRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
-from pnpdepth_cli.errors import InputError, OutputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
@@ -127,8 +127,8 @@ def test_what_cannot_be_done_is_an_error_and_writes_nothing(tmp_path: Path) -> N
         (c, {"max_sigma": 0.1}, InputError, "c"),
         (out, {"calib": None}, InputError, "b_depth"),  # it alone has no pose
         (out, {"image": big}, UsageError, "--image"),
-        (b, {"image": big}, SizeError, "--image"),
-        (resized, {}, SizeError, "c_depth"),
+        (b, {"image": big}, InputError, "--image"),
+        (resized, {}, InputError, "c_depth"),
     ]
     for path, values, error, named in cases:
         with pytest.raises(error, match=named):

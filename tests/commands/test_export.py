@@ -14,7 +14,7 @@ import pytest
 from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, PnpDepthError, SizeError
+from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
@@ -181,11 +181,11 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
         ("camera.pose", None, InputError),
         ("unit", "m", InputError),  # the others are in model units
         ("inputs.sparse.image", "b.png", InputError),  # as of the next frame
-        ("size", [9, 9], SizeError),
+        ("size", [9, 9], InputError),
         ("camera.distortion", [0.1] * 8, InputError),  # not Nerfstudio's
-        ("camera.pose", [1, 2], FileFormatError),
-        ("inputs.sparse.image", "../../../ESC", FileFormatError),
-        ("inputs.sparse.image", "/etc/x.png", FileFormatError),
+        ("camera.pose", [1, 2], InputError),
+        ("inputs.sparse.image", "../../../ESC", InputError),
+        ("inputs.sparse.image", "/etc/x.png", InputError),
     ],
 )
 def test_results_that_cannot_be_exported_are_one_line(
@@ -213,7 +213,7 @@ def test_results_need_depth_and_masks_of_their_size_and_nothing_is_replaced_unas
     cases: list[tuple[Path, Path, type[PnpDepthError], str]] = [
         (root / "images", root / "new", InputError, "NAME_depth"),
         (folder, dense, OutputError, "--overwrite"),
-        (folder, root / "new", SizeError, "a_valid"),
+        (folder, root / "new", InputError, "a_valid"),
     ]
     for source, output, error, named in cases:
         with pytest.raises(error, match=named):

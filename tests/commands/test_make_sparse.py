@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.make_sparse import (
     simulate_scan,
 )
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.errors import OutputError, PnpDepthError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
 from tests.commands.frames import ScanOnDisk, scan_on_disk
@@ -76,11 +76,11 @@ def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnD
     small, wide = frame.folder / "small.png", frame.folder / "wide.png"
     Image.new("RGB", (20, 15)).save(small)
     Image.new("RGB", (128, 48)).save(wide)
-    refused(frame, SizeError, "small.png is 20×15, which does not contain", image=small)
+    refused(frame, InputError, "small.png is 20×15, which does not contain", image=small)
     record = projected(frame, image=wide)
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
-    refused(frame, SizeError, "is for images of 64×48", image=wide, output="b.csv")
+    refused(frame, InputError, "is for images of 64×48", image=wide, output="b.csv")
 
 
 def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:

@@ -20,7 +20,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import evaluate
 from pnpdepth_cli.commands.make_sparse import sample_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refiner import frame_of_arrays
@@ -111,7 +111,7 @@ def test_a_list_with_a_calibration_is_a_scan_unless_it_has_pixels(
 ) -> None:
     write_list(tmp_path / name, scan[:, :columns])
     same_points(tmp_path / name, scan[:, :3])
-    with pytest.raises(FileFormatError, match="--calib"):
+    with pytest.raises(InputError, match="--calib"):
         read(tmp_path / name, calib=None)
     rows = np.random.default_rng(0).uniform(1, 300, (50, 3))
     if name != "a.csv":
@@ -190,7 +190,7 @@ def test_a_calibration_that_the_image_contradicts_is_warned_of(tmp_path: Path) -
     (warning,) = warnings_of(extrinsics=turned)
     assert "turned by 0° about the camera's x and -2° about y" in warning
     np.savetxt(mirrored, pose * (1, -1, 1, 1))
-    with pytest.raises(FileFormatError, match="determinant −1"):
+    with pytest.raises(InputError, match="determinant −1"):
         warnings_of(extrinsics=mirrored)
 
 
@@ -248,7 +248,7 @@ def test_a_mask_is_no_depth_and_is_said_where_it_is_not_used(tmp_path: Path) -> 
     np.save(tmp_path / "mask.npy", np.arange(640) < np.full((480, 1), 320))
     frame = indoor(INDOOR / "sparse.png", tmp_path / "mask.npy")
     assert len(frame.points) == np.count_nonzero(codes_of(INDOOR / "sparse.png")[:, :320])
-    with pytest.raises(FileFormatError, match=r"mask\.npy"):
+    with pytest.raises(InputError, match=r"mask\.npy"):
         indoor(tmp_path / "mask.npy")
     frame = indoor(INDOOR / "sparse.png", masks=(tmp_path / "mask.npy",))  # of no ground truth
     assert any("sparse_mask" in note for note in frame.notes)

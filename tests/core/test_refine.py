@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.choices import UPDATES
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import DivergedError, LayerError, ModelError
+from pnpdepth_cli.errors import DivergedError, ModelError
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 from tests.completion.naive import naive_refine, plain
@@ -158,7 +158,7 @@ def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(
 ) -> None:
     parts = {"cut": conv(3, 4), "side": conv(3, 4), "head": conv(4, 1)}
     network = Net(lambda net, x: behind(net, net.cut(x), x), **parts)
-    with pytest.raises(LayerError) as error:
+    with pytest.raises(ModelError) as error:
         refined(network, "cut", ClosedSettings())
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)

@@ -18,7 +18,7 @@ from pnpdepth_cli.dataset.frame_record import (
     ModelRecord,
     PointsRecord,
 )
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, Sampling
 from pnpdepth_cli.io.file_bytes import Fingerprint
 
@@ -107,7 +107,7 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
     ],
 )
 def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
-    with pytest.raises(FileFormatError, match=r"a\.json"):
+    with pytest.raises(InputError, match=r"a\.json"):
         FrameRecord.from_json(entry, Path("a.json"))
 
 

@@ -17,7 +17,7 @@ from pnpdepth_cli.dataset.plausible import (
     plausible_map,
     scan_returns,
 )
-from pnpdepth_cli.errors import FileFormatError, InputError, NoPointsError, SizeError
+from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.formats import Reading
 
 RNG = np.random.default_rng(0)
@@ -67,8 +67,8 @@ def test_beams_without_return_are_dropped_and_counted(scan: np.ndarray, gone: sl
 @pytest.mark.parametrize(
     ("scan", "error", "said"),
     [
-        (with_rows(slice(10, 210), [1, np.nan, 1]), FileFormatError, "200 of .*number 11: 1 nan 1"),
-        (SCAN * [1, 1e9, 1], FileFormatError, "none of a scan"),
+        (with_rows(slice(10, 210), [1, np.nan, 1]), InputError, "200 of .*number 11: 1 nan 1"),
+        (SCAN * [1, 1e9, 1], InputError, "none of a scan"),
         (SCAN[:0], NoPointsError, "a.npy"),
         (np.zeros((5, 3), np.float32), NoPointsError, "a.npy"),
         (1000 * SCAN, InputError, r"--depth-scale 1000 \(now 1\) would make it"),
@@ -201,10 +201,10 @@ LIST = RNG.uniform(0, 1, (100, 2)) * (639, 479)
 @pytest.mark.parametrize(
     ("xy", "error", "said"),
     [
-        (LIST / (640, 480), FileFormatError, "a.csv"),
-        (2 * LIST / (640, 480) - 1, FileFormatError, "a.csv"),
-        (LIST - np.array([320, 240]), FileFormatError, "a.csv"),
-        (LIST[:, ::-1], SizeError, "swap x and y"),
+        (LIST / (640, 480), InputError, "a.csv"),
+        (2 * LIST / (640, 480) - 1, InputError, "a.csv"),
+        (LIST - np.array([320, 240]), InputError, "a.csv"),
+        (LIST[:, ::-1], InputError, "swap x and y"),
         (LIST[:5] + 1000, NoPointsError, "a.csv"),
     ],
 )

@@ -15,7 +15,7 @@ from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
-from pnpdepth_cli.errors import InputError, NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
@@ -98,7 +98,7 @@ def test_what_does_not_fit_a_model_is_refused(project: Path) -> None:
         with pytest.raises(UsageError, match="--unit-scale"):
             ReadOptions(unit_scale=scale)
     for size, why in (((WIDTH, HEIGHT), "turned by 90°"), ((WIDTH, 3 * WIDTH), "same view")):
-        with pytest.raises(SizeError, match=why):
+        with pytest.raises(InputError, match=why):
             read_colmap_points(project, project / "images/a.png", size)
     change(project, "points3D.txt", " 9 9 9 0.5 ", " 9 9 9 5 ")
     with pytest.raises(NoPointsError):
@@ -183,7 +183,7 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
     assert record.camera.intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
     assert record.camera.distortion == [-0.1, 0, 0, 0]
     calib.write_text(f"{CALIB}size: [64, 48]\n")
-    with pytest.raises(SizeError, match=r"\b64×48"):
+    with pytest.raises(InputError, match=r"\b64×48"):
         run(frame, scan=ScanOptions(calib=calib), overwrite=True)
 
 

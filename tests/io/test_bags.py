@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.bags import bound_decompression, open_bag
 from pnpdepth_cli.io.bags.messages import camera_info_topic, cloud_points, image_file
 from tests.bags import write_bag
@@ -50,7 +50,7 @@ def test_an_image_of_every_encoding_has_its_colour(encoding: str) -> None:
 def test_an_image_of_other_size_than_its_bytes_or_of_another_kind_is_refused() -> None:
     sizes = ({"height": 0}, {"height": 7}, {"width": 7}, {"step": 5}, {"step": 7})
     for claim in (*sizes, {"encoding": "rgb8"}, {"encoding": "yuv422"}):
-        with pytest.raises(FileFormatError):
+        with pytest.raises(InputError):
             image_file(image_message(**claim), "/image")
 
 
@@ -68,7 +68,7 @@ def test_an_organised_cloud_gives_its_points_row_by_row(order: str) -> None:
     assert flat.tolist() == got[:3].tolist()
     claims = ({"height": 3}, {"width": 4}, {"point_step": 11}, {"row_step": 35})
     for claim in (*claims, {"fields": fields[:2]}):
-        with pytest.raises(FileFormatError):
+        with pytest.raises(InputError):
             cloud_points(SimpleNamespace(**(cloud | claim)), "/scan")
 
 
@@ -136,9 +136,9 @@ def test_a_bag_with_odd_metadata_or_a_database_that_computes_is_refused(
     else:
         with closing(sqlite3.connect(file)) as connection:
             connection.executescript(hostile)
-        with pytest.raises(FileFormatError):
+        with pytest.raises(InputError):
             read_all(file)
-    with pytest.raises(FileFormatError):
+    with pytest.raises(InputError):
         read_all(bag)
 
 

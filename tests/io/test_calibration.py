@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.sensors.lens import pixels_of
@@ -225,7 +225,7 @@ NO_POSES = [
 def test_what_is_missing_or_wrong_is_named_in_one_line(
     tmp_path: Path, read: Callable[[Path], object], text: str
 ) -> None:
-    with pytest.raises(FileFormatError, match=r"calib\.txt") as error:
+    with pytest.raises(InputError, match=r"calib\.txt") as error:
         read(write(tmp_path, text))
     assert "\n" not in str(error.value)
 

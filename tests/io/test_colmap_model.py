@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.colmap_model import MODELS, name_in_model, read_model
 from pnpdepth_cli.sensors.lens import pixels_of
 from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
@@ -57,7 +57,7 @@ def test_a_binary_file_that_is_cut_short_or_whose_counts_lie_is_one_line(
     lies = [whole[:at] + struct.pack("<Q", 2**40) + whole[at + 8 :] for at in counts]
     for content in [*lies, *(whole[:end] for end in range(1, len(whole)))]:
         file.write_bytes(content)
-        with pytest.raises(FileFormatError, match=str(file)) as caught:
+        with pytest.raises(InputError, match=str(file)) as caught:
             read_model(tmp_path)
         assert "\n" not in str(caught.value)
 
@@ -80,7 +80,7 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
 def test_a_faulty_line_of_a_text_model_is_refused(part: str, text: str, tmp_path: Path) -> None:
     write_text_model(tmp_path)
     (tmp_path / f"{part}.txt").write_text(text)
-    with pytest.raises(FileFormatError):
+    with pytest.raises(InputError):
         read_model(tmp_path)
 
 

@@ -10,15 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from pnpdepth_cli.errors import (
-    FileFormatError,
-    InputError,
-    NoPointsError,
-    OutputError,
-    PnpDepthError,
-    SizeError,
-    UsageError,
-)
+from pnpdepth_cli.errors import InputError, NoPointsError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import (
     DEPTH_SUFFIXES,
     describe_range,
@@ -78,7 +70,7 @@ ONE = [[1.0]]
         ("d.png", [[1, 1e-3, 1e-4]], 256, OutputError),
         *(("d.png", ONE, s, UsageError) for s in (0, np.nan)),
         *((name, ONE, 256, OutputError) for name in ("d.jpg", "d")),
-        ("d.npy", np.ones((0, 4)), 256, SizeError),
+        ("d.npy", np.ones((0, 4)), 256, InputError),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
@@ -166,9 +158,9 @@ def test_a_header_says_whether_rows_are_of_a_scan(
 @pytest.mark.parametrize(
     ("content", "error"),
     [
-        *((text, FileFormatError) for text in ("1 2 3\n4 5\n", "1 2 3 4\n", "1 2\n3 4\n")),
-        *((text, FileFormatError) for text in ("u v w\n1 2 3\n", "1,5;2,5;3,5\n")),
-        ("1 2 3\n", SizeError),
+        *((text, InputError) for text in ("1 2 3\n4 5\n", "1 2 3 4\n", "1 2\n3 4\n")),
+        *((text, InputError) for text in ("u v w\n1 2 3\n", "1,5;2,5;3,5\n")),
+        ("1 2 3\n", InputError),
         *((text, NoPointsError) for text in ("0 0 0\n" * 5, "# nothing\n")),
     ],
 )

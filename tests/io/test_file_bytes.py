@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, read_json, read_rows, write_json
 
 
@@ -41,7 +41,7 @@ def test_json_is_read_back_plain_and_in_order_and_what_it_cannot_hold_leaves_the
 )
 def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "r.json").write_bytes(content)
-    with pytest.raises(FileFormatError, match=r"r\.json") as no:
+    with pytest.raises(InputError, match=r"r\.json") as no:
         read_json(tmp_path / "r.json")
     assert "\n" not in str(no.value)
 
@@ -51,7 +51,7 @@ def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> No
     [("x,y,depth\n1,2,3\n1,b,3\n", 3), ("# c\n\n1 2 3\n1 2 3 4\n", 4), ("1 2\n1 2 3\n", 1)],
 )
 def test_a_row_that_is_not_of_as_many_numbers_is_named_by_its_line(text: str, line: int) -> None:
-    with pytest.raises(FileFormatError, match=rf"points\.csv, line {line}\b"):
+    with pytest.raises(InputError, match=rf"points\.csv, line {line}\b"):
         read_rows(Path("points.csv"), text.encode())
 
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, write_depth
 from tests.exr_files import write_exr
 from tests.models.weights.files import Hostile
@@ -58,7 +58,7 @@ def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
     for senseless in (0.0, -256.0, math.nan):
         with pytest.raises(UsageError):
             read_depth(path, scale=senseless)
-        with pytest.raises(FileFormatError, match=f"pnpdepth:scale={senseless}"):
+        with pytest.raises(InputError, match=f"pnpdepth:scale={senseless}"):
             read_depth(save(tmp_path / "d.png", CODES, str(senseless)))
 
 
@@ -124,14 +124,14 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
     ],
 )
 def test_what_is_no_depth_is_refused(tmp_path: Path, name: str, values: Any) -> None:
-    with pytest.raises(FileFormatError):
+    with pytest.raises(InputError):
         read_depth(save(tmp_path / name, values))
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
 def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
     evil = np.array([Hostile(open, str(tmp_path / "trace"), "w")], dtype=object)
-    with pytest.raises(FileFormatError, match="allow_pickle"):
+    with pytest.raises(InputError, match="allow_pickle"):
         read_depth(save(tmp_path / f"d{suffix}", evil if suffix == ".npy" else {"a": evil}))
     assert not (tmp_path / "trace").exists()
 
@@ -145,7 +145,7 @@ def test_every_truncation_of_a_depth_file_is_refused_in_one_line(
     content = path.read_bytes()
     for length in [*range(0, len(content), max(1, len(content) // 60)), len(content) - 1]:
         path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError, match=f"^{path}") as caught:
+        with pytest.raises(InputError, match=f"^{path}") as caught:
             read_depth(path)
         assert "\n" not in str(caught.value)
     said = capfd.readouterr()
@@ -162,5 +162,5 @@ def test_an_exr_of_several_parts_or_with_a_crop_of_its_display_is_refused(tmp_pa
     window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
     write_exr(tmp_path / "crop.exr", {"Z": METRES}, displayWindow=window)
     for name in ("parts.exr", "crop.exr"):
-        with pytest.raises(FileFormatError, match=name):
+        with pytest.raises(InputError, match=name):
             read_depth(tmp_path / name)

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.budget import set_max_pixels
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
 from pnpdepth_cli.io.file_bytes import read_json, sha256_of
@@ -139,7 +139,7 @@ def test_what_claims_much_or_lies_is_refused_with_little_memory_and_in_silence(
     path = tmp_path / name
     path.write_bytes(HOSTILE[name])
     for read in (read_depth, read_rgb) if path.suffix in (".png", ".tif") else (read_depth,):
-        with little(), pytest.raises(FileFormatError, match=re.escape(str(path))) as caught:
+        with little(), pytest.raises(InputError, match=re.escape(str(path))) as caught:
             read(path)
         assert "\n" not in str(caught.value)
     said = capfd.readouterr()
@@ -171,7 +171,7 @@ def test_more_pixels_than_the_budget_are_refused_before_they_are_read(
     write_depth(path, np.ones((300, 400), np.float32))
     try:
         set_max_pixels(119_999)
-        with pytest.raises(FileFormatError):
+        with pytest.raises(InputError):
             read_depth(path)
         set_max_pixels(120_000)
         assert read_depth(path).values.shape == (300, 400)

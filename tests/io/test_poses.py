@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.errors import FileFormatError, InputError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.poses import poses_of_frames, read_poses, read_trajectory
 
 HALF = float(np.sqrt(0.5))
@@ -67,7 +67,7 @@ def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
     for name in ("a", "d"):
         with pytest.raises(InputError, match=f"'{name}'"):
             poses_of(cameras, name)
-    with pytest.raises(FileFormatError):
+    with pytest.raises(InputError):
         poses_of({"a": [[1, 2]]}, "a")
 
 
@@ -103,7 +103,7 @@ def test_poses_of_every_kind_are_the_same_camera(
 )
 def test_a_broken_row_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "p.txt").write_text(text)
-    with pytest.raises(FileFormatError, match=r"p\.txt"):
+    with pytest.raises(InputError, match=r"p\.txt"):
         read_poses(tmp_path / "p.txt")
 
 

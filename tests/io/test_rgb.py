@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
 from tests.exr_files import write_exr
 
@@ -58,7 +58,7 @@ def test_exif_rotation_is_honoured(tmp_path: Path, kind: str, orientation: int) 
 def test_what_is_no_image_is_refused(tmp_path: Path, kind: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"\0\0\0\x18ftyp" + kind + b"\0\0\0\0" if len(kind) == 4 else kind)
-    with pytest.raises(FileFormatError, match=str(path)):
+    with pytest.raises(InputError, match=str(path)):
         read_rgb(path)
 
 
@@ -80,7 +80,7 @@ def test_every_truncation_of_an_image_is_refused(tmp_path: Path, kind: str) -> N
     content = path.read_bytes()
     for length in [*range(0, len(content), 41), len(content) - 2, len(content) - 1]:
         path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError):
+        with pytest.raises(InputError):
             read_rgb(path)
 
 

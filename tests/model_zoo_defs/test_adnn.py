@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from model_zoo_defs.adnn import Adnn
-from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.network import load_network
 
 Array = NDArray[np.float64]
@@ -96,5 +96,5 @@ def test_the_authors_variables_load_from_a_numpy_file_into_their_parameters(tmp_
     for name, array in arrays.items():
         assert np.array_equal(state[name], array.transpose(3, 2, 0, 1) if array.ndim else array)
     np.save(tmp_path / "adnn.npy", arrays | {"global_step": np.array(3)}, allow_pickle=True)
-    with pytest.raises(CheckpointError):
+    with pytest.raises(ModelError):
         load_network("adnn", tmp_path / "adnn.npy")

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from pnpdepth_cli.errors import CheckpointError, DeviceError, ModelError
+from pnpdepth_cli.errors import DeviceError, ModelError
 from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -102,7 +102,7 @@ def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_ch
         assert loaded.checkpoint == weights
     weights.unlink()
     for spec in (bare, owned):
-        with pytest.raises(CheckpointError):
+        with pytest.raises(ModelError):
             load_network(spec, None)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import PATTERNS
-from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.pixels import Points
 from pnpdepth_cli.sensors.simulation import LIDARS, ideal_lidar, sample_points, simulate_lidar
@@ -121,7 +121,7 @@ def test_features_lie_at_the_corners_of_the_image() -> None:
         (DEPTH, "uniform", 4801, None, UsageError),
         (DEPTH, "features", 3, PLAIN, NoPointsError),
         (DEPTH, "features", 3, None, UsageError),
-        (DEPTH, "features", 3, PLAIN[:30], SizeError),
+        (DEPTH, "features", 3, PLAIN[:30], InputError),
         (DEPTH, "lines", 61, None, UsageError),
     ],
 )

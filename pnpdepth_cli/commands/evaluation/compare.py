@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.statistics import Clusters, find_clusters
 from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import groups_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.errors import FileFormatError, InputError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
@@ -117,8 +117,8 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
 
     Raises:
         UsageError: For fewer than two runs.
-        FileFormatError: For a file without scores.
-        InputError: If they were scored by different rules, or have no frame in common.
+        InputError: For a file without scores, or if the runs were scored by different rules or have
+            no frame in common.
     """
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare")
@@ -284,7 +284,7 @@ def _read_run(text: str) -> Run:
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FileFormatError(
+        raise InputError(
             f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))}); give"
             " what eval --json printed, or the summary of a batch with ground truth"
         ) from error

@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, 
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
-from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError
+from pnpdepth_cli.errors import InputError, PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
 from pnpdepth_cli.io.formats import DepthFile, Reading
@@ -239,11 +239,11 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     """Returns the rows and columns of a frame of `size` (H, W) pixels that lie in a crop.
 
     Raises:
-        SizeError: If the crop does not fit the frame.
+        InputError: If the crop does not fit the frame.
     """
     height, width = size
     if crop == "nyu" and size != (480, 640):
-        raise SizeError(
+        raise InputError(
             f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol paper"
             " scores any size"
         )
@@ -252,9 +252,9 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     return slice(*map(int, rows)), slice(*map(int, columns))
 
 
-def _different(what: str, shape: Size, size: Size, advice: str = "") -> SizeError:
+def _different(what: str, shape: Size, size: Size, advice: str = "") -> InputError:
     other = f"the ground truth is {size[1]}×{size[0]}"
-    return SizeError(f"{what} is {shape[1]}×{shape[0]} but {other}{advice}")
+    return InputError(f"{what} is {shape[1]}×{shape[0]} but {other}{advice}")
 
 
 def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:

@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.tables import count_of
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_files import ImageSource, name_problem
 from pnpdepth_cli.dataset.frame_record import Pose
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, SizeError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import all_or_none, atomic_path, make_folder
 from pnpdepth_cli.io.rgb import sizes_of
 from pnpdepth_cli.points import MODEL_UNITS
@@ -188,10 +188,10 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
     own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
     name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
     if not 1e-9 < scale < 1e9 or name_problem(name) or not name.isprintable():
-        raise FileFormatError(f"{result.depth}: the record beside it is damaged; refine it again")
+        raise InputError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
     if isinstance(image, Path) and (height, width) not in sizes_of(image):
-        raise SizeError(
+        raise InputError(
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"
         )

@@ -51,7 +51,7 @@ class Split:
             values of tensors reach Python.
 
     Raises:
-        LayerError: The layer does not exist, never runs, or runs or returns several times without a
+        ModelError: The layer does not exist, never runs, or runs or returns several times without a
             choice.
     """
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.tensors import tensors_in
-from pnpdepth_cli.errors import LayerError
+from pnpdepth_cli.errors import ModelError
 
 _NAME = re.compile(r"(?P<module>[^#\[\]]*)(?:#(?P<call>\d+))?(?P<keys>(?:\[[^\[\]]+\])*)")
 """`module`, `module#2` for its second call, `module[key]` for one of its outputs."""
@@ -34,10 +34,10 @@ class CutPoint:
 
     @classmethod
     def find(cls, network: nn.Module, layer: str) -> CutPoint:
-        """Returns the cut point of that name. Raises LayerError if there is no such submodule."""
+        """Returns the cut point of that name. Raises ModelError if there is no such submodule."""
         match = _NAME.fullmatch(layer)
         if match is None or match["call"] == "0":
-            raise LayerError(f"layer {layer!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
+            raise ModelError(f"layer {layer!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
         name = match["module"]
         modules = dict(network.named_modules(remove_duplicate=False))
         if name not in modules or not name:
@@ -45,7 +45,7 @@ class CutPoint:
             hint = f"did you mean {', '.join(near)}?"
             if not near:
                 hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
-            raise LayerError(f"layer {name!r} is not in this network; {hint}")
+            raise ModelError(f"layer {name!r} is not in this network; {hint}")
         return cls(
             layer=layer,
             name=name,
@@ -61,7 +61,7 @@ class CutPoint:
         """Returns the path and the tensor of z in the layer's output.
 
         Raises:
-            LayerError: The output has no such tensor, or several and the name chooses none.
+            ModelError: The output has no such tensor, or several and the name chooses none.
         """
         candidates = [
             (path, tensor)
@@ -79,20 +79,20 @@ class CutPoint:
             problem = f"returns several tensors; say which: {names}"
         else:
             problem = "returns no tensor"
-        raise LayerError(f"layer {self.layer!r} {problem}")
+        raise ModelError(f"layer {self.layer!r} {problem}")
 
-    def never_ran(self, ran: Collection[nn.Module], calls: int) -> LayerError:
+    def never_ran(self, ran: Collection[nn.Module], calls: int) -> ModelError:
         """Returns the error of a pass that did not reach the cut."""
         if self.module in ran:
             times = f"{calls} time{'s' if calls > 1 else ''}"
-            return LayerError(f"layer {self.layer!r}: it is called only {times}")
+            return ModelError(f"layer {self.layer!r}: it is called only {times}")
         inside = [
             name
             for name, module in self.modules.items()
             if name.startswith(f"{self.name}.") and module in ran
         ]
         hint = f"cut at a part of it: {', '.join(inside[:4])}" if inside else "choose another layer"
-        return LayerError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
+        return ModelError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
 
 
 def _containers(inner: nn.Module, modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split.cut_point import CutPoint
 from pnpdepth_cli.core.split.tensors import SavedTensors, map_tensors, tensors_in
 from pnpdepth_cli.core.split.watch import Watch
-from pnpdepth_cli.errors import LayerError, PnpDepthError
+from pnpdepth_cli.errors import ModelError, PnpDepthError
 
 Run = Callable[[], object]
 """Runs a call of a submodule; returns its output."""
@@ -271,14 +271,14 @@ class Recorder:
         """Gives the replay the whole recording.
 
         Raises:
-            LayerError: The cut is ambiguous, or its output cannot be replaced.
+            ModelError: The cut is ambiguous, or its output cannot be replaced.
         """
         layer, calls = self._cut.layer, self._replay.calls[self._cut.module]
         if self._cut.call is None and calls > 1:
             choices = ", ".join(f"{layer}#{call}" for call in range(1, calls + 1))
-            raise LayerError(f"layer {layer!r} is called {calls} times; say which call: {choices}")
+            raise ModelError(f"layer {layer!r} is called {calls} times; say which call: {choices}")
         if self.watch.torn:  # z shares memory with a tensor that the network changes
-            raise LayerError(
+            raise ModelError(
                 f"layer {layer!r}: its output lies in the memory of an earlier tensor, and the"
                 " network changes one in place and reads the other; cut one layer later"
             )

@@ -35,7 +35,7 @@ from pnpdepth_cli.dataset.frame_files import (
     find_files,
 )
 from pnpdepth_cli.dataset.layouts.layout import Layout, row
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
 from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes, read_json
 from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory, rotation_of
@@ -98,7 +98,7 @@ def _timed_files(path: Path, count: int) -> list[list[Timed]]:
         finite = all(math.isfinite(time_s) for time_s, _ in row)
         if len(row) != count or not finite or (count == 2 and sum(map(_is_depth, row)) != 1):
             fact = f"{one_line(line)[:60]!r} is not a time and a path for each image and depth"
-            raise FileFormatError(f"{path}, line {number}: {fact}")
+            raise InputError(f"{path}, line {number}: {fact}")
         rows.append(row)
     return rows
 
@@ -172,7 +172,7 @@ def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:
         rows = np.loadtxt(io.BytesIO(read_bytes(path)), delimiter=",", skiprows=1, usecols=range(9))
         poses = {int(row[1]): _pose(row[2:5], row[5:]) for row in np.atleast_2d(rows)}
     except (ValueError, OverflowError) as error:
-        raise FileFormatError(
+        raise InputError(
             f"{path}: not timestamp, frame, x, y, z, qx, qy, qz, qw ({one_line(error)})"
         ) from error
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
@@ -184,7 +184,7 @@ def _of_record3d(place: Path) -> Callable[[FrameFiles], FrameFiles]:
         rows = [np.array(row, np.float64) for row in read_json(path).get("poses", [])]
         poses = {n: _pose(row[4:], row[:4], y_up=True) for n, row in enumerate(rows)}
     except (TypeError, ValueError):
-        raise FileFormatError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
+        raise InputError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 

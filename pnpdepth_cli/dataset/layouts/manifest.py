@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
 from pnpdepth_cli.dataset.layouts.layout import Layout
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
@@ -40,7 +40,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
         try:
             frames[number] = _frame(row, paths)
         except (ValueError, OverflowError, UsageError) as error:
-            raise FileFormatError(f"{root}, line {number}: {one_line(error)}") from error
+            raise InputError(f"{root}, line {number}: {one_line(error)}") from error
         for path in paths.values():
             if not path.exists():
                 why = f"does not exist; correct line {number} of {root}"
@@ -50,7 +50,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
-            raise FileFormatError(
+            raise InputError(
                 f"{root}, line {number}: a second frame {one_line(frame.name)!r}, but for capitals;"
                 " give it a name of its own"
             )
@@ -62,14 +62,14 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path} is not a text file; give CSV") from error
+        raise InputError(f"{path} is not a text file; give CSV") from error
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         for row in reader:
             texts = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None}
             yield reader.line_num, {k: v for k, v in texts.items() if v}
     except csv.Error as error:
-        raise FileFormatError(f"{path}, line {reader.line_num}: {one_line(error)}") from error
+        raise InputError(f"{path}, line {reader.line_num}: {one_line(error)}") from error
 
 
 def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from pnpdepth_cli.budget import budget
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, parse_yaml, read_bytes, size_of_regular_file
 
 if TYPE_CHECKING:
@@ -84,8 +84,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Yields the bag in a file (.bag, .mcap, .db3) or in a folder with metadata.yaml.
 
     Raises:
-        InputError: There is none.
-        FileFormatError: It is cut short, or no bag.
+        InputError: There is none, or it is cut short, or no bag.
         UsageError: rosbags is not installed.
     """
     try:
@@ -165,7 +164,7 @@ def _as_our_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (Reader1Error, Reader2Error, SerdeError, *others) as error:
-        raise FileFormatError(
+        raise InputError(
             f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
             " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
         ) from error
@@ -185,17 +184,17 @@ _COMPUTED = """
 
 
 def _check_bag(path: Path) -> None:
-    """Raises FileFormatError if a bag is compressed as a whole, or its database computes values."""
+    """Raises InputError if a bag is compressed as a whole, or its database computes values."""
     files = [path]
     if path.is_dir():
         files, metadata = sorted(path.glob("*.db3")), path / "metadata.yaml"
         match parse_yaml(metadata, read_bytes(metadata).decode("utf-8", "replace")):
             case {"rosbag2_bagfile_information": dict(information)}:
                 if str(information.get("compression_mode", "")).lower() not in ("", "none"):
-                    raise FileFormatError(f"{path}: the bag is compressed; `ros2 bag convert` it")
+                    raise InputError(f"{path}: the bag is compressed; `ros2 bag convert` it")
             case _:
                 fact = "is no metadata of a bag; repair it: ros2 bag reindex"
-                raise FileFormatError(f"{metadata} {fact}")
+                raise InputError(f"{metadata} {fact}")
     for file in files:
         size_of_regular_file(file)
         if file.suffix.lower() == ".db3":
@@ -210,7 +209,7 @@ def _check_database(path: Path) -> None:
         connection.close()
     if computed is not None:
         name = one_line(computed[0])[:40]
-        raise FileFormatError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
+        raise InputError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
 
 
 @functools.cache

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Extrinsics
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag, Message
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.depth import known_metres
@@ -56,24 +56,24 @@ def image_file(message: Message, topic: str) -> tuple[str, bytes]:
     """Returns (suffix, bytes) of the file in a CompressedImage, or of a PNG of an Image.
 
     Raises:
-        FileFormatError: The message holds no image that is known here.
+        InputError: The message holds no image that is known here.
     """
     if not hasattr(message, "encoding"):
         data = bytes(message.data)
         suffix = next((s for start, s in _MAGIC.items() if data.startswith(start)), None)
         if suffix is None:
             kind = one_line(message.format)[:30]
-            raise FileFormatError(f"{topic}: {kind!r} is no JPEG and no PNG; name another --topic")
+            raise InputError(f"{topic}: {kind!r} is no JPEG and no PNG; name another --topic")
         return suffix, data
     # The pixels, in blue, green and red.
     if (encoding := str(message.encoding)) not in _CHANNELS:
         known = ", ".join(_CHANNELS)
-        raise FileFormatError(f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {known}")
+        raise InputError(f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {known}")
     channels = _CHANNELS[encoding]
     layout = np.dtype("u1" if channels == 1 else ("u1", channels))
     pixels = np.ascontiguousarray(_grid(message, topic, layout, int(message.step)))
     if not pixels.size:
-        raise FileFormatError(f"{topic}: an image without pixels; the bag is damaged")
+        raise InputError(f"{topic}: an image without pixels; the bag is damaged")
     if encoding in _TO_BGR:
         pixels = cv2.cvtColor(pixels, _TO_BGR[encoding])
     return ".png", cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
@@ -85,7 +85,7 @@ def _grid(message: Message, topic: str, layout: np.dtype[_Kind], row_bytes: int)
     data = np.frombuffer(message.data, np.uint8)
     if width * layout.itemsize > row_bytes or height * row_bytes > data.size:
         what = f"{width}×{height} values of {layout.itemsize} bytes, {row_bytes} a row,"
-        raise FileFormatError(f"{topic}: {what} have {data.size:,} bytes; the bag is damaged")
+        raise InputError(f"{topic}: {what} have {data.size:,} bytes; the bag is damaged")
     return np.ndarray((height, width), layout, data, 0, (row_bytes, layout.itemsize))
 
 
@@ -107,7 +107,7 @@ def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
     number, and a and b of the code a / depth + b of 32FC1 (compressed_depth_image_transport).
 
     Raises:
-        FileFormatError: It is damaged, or compressed otherwise.
+        InputError: It is damaged, or compressed otherwise.
     """
     if hasattr(message, "encoding"):
         order = ">" if message.is_bigendian else "<"
@@ -117,7 +117,7 @@ def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
     data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or format_of_content(data[_DEPTH_HEADER:]) is not PNG:
         kind = one_line(message.format)[:40]
-        raise FileFormatError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
+        raise InputError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
     codes = PNG.read(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
         return known_metres(codes / _MM_PER_M)
@@ -130,11 +130,11 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
     """Returns the (N, 3) points x y z of a sensor_msgs/PointCloud2, of any field layout.
 
     Raises:
-        FileFormatError: It has no x, y and z, or claims more than it holds.
+        InputError: It has no x, y and z, or claims more than it holds.
     """
     fields = {str(field.name): field for field in message.fields}
     if any(name not in fields or int(fields[name].datatype) not in _NUMBERS for name in "xyz"):
-        raise FileFormatError(f"{topic}: a cloud without numbers x y z; name another topic")
+        raise InputError(f"{topic}: a cloud without numbers x y z; name another topic")
     # Where x, y and z lie in a point.
     order, step = ">" if message.is_bigendian else "<", int(message.point_step)
     formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]
@@ -144,7 +144,7 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
             {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}
         )
     except ValueError as error:
-        raise FileFormatError(f"{topic}: points of {step} bytes do not hold x y z") from error
+        raise InputError(f"{topic}: points of {step} bytes do not hold x y z") from error
     # The row's length may be 0 in a cloud of one row.
     row_bytes = int(message.row_step) if message.height > 1 else int(message.width) * step
     points = _grid(message, topic, layout, row_bytes).ravel()

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 
 KITTI_SCALE = 256.0
 """Codes per metre in the KITTI depth files, assumed for integers that do not say their own."""
@@ -59,7 +59,7 @@ class DepthFormat:
     magic: tuple[bytes, ...]
     """What the content begins with; files are recognised by content, never by suffix."""
     read: Callable[[Path, bytes], DepthFile]
-    """Reader of path (for messages) and content. Raises FileFormatError."""
+    """Reader of path (for messages) and content. Raises InputError."""
     write: Callable[[Path, NDArray[Any], Mapping[str, str]], None]
     """(H, W) float32 metres or uint16 codes, 0 where unknown, into an existing empty file, with
     texts by key where the format has room for them."""
@@ -90,10 +90,10 @@ def kind_of(data: bytes) -> str | None:
     return None if depth_format is None else depth_format.name
 
 
-def no_depth(path: Path, what: str) -> FileFormatError:
+def no_depth(path: Path, what: str) -> InputError:
     """Returns the error for an image of pixels that hold no depth."""
     way_out = "give the 16-bit PNG, EXR or NPY that it is an image of"
-    return FileFormatError(f"{path} is {what}, which cannot hold depth; {way_out}")
+    return InputError(f"{path} is {what}, which cannot hold depth; {way_out}")
 
 
 def check_scale(scale: float | None) -> None:

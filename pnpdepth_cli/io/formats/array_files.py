@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from pnpdepth_cli.budget import budget, check_claim
-from pnpdepth_cli.errors import FileFormatError
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
 
@@ -44,7 +44,7 @@ _LOCK = threading.Lock()
 def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]:
     """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
 
-    Messages name `path` and `kind`. Raises FileFormatError if it is damaged or holds no numbers.
+    Messages name `path` and `kind`. Raises InputError if it is damaged or holds no numbers.
     """
     # The header.
     stream = io.BytesIO(data)
@@ -58,9 +58,9 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
-        raise FileFormatError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
+        raise InputError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
     if dtype.kind not in "fiub":
-        raise FileFormatError(f"{path} holds {dtype} values; save numbers")
+        raise InputError(f"{path} holds {dtype} values; save numbers")
     # The numbers that it claims.
     count, start = math.prod(shape), stream.tell()
     check_value_count(path, count, value_bytes=dtype.itemsize)
@@ -97,10 +97,10 @@ def _read_npz(path: Path, data: bytes) -> DepthFile:
             members = archive.infolist()
             if len(members) != 1:
                 listing = one_line(", ".join(each.filename for each in members)) or "none"
-                raise FileFormatError(f"{path} holds several arrays or none ({listing}); save one")
+                raise InputError(f"{path} holds several arrays or none ({listing}); save one")
             (member,) = members
             if member.compress_type not in COMPRESSIONS:
-                raise FileFormatError(f"{path} is compressed; save it by numpy.savez_compressed")
+                raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
             claim, most = f"{path} holds {member.file_size:,} bytes", budget().max_image_bytes
             check_claim(claim, member.file_size, most, way_out="create it again")
             array = parse_npy(path, archive.read(member), "NPZ")

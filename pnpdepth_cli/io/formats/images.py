@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.errors import FileFormatError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import (
     SCALE_KEY,
@@ -88,7 +88,7 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
     kind is "PNG", "JPEG", "TIFF", "WEBP" or "HEIF".
 
     Raises:
-        FileFormatError: The file is damaged or cut short, or exceeds the budget.
+        InputError: The file is damaged or cut short, or exceeds the budget.
     """
     from PIL import Image
 
@@ -207,7 +207,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
     """Returns the channels by name: (H, W) arrays of float16, float32 or uint32.
 
     Raises:
-        FileFormatError: The file is damaged, or exceeds the budget; or it has several parts, or
+        InputError: The file is damaged, or exceeds the budget; or it has several parts, or
             pixels that are deep, subsampled or cropped.
     """
     import OpenEXR
@@ -215,7 +215,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
     # The size that the channels will have is checked before they are decoded.
     lists = [int.from_bytes(size, "little") for size in _CHANNEL_LIST.findall(data)]
     if sum(lists) > _MOST_CHANNEL_BYTES:
-        raise FileFormatError(f"{path} lists tens of thousands of channels; export the depth alone")
+        raise InputError(f"{path} lists tens of thousands of channels; export the depth alone")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             _check_exr(path, file, len(data))
@@ -235,7 +235,7 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
 
 
 def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
-    """Raises FileFormatError for what is not one flat image of whole channels in the budget."""
+    """Raises InputError for what is not one flat image of whole channels in the budget."""
     header, channels = file.header(0), file.header(0)["channels"]
     (left, top), (right, bottom) = np.array(header["dataWindow"]).tolist()
     size, pixel_bytes = (right - left + 1, bottom - top + 1), 4 * len(channels)
@@ -244,7 +244,7 @@ def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
     sampled = any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels)
     if len(file.parts) > 1 or "deep" in str(header.get("type", "")) or cropped or sampled:
         fact = "has several parts, or is deep, cropped or subsampled"
-        raise FileFormatError(f"{path} {fact}; export one flat image of its whole frame")
+        raise InputError(f"{path} {fact}; export one flat image of its whole frame")
 
 
 def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -271,7 +271,7 @@ def _read_exr(path: Path, data: bytes) -> DepthFile:
         )
     if len(names) > 1 and len(named) != 1:
         listing = ", ".join(channels)
-        raise FileFormatError(f"{path} has several channels ({listing}); export the depth alone")
+        raise InputError(f"{path} has several channels ({listing}); export the depth alone")
     (name,) = names if len(names) == 1 else named
     return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
 

@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.errors import CheckpointError, ModelError, wrap_user_errors
+from pnpdepth_cli.errors import ModelError, wrap_user_errors
 from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
 from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
 from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file
@@ -55,15 +55,15 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
         notes: List that gets what a person should know of the reading.
 
     Raises:
-        CheckpointError: The file is missing or broken, or holds no named tensors.
+        ModelError: The file is missing or broken, or holds no named tensors.
     """
     notes = [] if notes is None else notes
     path, key = file_and_part(path)
     if path.is_dir():
         return _read_folder(path, notes)
     if not path.is_file():
-        raise CheckpointError(f"checkpoint {path} does not exist")
-    check_network_file(path, "checkpoint", CheckpointError)
+        raise ModelError(f"checkpoint {path} does not exist")
+    check_network_file(path, "checkpoint")
     # Its reader gives named tensors, or what a torch file holds.
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     try:
@@ -71,10 +71,10 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     except (*CONTENT_ERRORS, SafetensorError) as error:
         fact = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
         reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
-        raise CheckpointError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
+        raise ModelError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
     if isinstance(content, dict):
         if key:
-            raise CheckpointError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
+            raise ModelError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content
     # The state dict in that.
     whole, names = content
@@ -87,7 +87,7 @@ def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:
     files = sorted(file for file in folder.iterdir() if file.suffix in WEIGHT_SUFFIXES)
     if not files:
         kinds = ", ".join(WEIGHT_SUFFIXES)
-        raise CheckpointError(f"checkpoint {folder} is a folder without weights; these are {kinds}")
+        raise ModelError(f"checkpoint {folder} is a folder without weights; these are {kinds}")
     notes.append(f"checkpoint {folder.name}: {', '.join(file.name for file in files)}")
     if len(files) == 1:
         return read_checkpoint(files[0], notes)
@@ -102,7 +102,7 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
     """The state dict in what a torch file holds: the one that the key names, or a usual one."""
     if not isinstance(content, Mapping):
         kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
-        raise CheckpointError(f"checkpoint {path} holds a {kind}, not named tensors")
+        raise ModelError(f"checkpoint {path} holds a {kind}, not named tensors")
     if not key and content and _only_tensors(content):
         return dict(content)
     states = {
@@ -121,7 +121,7 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
         return _state_in(content[key], path, "", notes)
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"
     held = _some([str(name) for name in content]) or "nothing"
-    raise CheckpointError(f"checkpoint {path} has {fact}, which {path}:KEY reads; it holds {held}")
+    raise ModelError(f"checkpoint {path} has {fact}, which {path}:KEY reads; it holds {held}")
 
 
 def _only_tensors(mapping: Mapping[Any, object]) -> bool:
@@ -171,7 +171,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
         path: File or folder, as `read_checkpoint` takes it.
 
     Raises:
-        CheckpointError: A tensor is missing, unexpected, of another shape, or not finite.
+        ModelError: A tensor is missing, unexpected, of another shape, or not finite.
     """
     notes = list[str]()
     own = {n: t for n, t in network.state_dict().items() if isinstance(t, Tensor)}
@@ -190,7 +190,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
         if name in state and not state[name].sum(dtype=torch.float64).isfinite()
     ]
     if broken:
-        raise CheckpointError(
+        raise ModelError(
             f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
             f" ({_some(broken)}); was its training broken off?"
         )
@@ -199,7 +199,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
 
 
 def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: str) -> None:
-    """CheckpointError, which begins with `misfit`, unless the state has the network's tensors."""
+    """ModelError, which begins with `misfit`, unless the state has the network's tensors."""
     both = [name for name in own if name in state]
     problems = {
         "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
@@ -213,4 +213,4 @@ def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: s
     }
     listed = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
     if listed:
-        raise CheckpointError(f"{misfit}: {'; '.join(listed)}")
+        raise ModelError(f"{misfit}: {'; '.join(listed)}")

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.budget import check_claim, check_network_file
+from pnpdepth_cli.budget import budget, check_claim
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
@@ -56,7 +56,9 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
             path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
             if not path.is_file():
                 raise BrokenFileError(f"{path.name} is not beside the index")
-            check_network_file(path, "its file", BrokenFileError)
+            size = path.stat().st_size
+            claim = f"{path.name} has {size:,} bytes"
+            check_claim(claim, size, budget().max_decoded_bytes, error=BrokenFileError)
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
         # Variables claim no more than the files have.

@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.evaluation.compare import (
     plot_comparison,
 )
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.errors import FileFormatError, InputError, OutputError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import write_json
 from tests.commands.evaluation.test_evaluate import frame, scored
 from tests.commands.test_tables import styled
@@ -170,7 +170,7 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
     one = run(tmp_path / "one", [1.0])
     (tmp_path / "broken.json").write_text(text)
     for other in (str(tmp_path / "broken.json"), f"{one}:before"):
-        with pytest.raises(FileFormatError, match=r"broken\.json|one"):
+        with pytest.raises(InputError, match=r"broken\.json|one"):
             compare([one, other])
 
 

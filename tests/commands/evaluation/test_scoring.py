@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.scoring import crop_window, scale_prediction
-from pnpdepth_cli.errors import InputError, SizeError
+from pnpdepth_cli.errors import InputError
 
 RNG = np.random.default_rng(0)
 GT = RNG.uniform(1, 9, (40, 50)).astype(np.float32)
@@ -39,5 +39,5 @@ def test_a_constant_prediction_too_few_pixels_and_too_small_a_frame_are_refused(
         scale_prediction(np.ones_like(GT), GT, "affine")
     with pytest.raises(InputError, match="needs 2 pixels"):
         scale_prediction(GT, np.zeros_like(GT), "median")
-    with pytest.raises(SizeError, match=r"640×480 but this one is 304×228"):
+    with pytest.raises(InputError, match=r"640×480 but this one is 304×228"):
         crop_window("nyu", (228, 304))

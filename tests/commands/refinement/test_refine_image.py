@@ -12,11 +12,10 @@ from PIL import Image
 
 from pnpdepth_cli.errors import (
     InputError,
-    LayerError,
+    ModelError,
     NoPointsError,
     OutputError,
     PnpDepthError,
-    SizeError,
     StorageError,
     UsageError,
 )
@@ -105,9 +104,9 @@ def test_the_networks_crop_leaves_the_rest_unknown_and_unscored(frame: FrameOnDi
 
 BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"holdout": 1.0}, UsageError, "--holdout must be a fraction"),
-    ({"layer": "midle"}, LayerError, "did you mean middle"),
+    ({"layer": "midle"}, ModelError, "did you mean middle"),
     ({"image": None}, PnpDepthError, "takes an rgb image"),
-    ({"gt": "small.npy"}, SizeError, "ground truth .* is 62×10 but the image is 62×46"),
+    ({"gt": "small.npy"}, InputError, "ground truth .* is 62×10 but the image is 62×46"),
     ({"gt": "codes.png"}, InputError, "gt_scale"),  # 256 is assumed, but 1000 is in use
     ({"sparse": None}, InputError, "has no sparse depth; add it, or sample the ground truth"),
     ({"sparse": "far.csv"}, NoPointsError, "none of its 1 points lies in the image"),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import LayerError, ModelError
+from pnpdepth_cli.errors import ModelError
 from tests.completion.naive import plain
 from tests.core.networks import (
     NETWORKS,
@@ -53,7 +53,7 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
                     for _ in range(3):
                         assert torch.equal(split.rear(z), whole), layer
             can += 1
-        except LayerError as error:
+        except ModelError as error:
             if "say which" in str(error):
                 layers += str(error).split(": ")[-1].split(", ")
             else:
@@ -192,7 +192,7 @@ def test_a_layer_that_cannot_be_cut_is_refused_on_one_line_that_names_the_way_ou
     make: Callable[[], nn.Module], layer: str
 ) -> None:
     network = make()
-    with pytest.raises(LayerError) as error, torch.no_grad(), Split(network, layer) as split:
+    with pytest.raises(ModelError) as error, torch.no_grad(), Split(network, layer) as split:
         split.rear(split.front(image()))
     assert "\n" not in str(error.value)
 

@@ -16,7 +16,7 @@ from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.errors import InputError, SizeError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.colmap_models import write_text_model
@@ -278,11 +278,11 @@ def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
     larger = [[0, 0, 0, 0], [0, 1, 0, 2], [0, 0, 0, 0], [0, 3, 0, 0]]
     assert move_depth(tmp_path, depth, (4, 4)).tolist() == larger
     assert move_depth(tmp_path, depth, (1, 1)).tolist() == [[1]]
-    with pytest.raises(SizeError, match="do not show the same view"):
+    with pytest.raises(InputError, match="do not show the same view"):
         move_depth(tmp_path, depth, (4, 9))
-    with pytest.raises(SizeError, match="90°"):
+    with pytest.raises(InputError, match="90°"):
         move_depth(tmp_path, depth[:1], (4, 2))
-    with pytest.raises(SizeError, match=r"\b912×228"):  # a part of the frame
+    with pytest.raises(InputError, match=r"\b912×228"):  # a part of the frame
         ODOMETRY_PART.apply(np.zeros((200, 1000)))
 
 
@@ -296,7 +296,7 @@ def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path)
     np.save(tmp_path / "mask.npy", np.arange(25).reshape(5, 5, 1) % 2)
     kept = apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.npy",))
     assert kept.ravel().tolist() == [n % 2 for n in range(25)]
-    with pytest.raises(SizeError, match=r"mask\.png is 32×24 but the ground truth is 5×5"):
+    with pytest.raises(InputError, match=r"mask\.png is 32×24 but the ground truth is 5×5"):
         apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.png",))
 
 

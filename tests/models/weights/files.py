@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from numpy.lib import format as npy
 
-from pnpdepth_cli.errors import CheckpointError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.weights import read_checkpoint
 
 
 def refused(path: Path) -> str:
     """The one short line that names the file."""
-    with pytest.raises(CheckpointError) as error:
+    with pytest.raises(ModelError) as error:
         read_checkpoint(path)
     message = str(error.value)
     assert str(path) in message

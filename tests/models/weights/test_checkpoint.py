@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from pnpdepth_cli.errors import CheckpointError, ModelError
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
@@ -89,7 +89,7 @@ def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
     assert "'model' is read, not 'ema'" in note
     (note,) = loads(tmp_path / "w.pth:ema", averaged)
     assert "'ema' is read, not 'model'" in note
-    with pytest.raises(CheckpointError, match="'teacher'"):
+    with pytest.raises(ModelError, match="'teacher'"):
         loads(tmp_path / "w.pth:teacher", {})
     torch.save({"ema": {"state_dict": weights(), "decay": 0.9}, "epoch": 7}, tmp_path / "w.pth")
     refused(tmp_path / "w.pth")
@@ -101,7 +101,7 @@ def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -
     state = weights()
     state["conv.weight"][0, 0, 0, 0] = value
     torch.save(state, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match=r"conv\.weight"):
+    with pytest.raises(ModelError, match=r"conv\.weight"):
         loads(tmp_path / "w.pth", {})
 
 
@@ -115,7 +115,7 @@ def test_every_kind_of_misfit_is_listed(tmp_path: Path) -> None:
     state["conv.bias"] = torch.ones(7)
     state["conv.weight"] = state["conv.weight"] * 1j
     torch.save(state, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError) as error:
+    with pytest.raises(ModelError) as error:
         loads(tmp_path / "w.pth", {})
     assert str(error.value).endswith(
         "does not fit network 'net': 2 missing (norm.weight, norm.bias); 1 complex (conv.weight);"
