@@ -1,14 +1,12 @@
 """How much one input file may take: bytes read and values decoded, checked before allocation.
 
-Readers ask `budget()`. The default follows from the machine's memory; `set_max_pixels` replaces it
-for the whole process, all threads included.
+The default follows from the machine's memory; `set_max_pixels` replaces it for the whole process,
+all threads included.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, ModelError
@@ -22,49 +20,37 @@ _UNBACKED_VALUES = 1 << 25
 _VALUES_PER_BYTE = 1032  # the highest ratio of deflate; no codec read here is far above it
 
 
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """Limits for one input file."""
-
-    max_pixels: int
-    """Pixels of an image, and rows or elements of any other array of numbers."""
-    max_file_bytes: int
-    """Bytes of a file with an image, depth, points or text, as stored."""
-    max_decoded_bytes: int
-    """Bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
-
-    @property
-    def max_image_bytes(self) -> int:
-        """Bytes that an image or array takes as its file stores it, decoded."""
-        return max(_DECODED_BYTES_PER_PIXEL * self.max_pixels, 1 << 20)
-
-    def max_values_from(self, file_bytes: int) -> int:
-        """Returns the most values that a file of this size may claim, at most max_pixels.
-
-        Any file may claim 2²⁵ values: an image of one colour takes almost no bytes.
-        """
-        return min(self.max_pixels, max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
+def max_pixels() -> int:
+    """Most pixels of an image, and rows or elements of any other array of numbers."""
+    return _chosen or min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
 
 
-def budget() -> Budget:
-    """The limits in force."""
-    memory = _memory_bytes()
-    pixels = _chosen or min(_MOST_PIXELS, memory // _BYTES_PER_PIXEL)
+def max_file_bytes() -> int:
+    """Most bytes of a file with an image, depth, points or text, as stored."""
     least = 1 << 20 if _chosen else _MOST_FILE_BYTES
-    return Budget(
-        max_pixels=pixels,
-        max_file_bytes=max(least, _FILE_BYTES_PER_PIXEL * pixels),
-        max_decoded_bytes=memory // 2,
-    )
+    return max(least, _FILE_BYTES_PER_PIXEL * max_pixels())
+
+
+def max_image_bytes() -> int:
+    """Most bytes that an image or array takes as its file stores it, decoded."""
+    return max(1 << 20, _DECODED_BYTES_PER_PIXEL * max_pixels())
+
+
+def max_decoded_bytes() -> int:
+    """Most bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
+    return _memory_bytes() // 2
+
+
+def max_values_from(file_bytes: int) -> int:
+    """Returns the most values that a file of this size may claim.
+
+    Any file may claim 2²⁵ values: an image of one colour takes almost no bytes.
+    """
+    return min(max_pixels(), max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
 
 
 def check_claim(
-    claim: str,
-    size: int,
-    most: int,
-    *,
-    error: Callable[[str], Exception] = InputError,
-    way_out: str = "",
+    claim: str, size: int, most: int, *, error: type[Exception] = InputError, way_out: str = ""
 ) -> None:
     """Raises the error if a file claims more than may be taken, or less than nothing.
 
@@ -82,7 +68,7 @@ def check_network_file(path: Path, kind: str) -> None:
     """
     size = path.stat().st_size
     claim = f"{kind} {path} has {size:,} bytes"
-    check_claim(claim, size, budget().max_decoded_bytes, error=ModelError)
+    check_claim(claim, size, max_decoded_bytes(), error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

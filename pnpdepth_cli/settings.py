@@ -119,8 +119,8 @@ class Settings:
 
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: value for name, value in values.items() if value != _OPEN[name]}
+        values = ((each, getattr(self, each.name)) for each in fields(self))
+        return {each.name: value for each, value in values if value != each.default}
 
     def over(self, others: Settings) -> Settings:
         """Returns these settings, and the others' where these are open."""
@@ -178,8 +178,6 @@ _CHECKS: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "seed": (_is_whole, "a whole number >= 0"),
 }
 """Whether a value of the field is valid, and what it must be."""
-
-_OPEN = {each.name: each.default for each in fields(Settings)}
 
 PAPER = Settings(**asdict(ClosedSettings()))
 """The settings of the paper, none open but the layer."""

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from pnpdepth_cli.budget import budget, check_claim, set_max_pixels
+from pnpdepth_cli import budget
+from pnpdepth_cli.budget import check_claim, set_max_pixels
 from pnpdepth_cli.errors import InputError, ModelError
 
 
@@ -18,17 +19,17 @@ def default_afterwards() -> Iterator[None]:
 
 def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -> None:
     set_max_pixels(1 << 30)
-    assert (budget().max_pixels, budget().max_file_bytes) == (1 << 30, 1 << 32)
+    assert (budget.max_pixels(), budget.max_file_bytes()) == (1 << 30, 1 << 32)
     set_max_pixels(9)
-    assert (budget().max_pixels, budget().max_file_bytes) == (9, 1 << 20)
+    assert (budget.max_pixels(), budget.max_file_bytes()) == (9, 1 << 20)
     set_max_pixels(None)
-    assert 1 << 20 < budget().max_pixels <= 64_000_000
-    assert budget().max_file_bytes == 1 << 30
-    assert budget().max_image_bytes == 8 * budget().max_pixels
-    assert budget().max_decoded_bytes > 32 * budget().max_pixels
+    assert 1 << 20 < budget.max_pixels() <= 64_000_000
+    assert budget.max_file_bytes() == 1 << 30
+    assert budget.max_image_bytes() == 8 * budget.max_pixels()
+    assert budget.max_decoded_bytes() > 32 * budget.max_pixels()
     # A small file may hold an image of one colour, but not any number of values.
-    assert budget().max_values_from(1) == 1 << 25
-    assert budget().max_values_from(1 << 20) == min(budget().max_pixels, 1032 << 20)
+    assert budget.max_values_from(1) == 1 << 25
+    assert budget.max_values_from(1 << 20) == min(budget.max_pixels(), 1032 << 20)
 
 
 def test_a_claim_is_refused_above_the_most_and_below_nothing() -> None:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli import budget
+from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
@@ -45,7 +46,7 @@ def read_bytes(path: Path) -> bytes:
         InputError: There is no such file; it is a folder, a device or a pipe; or it is empty, or
             larger than the budget.
     """
-    size, limit = size_of_regular_file(path), budget().max_file_bytes
+    size, limit = size_of_regular_file(path), budget.max_file_bytes()
     check_claim(f"{path} has {size:,} bytes", size, limit, way_out=_SMALLER)
     try:
         data = path.read_bytes()
@@ -128,15 +129,15 @@ def check_pixel_count(
     check_value_count(path, count, value_bytes=pixel_bytes)
     if file_bytes is not None:
         claim = f"{path} claims {width}x{height} pixels in {file_bytes:,} bytes"
-        check_claim(claim, count, budget().max_values_from(file_bytes), way_out="create it again")
+        check_claim(claim, count, budget.max_values_from(file_bytes), way_out="create it again")
 
 
 def check_value_count(path: Path, count: int, *, value_bytes: int = 1) -> None:
     """Raises InputError for an array of more values than the budget."""
-    limits, decoded = budget(), count * value_bytes
-    check_claim(f"{path} has {count:,} values", count, limits.max_pixels, way_out=_SMALLER)
+    check_claim(f"{path} has {count:,} values", count, budget.max_pixels(), way_out=_SMALLER)
+    decoded = count * value_bytes
     claim = f"{path} has {count:,} values of {decoded:,} bytes"
-    check_claim(claim, decoded, limits.max_image_bytes, way_out=_SMALLER)
+    check_claim(claim, decoded, budget.max_image_bytes(), way_out=_SMALLER)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.budget import check_claim, max_pixels
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import (
@@ -236,7 +236,7 @@ def load_network(
         )
     if isinstance(size := definition.size, Fixed):
         claim = f"network {definition.name!r} takes images of {size.width}×{size.height} pixels"
-        pixels, most = size.height * size.width, budget().max_pixels
+        pixels, most = size.height * size.width, max_pixels()
         check_claim(claim, pixels, most, error=ModelError, way_out="allow more pixels")
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []

@@ -22,7 +22,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from pnpdepth_cli.budget import budget
+from pnpdepth_cli.budget import max_file_bytes
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import one_line, parse_yaml, read_bytes, size_of_regular_file
 
@@ -214,7 +214,7 @@ def _check_database(path: Path) -> None:
 
 @functools.cache
 def bound_decompression() -> None:
-    """Makes rosbags decompress chunks within `budget()`, in the whole process."""
+    """Makes rosbags decompress chunks within the budget, in the whole process."""
     import lz4.frame
 
     rosbag1 = importlib.import_module("rosbags.rosbag1.reader")
@@ -227,7 +227,7 @@ def _bound(open_stream: Callable[[BytesIO], IO[bytes]]) -> Callable[..., bytes]:
     """Returns a function of compressed bytes and, for MCAP, the size that the chunk claims."""
 
     def decompress(data: bytes, claimed: int = _CHUNK_BYTES) -> bytes:
-        limit = min(_CHUNK_BYTES, budget().max_file_bytes, claimed)
+        limit = min(_CHUNK_BYTES, max_file_bytes(), claimed)
         with open_stream(BytesIO(data)) as stream:
             content = stream.read(limit + 1)
         if len(content) > limit:

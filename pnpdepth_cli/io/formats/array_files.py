@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.budget import check_claim, max_image_bytes
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
@@ -101,7 +101,7 @@ def _read_npz(path: Path, data: bytes) -> DepthFile:
             (member,) = members
             if member.compress_type not in COMPRESSIONS:
                 raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
-            claim, most = f"{path} holds {member.file_size:,} bytes", budget().max_image_bytes
+            claim, most = f"{path} holds {member.file_size:,} bytes", max_image_bytes()
             check_claim(claim, member.file_size, most, way_out="create it again")
             array = parse_npy(path, archive.read(member), "NPZ")
     except _ARCHIVE_ERRORS as error:

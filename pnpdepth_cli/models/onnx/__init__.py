@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.fx.node import Argument
 
-from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.budget import check_claim, max_decoded_bytes
 from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 from pnpdepth_cli.models.definition import (
     ASSUMED_MULTIPLE,
@@ -135,7 +135,7 @@ def _load_external(model: ModelProto, folder: Path) -> None:
     ]
     sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
     claimed = sum(claim.length or sizes[claim.location] for claim in claims)
-    most = min(_SHARED * sum(sizes.values()), budget().max_decoded_bytes)
+    most = min(_SHARED * sum(sizes.values()), max_decoded_bytes())
     check_claim(
         f"its tensors have {claimed:,} bytes in other files", claimed, most, error=ValueError
     )

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.budget import budget, check_claim
+from pnpdepth_cli.budget import check_claim, max_decoded_bytes
 from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
@@ -58,7 +58,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
                 raise BrokenFileError(f"{path.name} is not beside the index")
             size = path.stat().st_size
             claim = f"{path.name} has {size:,} bytes"
-            check_claim(claim, size, budget().max_decoded_bytes, error=BrokenFileError)
+            check_claim(claim, size, max_decoded_bytes(), error=BrokenFileError)
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
         # Variables claim no more than the files have.
