@@ -35,7 +35,6 @@ from pnpdepth_cli.io.bags import (
     open_bag,
 )
 from pnpdepth_cli.io.bags.messages import (
-    Stamped,
     camera_info_topic,
     camera_of_bag,
     camera_trajectory,
@@ -175,7 +174,7 @@ def _write_pairs(
     lost, times, dropped = 0, list[float](), Counter[str]()
     first, last = request.between or (0, math.inf)
     numbers = itertools.count()
-    for image, scan in nearest_pairs(stream(bag, sensors, offset), request.tolerance):
+    for time_s, image, scan in nearest_pairs(stream(bag, sensors, offset), request.tolerance):
         if scan is None:
             lost += 1
             continue
@@ -184,14 +183,14 @@ def _write_pairs(
         if number < first or (number - first) % request.every:
             continue
         try:
-            values, counts = measurement(sensors, scan.message)
+            values, counts = measurement(sensors, scan)
         except NoPointsError:
             lost += 1
             continue
         dropped.update(counts)
-        times.append(image.time_s)
-        name = f"{image.time_s:.6f}".replace(".", "_")
-        suffix, data = image_file(image.message, sensors.images)
+        times.append(time_s)
+        name = f"{time_s:.6f}".replace(".", "_")
+        suffix, data = image_file(image, sensors.images)
         with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
             temporary.write_bytes(data)
         sparse = request.output / "sparse" / name
@@ -363,12 +362,12 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
     return points, counts
 
 
-def stream(bag: Bag, sensors: Sensors, offset: float = 0.0) -> Iterator[tuple[bool, Stamped]]:
-    """Yields whether it is an image, and the message; `offset` is added to times of points."""
+def stream(bag: Bag, sensors: Sensors, offset: float) -> Iterator[tuple[bool, float, Message]]:
+    """Yields whether it is an image, its time, and the message; adds `offset` to that of points."""
     for topic, logged_ns, message in bag.messages([sensors.images, sensors.points]):
         is_image = topic == sensors.images
         time_s = seconds_of(message, logged_ns) + (0.0 if is_image else offset)
-        yield is_image, Stamped(time_s, message)
+        yield is_image, time_s, message
 
 
 def clock_offset(bag: Bag, sensors: Sensors, say: Say) -> float:

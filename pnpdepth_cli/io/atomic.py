@@ -36,17 +36,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if path.exists() and not path.is_file():  # nobody wants /dev/stdout replaced
             raise OutputError(f"{path} is no regular file; give the name of a file to write")
         temporary.touch(exist_ok=False)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    try:
         yield temporary
         temporary.replace(path)
-    except BaseException as error:
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
         with suppress(OSError):
             temporary.unlink()
-        if isinstance(error, OSError):
-            raise cannot_write(path, error) from error
-        raise
 
 
 @contextmanager
@@ -93,10 +89,8 @@ def make_folder(folder: Path, *, below: Path | None = None) -> None:
     Raises:
         OutputError: It cannot be created, or a link leads out of the folder that the user named.
     """
-    inside = () if below is None else folder.relative_to(below).parts
-    for count in range(1, len(inside) + 1):
-        path = Path(below or "", *inside[:count])
-        if path.is_symlink():
+    for path in (folder, *folder.parents):
+        if below in path.parents and path.is_symlink():
             raise OutputError(f"{path} is a link; remove it, as outputs stay in {below}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -159,14 +153,11 @@ def _hold(path: Path, timeout_s: float = _TRIED_S) -> Iterator[None]:
 
     if not path.parent.is_dir():  # filelock would make it
         raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
-    lock = FileLock(path)
     try:
-        lock.acquire(timeout=timeout_s)
+        held = FileLock(path).acquire(timeout=timeout_s)
     except Timeout:
         raise OutputError(f"another batch writes to {path.parent}; wait for it to end") from None
     except OSError as error:
         raise cannot_write(path, error) from error
-    try:
+    with held:
         yield
-    finally:
-        lock.release()

@@ -169,8 +169,11 @@ def _parameter_count(name: str) -> int:
     return focals + 2 + coefficients
 
 
-def _camera(name: str, size: tuple[int, int], parameters: Sequence[float]) -> Camera:
+def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
     """The camera of a model with its parameters in COLMAP's order."""
+    check_pixel_count(path, width, height)
+    if len(parameters) != _parameter_count(name):
+        raise ValueError(f"a {name} camera has other parameters")
     _, focals, lens, _ = MODELS[name]
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy = parameters[focals : focals + 2]
@@ -184,7 +187,7 @@ def _camera(name: str, size: tuple[int, int], parameters: Sequence[float]) -> Ca
         intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
         lens=lens,
         distortion=distortion,
-        size=size,
+        size=(height, width),
         source=f"{name} camera",
     )
 
@@ -220,8 +223,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         number, model, width, height = _records(stream, _CAMERA).item()
         name = _NAMES.get(model, f"number {model}")
         parameters = _records(stream, _NUMBER, _parameter_count(name)).tolist()
-        check_pixel_count(path, width, height)
-        yield number, _camera(name, (height, width), parameters)
+        yield number, _camera(path, name, width, height, parameters)
 
 
 def _binary_images(path: Path) -> Iterator[Registered]:
@@ -246,12 +248,9 @@ def _binary_points(path: Path) -> NDArray[np.void]:
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for _, text in numbered_lines(read_bytes(path)):
-        number, name, width, height, *parameters = text.split()
-        if len(parameters) != _parameter_count(name):
-            raise ValueError(f"a {name} camera has other parameters")
-        size = int(height), int(width)
-        check_pixel_count(path, size[1], size[0])
-        yield int(number), _camera(name, size, [float(word) for word in parameters])
+        number, name, width, height, *words = text.split()
+        parameters = [float(word) for word in words]
+        yield int(number), _camera(path, name, int(width), int(height), parameters)
 
 
 def _text_images(path: Path) -> Iterator[Registered]:

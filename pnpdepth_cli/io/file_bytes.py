@@ -35,7 +35,7 @@ _OPENCV_HEADER = re.compile(r"\A\s*%YAML:1\.\d\s*$", re.MULTILINE)
 
 PIXELS = ["x", "y", "depth"]
 _HEADERS = (PIXELS, ["x", "y", "z"])
-_SEPARATOR = re.compile(r"[\s,;]+")
+_WORD = re.compile(r"[^\s,;]+")
 _SMALLER = "make it smaller, or allow more with --max-pixels"
 
 
@@ -152,24 +152,22 @@ class Fingerprint:
 
 def fingerprint(path: Path) -> Fingerprint:
     """Returns the fingerprint of a file. Raises InputError if it cannot be read."""
-    size, mtime_ns, ctime_ns = now = _size_and_times(path)
-    return Fingerprint(size=size, mtime_ns=mtime_ns, ctime_ns=ctime_ns, sha256=_digest(path, *now))
+    status = _status(path)
+    size, times = status.st_size, (status.st_mtime_ns, status.st_ctime_ns)
+    sha256 = _digest(path, size, *times)
+    return Fingerprint(size=size, sha256=sha256, mtime_ns=times[0], ctime_ns=times[1])
 
 
 def is_unchanged(path: Path, known: Fingerprint) -> bool:
     """Returns whether the file is there with that content; it is read unless no time differs."""
     try:
-        now = _size_and_times(path)
-        if now == (known.size, known.mtime_ns, known.ctime_ns):
+        status = _status(path)
+        times = known.mtime_ns, known.ctime_ns
+        if status.st_size == known.size and (status.st_mtime_ns, status.st_ctime_ns) == times:
             return True
-        return now[0] == known.size and _digest(path, *now) == known.sha256
+        return fingerprint(path).sha256 == known.sha256
     except InputError:
         return False
-
-
-def _size_and_times(path: Path) -> tuple[int, int, int]:
-    status = _status(path)
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 # Several frames may share one file: a calibration, a list, or a video.
@@ -214,11 +212,13 @@ def read_json(path: Path) -> dict[str, Any]:
     """Returns the object in a JSON file.
 
     Raises:
-        InputError: The file cannot be read, or holds anything else.
+        InputError: The file cannot be read, or holds anything else, such as NaN, infinity and
+            numbers that are too large to be finite.
     """
     data = read_bytes(path)
     try:
-        content = parse_json(data)
+        text = data.decode("utf-8-sig")
+        content = json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_finite)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({one_line(error)})") from error
     if not isinstance(content, dict):
@@ -241,15 +241,6 @@ def plain(value: object) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
-
-
-def parse_json(data: bytes) -> Any:
-    """Returns the content of a JSON text. Raises ValueError or RecursionError if it is none.
-
-    NaN, infinity and numbers that are too large to be finite are no JSON numbers.
-    """
-    text = data.decode("utf-8-sig")
-    return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_finite)
 
 
 def _finite(text: str) -> float:
@@ -277,25 +268,17 @@ def parse_yaml(path: Path, text: str) -> object:
     if len(text) > _LONGEST_YAML:
         raise InputError(f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}")
 
-    class Loader(yaml.BaseLoader):  # type: ignore[misc]
-        """BaseLoader without aliases, which can make a small file large."""
-
-        def compose_node(self, parent: object, index: object) -> object:
-            if self.check_event(yaml.AliasEvent):
-                raise yaml.YAMLError("it has an alias (*name), which is not allowed here")
-            return super().compose_node(parent, index)
-
+    text = _OPENCV_HEADER.sub("", text)
     try:
-        return next(yaml.load_all(_OPENCV_HEADER.sub("", text), Loader), None)
+        # Aliases can make a small file large.
+        for event in yaml.parse(text, yaml.BaseLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise yaml.YAMLError("it has an alias (*name), which is not allowed here")
+            if isinstance(event, yaml.DocumentEndEvent):
+                break
+        return next(yaml.load_all(text, yaml.BaseLoader), None)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} is not valid YAML ({one_line(error)})") from error
-
-
-def _is_numbers(line: str, count: int) -> bool:
-    try:
-        return len([float(word) for word in line.split()]) == count
-    except ValueError:
-        return False
 
 
 def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
@@ -306,20 +289,18 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     Raises:
         InputError: A line is not made of as many numbers as the first.
     """
-    numbered = [(number, _SEPARATOR.sub(" ", text)) for number, text in numbered_lines(data)]
-    header = numbered[0][1].replace('"', "").lower().split() if numbered else []
+    numbered = [(number, _WORD.findall(text)) for number, text in numbered_lines(data)]
+    header = [word.strip('"').lower() for word in numbered[0][1]] if numbered else []
     header = header if header[:3] in _HEADERS else []
-    numbered = numbered[bool(header) :]
-    lines = [line.split() for _, line in numbered]
-    try:
-        rows = np.array(lines, np.float64)
-    except ValueError:
-        count = max(3, len(lines[0]))
-        bad = (each for each in numbered if not _is_numbers(each[1], count))
-        number, line = next(bad, numbered[-1])
-        raise InputError(f"{path}, line {number}: {line[:80]!r} is not {count} numbers") from None
-    if not rows.size:
-        return np.empty((0, 3)), header
-    if rows.shape[1] < 3:
-        raise InputError(f"{path} has lines of {rows.shape[1]} numbers; give 3 or more")
-    return rows, header
+    rows = list[list[float]]()
+    for number, words in numbered[bool(header) :]:
+        count = len(rows[0]) if rows else max(3, len(words))
+        try:
+            numbers = list(map(float, words))
+        except ValueError:
+            numbers = []
+        if len(numbers) != count:
+            fact = f"{' '.join(words)[:80]!r} is not {count} numbers"
+            raise InputError(f"{path}, line {number}: {fact}")
+        rows.append(numbers)
+    return np.array(rows or np.empty((0, 3)), np.float64), header

@@ -53,7 +53,7 @@ def read_extrinsics(path: Path) -> Extrinsics:
     if numbers is None:
         return _pose_of_transform(path, parse_yaml(path, text))
     if len(numbers) == 7:
-        return pose_of_quaternion(path, numbers[:3], numbers[3:])
+        return pose_of_quaternion(path, numbers)
     if len(numbers) in (12, 16):
         return pose_of_matrix(path, "the matrix", numbers)
     raise InputError(f"{path} holds {len(numbers)} numbers; a pose has 7, 12 or 16")
@@ -85,15 +85,13 @@ def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
     return check_pose(path, name, matrix[:3, :3], matrix[:3, 3])
 
 
-def pose_of_quaternion(path: Path, translation: list[float], xyzw: list[float]) -> Extrinsics:
-    """Returns the pose of a translation and a quaternion x y z w."""
+def pose_of_quaternion(path: Path, numbers: list[float]) -> Extrinsics:
+    """Returns the pose of a translation and a quaternion, tx ty tz qx qy qz qw."""
+    translation, xyzw = np.split(np.array(numbers), [3])
     length = float(np.linalg.norm(xyzw))
-    if len(xyzw) != 4 or not abs(length - 1) < 0.01:
+    if not abs(length - 1) < 0.01:
         raise InputError(f"{path}: the quaternion has length {length:.3g} instead of 1")
-    if len(translation) != 3:
-        raise InputError(f"{path}: a translation has 3 numbers, not {len(translation)}")
-    rotation = rotation_of(np.roll(xyzw, 1))
-    return check_pose(path, "the quaternion", rotation, np.array(translation))
+    return check_pose(path, "the quaternion", rotation_of(np.roll(xyzw, 1)), translation)
 
 
 def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
@@ -116,14 +114,9 @@ def is_rotation(matrix: Floats) -> bool:
 def rotation_of(wxyz: Floats) -> Floats:
     """Returns the (3, 3) rotation of a quaternion w x y z of any length but 0, which gives NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = wxyz / float(np.linalg.norm(wxyz))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+        w, *axis = wxyz / float(np.linalg.norm(wxyz))
+    turn = np.cross(np.eye(3), axis)  # turn @ v is the axis × v
+    return np.asarray(np.eye(3) + 2 * (w * turn + turn @ turn))
 
 
 def _pose_of_transform(path: Path, content: object) -> Extrinsics:
@@ -137,7 +130,7 @@ def _pose_of_transform(path: Path, content: object) -> Extrinsics:
         }:
             numbers = numbers_in([x, y, z, qx, qy, qz, qw])
             if numbers is not None and len(numbers) == 7:
-                return pose_of_quaternion(path, numbers[:3], numbers[3:])
+                return pose_of_quaternion(path, numbers)
     raise InputError(f"{path} holds no matrix, no tx ty tz qx qy qz qw, no ROS transform")
 
 

@@ -8,9 +8,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,33 +22,12 @@ from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_folder, cannot_write
 from pnpdepth_cli.io.file_bytes import plain, read_json, write_json
 from pnpdepth_cli.io.visualisation import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
-from pnpdepth_cli.measures import Measure
 
 PAGE = "index.html"
 IMAGES = "images"
 VIEWER = "viewer.js"
 _MADE_OF = "report.json"
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Head:
-    """What a page shows of all frames together."""
-
-    title: str
-    facts: Sequence[tuple[str, str]] = ()
-    notes: Sequence[str] = ()
-    tables: Sequence[object] = ()
-    """Each has title, headings and texts, as `commands.tables.Table`."""
-    without: Sequence[tuple[str, str]] = ()
-    """Names of frames that were not refined, and why."""
-    columns: Sequence[Measure] = ()
-    """Measures of a frame's values; the main ones are in the list of frames."""
-    signed: Sequence[str] = ()
-    """Keys of the columns whose values below 0 are better and above 0 worse."""
-    sort_by: str = ""
-    """Key of the column that the page is sorted by at first."""
-    unit: str = "m"
 
 
 def check_report_folder(
@@ -90,7 +68,8 @@ def visible(text: str) -> str:
 def write_report(
     folder: Path,
     made_of: Mapping[str, object],
-    head: Head,
+    page: Mapping[str, object],
+    data: Mapping[str, object],
     frames: Callable[[Path], Iterable[Mapping[str, object]]],
     *,
     viewer: bool = False,
@@ -100,17 +79,17 @@ def write_report(
     Args:
         folder: The report's folder.
         made_of: Sources of the report, by which it is known later.
-        head: Facts, notes and tables of all frames.
+        page: What report.html shows of all frames: `title`, `facts` and `notes`; `tables` with
+            title, headings and texts; `without`, the names of frames not refined, and why.
+        data: What report.js needs of all frames: `columns`, the measures of a frame's values;
+            `sort_by`, the number of the column that comes first; `signed`, the keys of those whose
+            values below 0 are better; `unit`.
         frames: Function of the folder for images that gives a mapping per frame, one by one, as
             report.js shows it. Its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
-    # What the page's script needs of all frames.
     data = {
-        "columns": [measure.to_json() for measure in head.columns],
-        "signed": head.signed,
-        "sort_by": next((n for n, c in enumerate(head.columns) if c.key == head.sort_by), 0),
-        "unit": head.unit,
+        **data,
         "map_colours": hex_colours(signed_bar("gain", 9)),
         "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
         "logarithmic_from": LOGARITHMIC_FROM,
@@ -122,7 +101,7 @@ def write_report(
         write_json(temporary / _MADE_OF, made_of)
         # The page, frame by frame.
         parts = _environment().get_template("report.html").generate(
-            head=head, data=plain(data), frames=map(plain, frames(images)), style=Markup(style),
+            page, data=plain(data), frames=map(plain, frames(images)), style=Markup(style),
             script=Markup(script), policy=_policy(style, script, viewer=viewer),
             version=__version__,
         )  # fmt: skip

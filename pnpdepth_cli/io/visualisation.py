@@ -15,7 +15,7 @@ from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
 
 Pixels = NDArray[np.uint8]
-Depth = NDArray[np.float32]
+Array = NDArray[np.float32]
 Panel = tuple[str, str, Pixels]
 """Title, a fainter remark beside it, and an image (H, W, 3)."""
 
@@ -81,17 +81,16 @@ class DepthScale:
 
 def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
     """Returns the scale over the 2nd to 98th percentile of all known depths together."""
-    values = [np.asarray(d, dtype=np.float64).ravel() for d in depths]
-    known = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
-    if known.size == 0:
+    known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
+    if not known.size:
         return DepthScale(low_m=1.0, high_m=2.0)
-    low, high = (float(v) for v in np.percentile(known, (2, 98)))
+    low, high = np.percentile(known.astype(np.float64), (2, 98)).tolist()
     if high - low < 0.01 * low:  # a single depth still needs a bar with two ends
         low, high = 0.95 * low, 1.05 * high
     return DepthScale(low_m=low, high_m=high)
 
 
-def _grey_of(rgb: NDArray[np.float32] | None, size: tuple[int, ...]) -> NDArray[np.float32]:
+def _grey_of(rgb: Array | None, size: tuple[int, ...]) -> Array:
     """(H, W) luma in 0..1 of an (H, W, 3) image in 0..1; without one, a uniform grey."""
     if rgb is None:
         return np.full(size, 0.3, np.float32)
@@ -99,7 +98,7 @@ def _grey_of(rgb: NDArray[np.float32] | None, size: tuple[int, ...]) -> NDArray[
     return np.asarray(np.clip(np.nan_to_num(rgb), 0, 1) @ weights, dtype=np.float32)
 
 
-def _dim(grey: NDArray[np.float32]) -> Pixels:
+def _dim(grey: Array) -> Pixels:
     """An (H, W, 3) dark grey image, on which coloured points stand out."""
     levels = np.rint(20 + 115 * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)
@@ -109,12 +108,12 @@ def _paint_signed(
     strength: NDArray[np.floating], light: NDArray[np.floating], colors: str
 ) -> Pixels:
     """(..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
-    above, below = _SIGNED[colors]
-    signed = np.asarray(strength, dtype=np.float32)[..., None]
+    above, below = np.array(_SIGNED[colors], np.float32)
+    signed = strength[..., None].astype(np.float32)
     amount = np.clip(np.abs(signed), 0, 1)
-    base = 255 * np.asarray(light, dtype=np.float32)[..., None]
-    hue = np.where(signed > 0, np.asarray(above, np.float32), np.asarray(below, np.float32))
-    return np.asarray(np.rint((1 - amount) * base + amount * hue), dtype=np.uint8)
+    base = 255 * light[..., None].astype(np.float32)
+    hue = np.where(signed > 0, above, below)
+    return np.asarray(np.rint((1 - amount) * base + amount * hue), np.uint8)
 
 
 def signed_bar(colors: str, length: int) -> Pixels:
@@ -144,13 +143,7 @@ def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
     return np.asarray(cv2.resize(pixels, size, interpolation=method))
 
 
-def _points_panel(
-    grey: NDArray[np.float32],
-    xy: NDArray[np.float32],
-    depth: Depth,
-    scale: DepthScale,
-    factor: float,
-) -> Panel:
+def _points_panel(grey: Array, xy: Array, depth: Array, scale: DepthScale, factor: float) -> Panel:
     """The points in the colours of their depth on the dark grey image, nearest on top."""
     canvas = np.ascontiguousarray(_resize(_dim(grey), factor, smooth=True))
     spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
@@ -216,11 +209,11 @@ def _save_figure(
 
 
 def preview(
-    rgb: NDArray[np.float32] | None,
-    sparse_xy: NDArray[np.float32],
-    sparse_depth: Depth,
-    before: Depth,
-    after: Depth,
+    rgb: Array | None,
+    sparse_xy: Array,
+    sparse_depth: Array,
+    before: Array,
+    after: Array,
     path: Path,
     unit: str = "m",
     made_by: tuple[str, str] = ("", ""),
@@ -262,9 +255,7 @@ def preview(
     return _save_depth_figure(path, panels, scale, unit, columns=columns)
 
 
-def overlay(
-    rgb: NDArray[np.float32], xy: NDArray[np.float32], depth: NDArray[np.float32], path: Path
-) -> None:
+def overlay(rgb: Array, xy: Array, depth: Array, path: Path) -> None:
     """Writes a PNG with N points in the colours of their depth on the grey image, nearest on top.
 
     The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
@@ -283,7 +274,7 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 
 
 def _paint(
-    values: NDArray[np.float64], where: NDArray[np.bool_], grey: NDArray[np.float32], colors: str
+    values: NDArray[np.float64], where: NDArray[np.bool_], grey: Array, colors: str
 ) -> tuple[Pixels, float]:
     """A map of signed values in colours on the dark grey image, and the value of full colour."""
     pixels, changed = _dim(np.asarray(0.6 * grey, np.float32)), np.abs(values[values != 0])
@@ -293,12 +284,7 @@ def _paint(
 
 
 def improvement(
-    rgb: NDArray[np.float32] | None,
-    before: Depth,
-    after: Depth,
-    truth: Depth,
-    path: Path,
-    unit: str = "m",
+    rgb: Array | None, before: Array, after: Array, truth: Array, path: Path, unit: str = "m"
 ) -> FigureRecord:
     """Writes a PNG of where |depth - truth| fell and rose, as figure 4(d) of the paper.
 
@@ -337,7 +323,7 @@ def improvement(
     return replace(figure, ends=ends, unknown=unknown, footer=footer)
 
 
-def gain(before: Depth, after: Depth, truth: Depth) -> NDArray[np.float64]:
+def gain(before: Array, after: Array, truth: Array) -> NDArray[np.float64]:
     """Returns by how much |depth - truth| fell; NaN where the truth or the depth after is unknown.
 
     A depth that is not finite counts as an error of 1e9.

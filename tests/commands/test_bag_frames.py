@@ -17,7 +17,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.bags.messages import Stamped, nearest_pairs
+from pnpdepth_cli.io.bags.messages import nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import read_json
@@ -201,10 +201,8 @@ def test_a_bag_that_is_cut_short_is_one_line(kind: str, part: float, tmp_path: P
 
 
 def test_each_image_gets_the_nearest_scan_within_the_tolerance() -> None:
-    def stream() -> list[tuple[bool, Stamped]]:
-        times = [(False, 0.0), (True, 0.04), (True, 0.06), (False, 0.1), (True, 0.2), (False, 0.29)]
-        return [(is_image, Stamped(time_s=t, message=t)) for is_image, t in times]
-
-    pairs = [(i.message, s and s.message) for i, s in nearest_pairs(stream(), 0.095)]
+    times = [(False, 0.0), (True, 0.04), (True, 0.06), (False, 0.1), (True, 0.2), (False, 0.29)]
+    messages = [(is_image, time_s, time_s) for is_image, time_s in times]
+    pairs = [(image, scan) for _, image, scan in nearest_pairs(messages, 0.095)]
     assert pairs == [(0.04, 0.0), (0.06, 0.1), (0.2, 0.29)]
-    assert [s for _, s in nearest_pairs(stream(), 0.01)] == [None] * 3
+    assert [scan for *_, scan in nearest_pairs(messages, 0.01)] == [None] * 3

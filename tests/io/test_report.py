@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.io.report import Head, check_report_folder, visible, write_report
+from pnpdepth_cli.io.report import check_report_folder, visible, write_report
 from tests.commands.report_pages import page_data
 
 NAMES = [
@@ -23,8 +23,9 @@ NAMES = [
 
 def written(folder: Path, frames: Iterable[dict[str, Any]], **head: Any) -> list[str]:
     """The names of the frames on the page of these frames."""
-    of_all = Head(**{"title": "a report", **head})
-    write_report(folder, {"command": "eval"}, of_all, lambda images: frames)
+    page = {"title": "", "facts": [], "notes": [], "tables": [], "without": [], **head}
+    data = {"columns": [], "sort_by": 0, "signed": [], "unit": "m"}
+    write_report(folder, {"command": "eval"}, page, data, lambda images: frames)
     return [each["name"] for each in page_data(folder)["frames"]]
 
 

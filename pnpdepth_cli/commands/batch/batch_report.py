@@ -76,23 +76,27 @@ def write_batch_report(
         notes.append(f"warning: {unmatched} are in no frame; summary.json has them")
     if results and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
-    head = report.Head(
-        title=summary.output,
-        facts=_facts(summary, results),
-        notes=notes,
-        tables=means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
-        without=[(record.name, record.message or "") for record in records if not record.outputs],
-        columns=columns,
-        signed=[measure.key for measure in columns if measure.key.endswith(_CHANGE)],
-        sort_by="rmse_after" if basis == USED else columns[0].key,
-        unit=summary.unit,
-    )
+    keys = [measure.key for measure in columns]
+    page = {
+        "title": summary.output,
+        "facts": _facts(summary, results),
+        "notes": notes,
+        "tables": means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
+        "without": [(each.name, each.message or "") for each in records if not each.outputs],
+    }
+    data = {
+        "columns": [measure.to_json() for measure in columns],
+        "sort_by": keys.index("rmse_after") if basis == USED else 0,
+        "signed": [key for key in keys if key.endswith(_CHANGE)],
+        "unit": summary.unit,
+    }
 
     def entries(images: Path) -> Iterator[dict[str, object]]:
         for record in results:
             yield _entry(record, basis, columns) | _views(record, request, images)
 
-    report.write_report(folder, _source(request, folder), head, entries, viewer=request.html_3d)
+    source = _source(request, folder)
+    report.write_report(folder, source, page, data, entries, viewer=request.html_3d)
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:

@@ -5,11 +5,12 @@ Every size is checked against the bytes there are.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -159,45 +160,35 @@ def seconds_of(message: Message, logged_ns: int) -> float:
     return time_s if time_s > 0 else 1e-9 * logged_ns
 
 
-class Stamped(NamedTuple):
-    """A message with the time of its header."""
-
-    time_s: float
-    message: Message
-
-
 def nearest_pairs(
-    stream: Iterable[tuple[bool, Stamped]], tolerance_s: float
-) -> Iterator[tuple[Stamped, Stamped | None]]:
-    """Yields each image, in order, with the scan nearest in time; None without one.
+    stream: Iterable[tuple[bool, float, Message]], tolerance_s: float
+) -> Iterator[tuple[float, Message, Message | None]]:
+    """Yields each image, in order, after its time and with the scan nearest to it, else None.
 
     Few messages are in memory. A scan may be the nearest of several images.
 
     Args:
-        stream: (whether it is an image, the message); each kind in the order of its time.
+        stream: (whether it is an image, seconds, message); each kind in the order of its time.
         tolerance_s: Largest difference of the two times.
     """
-    images: deque[Stamped] = deque()
-    scans: deque[Stamped] = deque(maxlen=_MOST_WAITING)
-    for is_image, each in stream:
-        (images if is_image else scans).append(each)
+    images = deque[tuple[float, Message]]()
+    scans = deque[tuple[float, Message]](maxlen=_MOST_WAITING)
+    for is_image, time_s, message in stream:
+        (images if is_image else scans).append((time_s, message))
         # an image is decided once a scan after it is known
-        while images and (
-            (scans and scans[-1].time_s >= images[0].time_s) or len(images) > _MOST_WAITING
-        ):
-            yield _pair(images.popleft(), scans, tolerance_s)
+        while images and ((scans and scans[-1][0] >= images[0][0]) or len(images) > _MOST_WAITING):
+            yield _pair(*images.popleft(), scans, tolerance_s)
     for image in images:
-        yield _pair(image, scans, tolerance_s)
+        yield _pair(*image, scans, tolerance_s)
 
 
 def _pair(
-    image: Stamped, scans: deque[Stamped], tolerance_s: float
-) -> tuple[Stamped, Stamped | None]:
-    while len(scans) > 1 and scans[1].time_s <= image.time_s:
+    time_s: float, image: Message, scans: deque[tuple[float, Message]], tolerance_s: float
+) -> tuple[float, Message, Message | None]:
+    while len(scans) > 1 and scans[1][0] <= time_s:
         scans.popleft()
-    nearest = min(scans, key=lambda scan: abs(scan.time_s - image.time_s), default=None)
-    near = nearest is not None and abs(nearest.time_s - image.time_s) <= tolerance_s
-    return image, nearest if near else None
+    nearest = min(scans, key=lambda scan: abs(scan[0] - time_s), default=(math.inf, None))
+    return time_s, image, nearest[1] if abs(nearest[0] - time_s) <= tolerance_s else None
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
@@ -285,5 +276,5 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
 
 
 def _pose_in(bag: Bag, shift: Message, turn: Message) -> Extrinsics:
-    xyzw = [turn.x, turn.y, turn.z, turn.w]
-    return pose_of_quaternion(bag.path, [shift.x, shift.y, shift.z], xyzw)
+    numbers = [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, turn.w]
+    return pose_of_quaternion(bag.path, numbers)
