@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.core.split.replay import Interception, Run
+from pnpdepth_cli.core.split.replay import Run, intercepted
 from pnpdepth_cli.errors import (
     DivergedError,
     NoPointsError,
@@ -223,9 +223,5 @@ def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None
             encoded[name] = run()
         return encoded[name]
 
-    encoder = Interception([network.module.get_submodule(name)])
-    try:
-        with encoder.handled_by(encode, encode):
-            yield
-    finally:
-        encoder.close()
+    with intercepted([network.module.get_submodule(name)], encode):
+        yield

@@ -18,13 +18,14 @@ reached Python, where the network could branch on it. Then further frames are on
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.replay import Interception, Recorder, Replay
+from pnpdepth_cli.core.split.replay import Recorder, Replay, Run, intercepted
 from pnpdepth_cli.core.split.tensors import NetworkState
 from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.errors import PnpDepthError, wrap_user_errors
@@ -60,24 +61,20 @@ class Split:
         self._network, self._promised_static = network, static_graph
         self._cut = CutPoint.find(network, layer)
         self._uncacheable: set[nn.Module] = set()
-        self._interception: Interception | None = None
         self._replay: Replay | None = None
 
     def __enter__(self) -> Self:
-        self._state = NetworkState(self._network)
-        try:
-            self._interception = Interception(dict.fromkeys(self._cut.modules.values()))
+        with ExitStack() as opening:
+            self._state = NetworkState(self._network)
+            opening.callback(self._state.close)
+            opening.enter_context(intercepted(self._cut.modules.values(), self._handle))
             self._network.eval()
             self._state.freeze()
-        except BaseException:
-            self.__exit__()
-            raise
+            self._open = opening.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._interception is not None:
-            self._interception.close()
-        self._state.close()
+        self._open.close()
         self._replay = None
 
     @property
@@ -103,12 +100,10 @@ class Split:
         replay = self._replay
         if replay is not None and replay.recording.holds_for(arguments):
             replay.next_frame(arguments)
-            if not self._run_front(replay):
-                ran = set(replay.recording.calls)
-                raise self._cut.never_ran(ran, replay.calls[self._cut.module])
+            self._run_front(replay)
         else:
             self._replay = replay = None  # frees the tensors of the last frame
-            self._replay = replay = self._record_front(arguments)
+            replay = self._record_front(arguments)
         z0 = replay.z0
         assert z0 is not None
         # A copy, because the network may go on to change the memory of z_0.
@@ -120,60 +115,58 @@ class Split:
         if replay is None or replay.z0 is None:
             raise RuntimeError("rear() needs front() first")
         replay.z = z
-        return self._run(replay) if replay.recording.complete else self._record_rear(replay)
+        if replay.recording.complete:
+            return self._run(replay)
+        recorder = self._recorder(replay)
+        output = self._run(replay, recorder)
+        recorder.finish_rear()
+        return output
 
     def _record_front(self, arguments: tuple[object, ...]) -> Replay:
         while True:
-            replay = Replay(self._cut, arguments)
-            watch = Watch(
-                (replay.arguments, *self._state.tensors), escapes=not self._promised_static
-            )
-            recorder = Recorder(self._cut, watch, replay, self._uncacheable)
-            uncacheable = len(self._uncacheable)
-            if not self._run_front(replay, recorder):
-                raise self._cut.never_ran(recorder.ran, replay.calls[self._cut.module])
-            if len(self._uncacheable) > uncacheable:
-                continue  # once more, to cache what lies inside those
-            recorder.finish(complete=False)
-            return replay
+            self._replay = replay = Replay(self._cut, arguments)
+            recorder, uncacheable = self._recorder(replay), len(self._uncacheable)
+            self._run_front(replay, recorder)
+            if len(self._uncacheable) == uncacheable:  # else once more, to cache what is in those
+                recorder.finish(complete=False)
+                return replay
 
-    def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> bool:
-        """Runs the network up to the cut, and returns whether it came there."""
+    def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> None:
+        """Runs the network up to the cut. Raises LayerError if it does not come there."""
         try:
             self._run(replay, recorder)
         except PnpDepthError:
             if not replay.has_front:
                 raise
-        return replay.has_front
+        if not replay.has_front:
+            ran = {module for module, _ in replay.recording.calls}
+            ran = ran if recorder is None else recorder.ran
+            raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
-    def _record_rear(self, replay: Replay) -> object:
+    def _recorder(self, replay: Replay) -> Recorder:
         saved = [output for output in replay.outputs if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, escapes=not self._promised_static)
-        recorder = Recorder(self._cut, watch, replay, self._uncacheable)
-        output = self._run(replay, recorder)
-        recorder.finish_rear()
-        return output
+        return Recorder(self._cut, watch, replay, self._uncacheable)
+
+    def _handle(self, module: nn.Module, inputs: object, run: Run) -> object:
+        return run() if self._replay is None else self._replay.handle(module, inputs, run)
 
     def _run(self, replay: Replay, recorder: Recorder | None = None) -> object:
         """One pass of the network, learning if there is a recorder."""
-        assert self._interception is not None
         self._state.restore()
         replay.calls.clear()
-        replay.recorder = recorder
+        replay.in_pass, replay.recorder = True, recorder
         arguments = replay.arguments.fresh()
         assert isinstance(arguments, tuple)
         try:
-            with (
-                self._interception.handled_by(replay.handle, replay.handle_outside),
-                wrap_user_errors("the network's forward"),
-            ):
+            with wrap_user_errors("the network's forward"):
                 if recorder is None:
                     return self._network(*arguments)
                 with recorder.watch, recorder.watch.seeing_escapes_of(self._network):
                     return self._network(*arguments)
         finally:
-            replay.recorder = None
+            replay.in_pass, replay.recorder = False, None
 
 
 def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:

@@ -46,15 +46,17 @@ class CutPoint:
             if not near:
                 hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
             raise ModelError(f"layer {name!r} is not in this network; {hint}")
+        module = modules[name]
+        hooked = [n for n, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
         return cls(
             layer=layer,
             name=name,
             call=int(match["call"]) if match["call"] else None,
             key=tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"])),
-            module=modules[name],
+            module=module,
             modules=modules,
-            containers=_containers(modules[name], modules),
-            around_hooks=_around_hooks(modules),
+            containers=_around([n for n, m in modules.items() if m is module], modules) | {module},
+            around_hooks=_around(hooked, modules),
         )
 
     def choose(self, output: object) -> tuple[tuple[str, ...], Tensor]:
@@ -95,20 +97,11 @@ class CutPoint:
         return ModelError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
 
 
-def _containers(inner: nn.Module, modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
-    names = [f"{name}." for name, module in modules.items() if module is inner]
+def _around(inner: list[str], modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
+    """The submodules that contain another one with one of these names."""
     return frozenset(
         module
         for name, module in modules.items()
-        if not name or any(inside.startswith(f"{name}.") for inside in names)
-    )
-
-
-def _around_hooks(modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
-    hooked = [name for name, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
-    return frozenset(
-        module
-        for part, module in modules.items()
-        for name in hooked
-        if name != part and (not part or name.startswith(f"{part}."))
+        for part in inner
+        if name != part and (not name or part.startswith(f"{name}."))
     )

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -26,77 +26,47 @@ Handler = Callable[[nn.Module, object, Run], object]
 """Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
 
 
-class Interception:
-    """Replaces `forward` of submodules, and puts their own back.
-
-    Args:
-        modules: The submodules, each once.
-    """
-
-    def __init__(self, modules: Iterable[nn.Module]) -> None:
-        self._handler: Handler = _run_only
-        self._own = {module: module.__dict__.get("forward") for module in modules}
-        for module in self._own:
-            module.__dict__["forward"] = self._stand_in(module, module.forward)
-
-    def close(self) -> None:
-        """Gives every submodule its own forward back, and lets go of the handler."""
-        for module, own_forward in self._own.items():
+@contextmanager
+def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None]:
+    """Inside, calls of the submodules go to the handler; afterwards to their own `forward`."""
+    own = {module: module.__dict__.get("forward") for module in modules}
+    try:
+        for module in own:
+            module.__dict__["forward"] = _stand_in(module, module.forward, handler)
+        yield
+    finally:
+        for module, own_forward in own.items():
             module.__dict__["forward"] = own_forward
             if own_forward is None:
                 del module.__dict__["forward"]
-        self._handler = _run_only
-
-    @contextmanager
-    def handled_by(self, during: Handler, afterwards: Handler) -> Iterator[None]:
-        """Sets the handler of intercepted calls during and after the block."""
-        self._handler = during
-        try:
-            yield
-        finally:
-            self._handler = afterwards
-
-    def _stand_in(
-        self, module: nn.Module, original: Callable[..., object]
-    ) -> Callable[..., object]:
-        @functools.wraps(original)
-        def forward(*args: object, **kwargs: object) -> object:
-            return self._handler(module, (args, kwargs), lambda: original(*args, **kwargs))
-
-        return forward
 
 
-def _run_only(module: nn.Module, inputs: object, run: Run) -> object:
-    return run()
+def _stand_in(
+    module: nn.Module, original: Callable[..., object], handler: Handler
+) -> Callable[..., object]:
+    @functools.wraps(original)
+    def forward(*args: object, **kwargs: object) -> object:
+        return handler(module, (args, kwargs), lambda: original(*args, **kwargs))
+
+    return forward
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """The calls of a pass in their order, up to the cut or to the end."""
 
-    calls: tuple[nn.Module, ...] = ()
-    """The submodules of calls that are cached, or that contain the cut or calls of their own."""
+    calls: Mapping[tuple[nn.Module, int], int] = field(default_factory=dict)
+    """Index of the call by its submodule and the number of its recorded calls before it. Recorded
+    are calls that are cached, or that contain the cut or calls of their own."""
     cut: int | None = None  # index of the call that is the cut; None before it was reached
     path: tuple[str, ...] = ()  # path of z in the output of that call
     shapes: object = None  # shapes and other properties of the arguments for which this holds
     static_graph: bool = True  # whether it holds for all arguments of these shapes, as far as known
     complete: bool = False  # whether the calls behind the cut are in it, too
 
-    def index(self, module: nn.Module, count: int) -> int | None:
-        """Returns the index of the module's call after `count` earlier ones of a pass."""
-        indices = self._indices.get(module, ())
-        return indices[count] if count < len(indices) else None
-
     def holds_for(self, arguments: tuple[object, ...]) -> bool:
         """Whether a pass with these arguments makes the same calls."""
         return self.complete and self.static_graph and self.shapes == shapes_of(arguments)
-
-    @functools.cached_property
-    def _indices(self) -> dict[nn.Module, list[int]]:
-        indices: dict[nn.Module, list[int]] = {}
-        for index, module in enumerate(self.calls):
-            indices.setdefault(module, []).append(index)
-        return indices
 
 
 def shapes_of(arguments: object) -> object:
@@ -125,6 +95,7 @@ class Replay:
         self.calls: Counter[nn.Module] = Counter()
         """How often each submodule was called in the last pass."""
         self.recorder: Recorder | None = None
+        self.in_pass = False
         self._fills = False  # inside a call whose output will be saved as a whole
 
     def next_frame(self, arguments: Sequence[object]) -> None:
@@ -143,14 +114,16 @@ class Replay:
         return PnpDepthError(f"layer {self._cut.layer!r} was reached, where the network is cut")
 
     def handle(self, module: nn.Module, inputs: object, run: Run) -> object:
-        """Returns the output of a call in a pass: saved, with z in it, or of the submodule."""
+        """Returns the output of a call: saved, with z in it, or of the submodule."""
+        if not self.in_pass:
+            return self._handle_outside(module, run)
         if self._fills:
             return run()
         if self.has_front:
             raise self.end_of_front()
         if self.recorder is not None:
             run = functools.partial(self.recorder.run, module, run)
-        index = self.recording.index(module, self.calls[module])
+        index = self.recording.calls.get((module, self.calls[module]))
         self.calls[module] += 1
         if index is None:
             return run() if self.recorder is None else self.recorder.record(module, inputs, run)
@@ -163,8 +136,8 @@ class Replay:
             raise self.end_of_front()
         return output
 
-    def handle_outside(self, module: nn.Module, inputs: object, run: Run) -> object:
-        """Returns the output of a call between passes, with z if checkpointing repeats the cut."""
+    def _handle_outside(self, module: nn.Module, run: Run) -> object:
+        """The output of a call between passes, with z if checkpointing repeats the cut."""
         in_backward = torch._C._current_graph_task_id() != -1
         is_cut = module is self._cut.module and self.calls[module] == 1
         return self._output_with_z(run) if in_backward and is_cut else run()
@@ -222,7 +195,7 @@ class Recorder:
     ) -> None:
         self.watch, self.ran = watch, set[nn.Module]()
         self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
-        self._calls = list(replay.recording.calls)
+        self._calls = [module for module, _ in replay.recording.calls]
         self._saved = list(replay.outputs)  # of each call; None where it cannot be cached
         self._known = len(self._calls)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
@@ -293,11 +266,11 @@ class Recorder:
 
     def finish(self, *, complete: bool) -> None:
         """Gives the replay the recording, up to the cut or complete."""
-        replay = self._replay
+        replay, calls = self._replay, self._calls
         replay.outputs = self._saved
         replay.recording = replace(
             replay.recording,
-            calls=tuple(self._calls),
+            calls={(m, calls[:index].count(m)): index for index, m in enumerate(calls)},
             shapes=shapes_of(replay.arguments.value),
             # No value may reach Python in front of the cut or behind it.
             static_graph=replay.recording.static_graph and not self.watch.escaped,

@@ -18,7 +18,7 @@ def tensors_in(
     if isinstance(structure, Tensor):
         yield path, structure
         return
-    for key, child in _children(structure):
+    for key, child in _children(structure) or ():
         yield from tensors_in(child, (*path, key))
 
 
@@ -30,12 +30,13 @@ def map_tensors(
     """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
     if isinstance(structure, Tensor):
         return change(path, structure)
-    children = [map_tensors(child, change, (*path, key)) for key, child in _children(structure)]
+    parts = _children(structure)
+    if parts is None:
+        return structure
+    children = [map_tensors(child, change, (*path, key)) for key, child in parts]
     if isinstance(structure, tuple):
         make: Callable[..., object] = type(structure)
         return make(*children) if hasattr(structure, "_fields") else make(children)
-    if not _is_container(structure):
-        return structure
     result = copy.copy(structure)
     if isinstance(result, list):
         result[:] = children
@@ -43,7 +44,7 @@ def map_tensors(
         for key, child in zip(result, children, strict=True):
             result[key] = child
     else:
-        for (name, _), child in zip(_children(structure), children, strict=True):
+        for (name, _), child in zip(parts, children, strict=True):
             object.__setattr__(result, name, child)  # the dataclass may be frozen
     return result
 
@@ -52,24 +53,19 @@ def is_transparent(structure: object) -> bool:
     """Whether `tensors_in` is sure to find every tensor of the structure."""
     if structure is None or isinstance(structure, Tensor | int | float | str | bool):
         return True
-    return _is_container(structure) and all(
-        is_transparent(child) for _, child in _children(structure)
-    )
+    parts = _children(structure)
+    return parts is not None and all(is_transparent(child) for _, child in parts)
 
 
-def _children(structure: object) -> Iterator[tuple[str, object]]:
+def _children(structure: object) -> list[tuple[str, object]] | None:
+    """The parts of a container by their keys. None: it is none."""
     if isinstance(structure, list | tuple):
-        yield from ((str(index), child) for index, child in enumerate(structure))
-    elif isinstance(structure, MutableMapping):
-        yield from ((str(key), child) for key, child in structure.items())
-    elif dataclasses.is_dataclass(structure) and not isinstance(structure, type):
-        yield from ((f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure))
-
-
-def _is_container(structure: object) -> bool:
-    return isinstance(structure, MutableMapping | list | tuple) or (
-        dataclasses.is_dataclass(structure) and not isinstance(structure, type)
-    )
+        return [(str(index), child) for index, child in enumerate(structure)]
+    if isinstance(structure, MutableMapping):
+        return [(str(key), child) for key, child in structure.items()]
+    if dataclasses.is_dataclass(structure) and not isinstance(structure, type):
+        return [(f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure)]
+    return None
 
 
 @dataclass(eq=False)
@@ -100,17 +96,10 @@ class NetworkState:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        modules = list(network.modules())  # going through a deep network takes a while: once
+        modules, parameters = list(network.modules()), list(network.parameters())
         # Frozen torch scripts have neither a mode nor buffers that can be set.
         plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
-        parameters, buffers = (
-            [tensor for tensor in dict.fromkeys(tensors) if tensor is not None]
-            for tensors in (
-                [p for m in modules for p in m._parameters.values()],
-                [b for m in modules for b in m._buffers.values()],
-            )
-        )
-        self._originals = [*parameters, *buffers]
+        self._originals = [*parameters, *network.buffers()]
         self.tensors = [SavedTensors(tensor) for tensor in self._originals]
         self._learning = [(p, p.requires_grad) for p in parameters]
         self._buffers = [(m, dict(m._buffers)) for m in plain if m._buffers]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 from torch import Tensor, nn, overrides
@@ -83,10 +83,7 @@ class Watch(TorchDispatchMode):
 
     def protect(self, saved: SavedTensors) -> None:
         """Protects these tensors from in-place operations."""
-        value = saved.value
-        # Parameters, of which there are many, come as tensors.
-        tensors = [value] if isinstance(value, Tensor) else [t for _, t in tensors_in(value)]
-        for tensor in tensors:
+        for _, tensor in tensors_in(saved.value):
             self._protected.setdefault(_storage(tensor), []).append(saved)
 
     def now(self) -> Moment:
@@ -117,19 +114,16 @@ class Watch(TorchDispatchMode):
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
         """Watches the methods that give values to Python, too, but not in torch's fused layers."""
-        if not self._notes_escapes:
-            yield
-            return
-        outer = self._sees_escapes
-        self._sees_escapes = getattr(type(module), "forward", None) not in _FUSED
+        outer, fused = self._sees_escapes, getattr(type(module), "forward", None) in _FUSED
+        self._sees_escapes = self._notes_escapes and not fused
+        innermost = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
+        change: AbstractContextManager[object] = nullcontext()
+        if self._sees_escapes and not outer:
+            change = self._function_mode
+        elif outer and not self._sees_escapes and innermost is self._function_mode:
+            change = overrides._pop_mode_temporarily()
         try:
-            if self._sees_escapes and not outer:
-                with self._function_mode:
-                    yield
-            elif outer and not self._sees_escapes and _innermost_mode() is self._function_mode:
-                with overrides._pop_mode_temporarily():
-                    yield
-            else:
+            with change:
                 yield
         finally:
             self._sees_escapes = outer
@@ -205,10 +199,6 @@ class _EscapeMode(TorchFunctionMode):
         if func in _ESCAPES and isinstance(args[0], Tensor):
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
-
-
-def _innermost_mode() -> object:
-    return overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
 
 
 _NO_STORAGE = 0
