@@ -70,14 +70,9 @@ class Alignment:
         bounds = torch.tensor(self.bounds, dtype=torch.float64)
         return sorted(to_space(bounds, self.space).tolist())
 
-    @property
-    def falling(self) -> bool:
-        """Whether a larger number of the network means a nearer point."""
-        return (self.scale < 0) != (self.space == "inverse")
-
     def __str__(self) -> str:
         read_as = {"depth": "depth", "inverse": "inverse depth", "log": "log depth"}[self.space]
-        sense = "nearer" if self.falling else "farther"
+        sense = "nearer" if (self.scale < 0) != (self.space == "inverse") else "farther"
         fitted = {"none": "not fitted", "affine": "fitted by scale and shift"}.get(
             self.kind, f"fitted by {self.kind}"
         )

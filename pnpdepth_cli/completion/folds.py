@@ -86,6 +86,6 @@ def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Gene
 
 def _some(xy: Tensor, generator: torch.Generator) -> Tensor:
     """At most `_SAMPLED` of the coordinates."""
-    return (
-        xy if len(xy) <= _SAMPLED else xy[torch.randperm(len(xy), generator=generator)[:_SAMPLED]]
-    )
+    if len(xy) <= _SAMPLED:
+        return xy
+    return xy[torch.randperm(len(xy), generator=generator)[:_SAMPLED]]

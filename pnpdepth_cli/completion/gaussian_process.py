@@ -195,11 +195,13 @@ def fit(field: ResidualField) -> ResidualField:
     return min([best, *noises], key=error)
 
 
-def predict(field: ResidualField) -> Tensor:
-    """Returns the mean residual (H, W) float32 at every pixel.
+def predict(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+    """Returns the mean residual (H, W) float32 at every pixel, or (M,) at M points' coordinates.
 
-    It is smooth where the prediction is not, so that it is predicted on a coarser grid.
+    It is smooth where the prediction is not, so that every pixel's is predicted on a coarser grid.
     """
+    if queries is not None:
+        return _predict_at(field, queries)
     size = field.points.size
     rows, columns = _steps(field.points)
     if rows == columns == 1:
@@ -211,8 +213,7 @@ def predict(field: ResidualField) -> Tensor:
     return F.interpolate(values, size, mode="bilinear", align_corners=False)[0, 0]
 
 
-def predict_at(field: ResidualField, queries: SparsePoints) -> Tensor:
-    """Returns the mean residual (M,) at the coordinates of M points."""
+def _predict_at(field: ResidualField, queries: SparsePoints) -> Tensor:
     features = _sample(field.features, queries)
     if _is_exact(field) or len(field.points) <= NEIGHBOURS:
         return _solve(field, _all_points(field), features[None])[0]

@@ -44,50 +44,37 @@ _OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
 
 
 def propagate(
-    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, *, kind: str = "gp"
+    prediction: Tensor,
+    points: SparsePoints,
+    rgb: Tensor | None,
+    xy: Tensor | None = None,
+    *,
+    kind: str = "gp",
 ) -> Tensor:
-    """Returns the prediction (H, W) metres with its residual at the points propagated, 0 = unknown.
+    """Returns the prediction with its residual at the points propagated, metres, 0 = unknown.
 
     Args:
         prediction: (H, W) metres.
         rgb: (3, H, W) in 0…1, or None.
+        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel, (H, W).
         kind: A name in `choices.PROPAGATIONS`, or "none".
 
     Raises:
         NoPointsError: No point has a prediction, except with "none".
     """
-    known = prediction.isfinite() & (prediction > 0)
+    known, queries = prediction.isfinite() & (prediction > 0), None
+    predicted = torch.where(known, prediction, 0.0)
+    if xy is not None:
+        queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
+        predicted = queries.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
+        queries = queries.tensors()
     if kind == "none":
-        return torch.where(known, prediction, 0.0).float()
+        return predicted.float()
     field = without_outliers(residual_field(prediction, points, rgb))
-    factor = _clamp(PROPAGATIONS[kind](field), field).exp().to(prediction.device)
-    return torch.where(known, prediction * factor, 0.0).float()
-
-
-def propagate_at(
-    prediction: Tensor, points: SparsePoints, rgb: Tensor | None, xy: Tensor, *, kind: str = "gp"
-) -> Tensor:
-    """Returns the propagated depth (M,) metres at pixel coordinates only; 0 where it is unknown.
-
-    Args:
-        prediction: (H, W) metres.
-        rgb: (3, H, W) in 0…1, or None.
-        xy: (M, 2) pixel coordinates.
-
-    Raises:
-        NoPointsError: No point has a prediction.
-    """
-    queries = SparsePoints(xy=xy, depth=torch.ones_like(xy[:, 0]), size=points.size)
-    known = prediction.isfinite() & (prediction > 0)
-    predicted = queries.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
-    field = without_outliers(residual_field(prediction, points, rgb))
-    residual = PROPAGATIONS[kind](field, queries.tensors())
-    return (predicted * _clamp(residual, field).exp().to(predicted.device)).float()
-
-
-def _clamp(residual: Tensor, field: ResidualField) -> Tensor:
-    """The residual within its range at the points."""
-    return residual.clamp(float(field.residual.min()), float(field.residual.max()))
+    # The residual stays within its range at the points.
+    residual: Tensor = PROPAGATIONS[kind](field, queries)
+    residual = residual.clamp(float(field.residual.min()), float(field.residual.max()))
+    return (predicted * residual.exp().to(predicted.device)).float()
 
 
 def local_lines(
@@ -143,10 +130,7 @@ def _by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tens
 
 
 def _by_gaussian_process(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
-    field = gaussian_process.fit(field)
-    if queries is None:
-        return gaussian_process.predict(field)
-    return gaussian_process.predict_at(field, queries)
+    return gaussian_process.predict(gaussian_process.fit(field), queries)
 
 
 TABLE = {"gp": _by_gaussian_process, "local": _by_lines}

@@ -21,7 +21,7 @@ from torch import Tensor
 from pnpdepth_cli.completion.folds import spatial_folds
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.completion.propagation import propagate_at
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.frames.frame import Frame, Prediction, ValidationPoints, is_dense
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.scan_pattern import scan_pattern
@@ -402,7 +402,7 @@ def _expert(
     if len(split.points):
         again = predict(network, kept, updates=not takes_points)
         xy, kind = split.points.xy, split.propagation
-        at = propagate_at(again.after, kept.points, kept.rgb, xy, kind=kind)
+        at = propagate(again.after, kept.points, kept.rgb, xy, kind=kind)
         updated = split.points.sample(again.after)
     return Expert(
         name=name,

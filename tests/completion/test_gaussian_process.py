@@ -17,7 +17,6 @@ from pnpdepth_cli.completion.gaussian_process import (
     leave_one_out,
     neighbourhoods,
     predict,
-    predict_at,
 )
 from pnpdepth_cli.points import SparsePoints
 
@@ -94,7 +93,7 @@ def test_at_a_position_the_mean_is_that_from_its_48_nearest_points(count: int) -
     for xy, one in zip(positions.numpy(), features.double().numpy(), strict=True):
         near = np.hypot(*(residuals.points.xy.numpy() - xy).T).argsort()[:48]
         expected += [reference(residuals, near, one[None], residuals.noise)[0].item()]
-    assert np.allclose(predict_at(residuals, queries), expected, atol=2e-4)
+    assert np.allclose(predict(residuals, queries), expected, atol=2e-4)
 
 
 @pytest.mark.parametrize("count", [12, 300])

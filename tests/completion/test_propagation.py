@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.choices import PROPAGATIONS
-from pnpdepth_cli.completion.propagation import propagate, propagate_at
+from pnpdepth_cli.completion.propagation import propagate
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
@@ -81,8 +81,8 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
     as_it_is = propagate(unknown, points, rgb, kind="none")
     assert torch.equal(as_it_is, torch.where(known, unknown, 0))
     beside, inside = torch.tensor([[[19.5, 9.0], [20.0, 9.0]], [[20.5, 9.0], [63.0, 9.0]]])
-    assert not bool((propagate_at(unknown, points, rgb, beside, kind=kind) > 0)[0])
-    assert bool((propagate_at(unknown, points, rgb, inside, kind=kind) > 0).all())
+    assert not bool((propagate(unknown, points, rgb, beside, kind=kind) > 0)[0])
+    assert bool((propagate(unknown, points, rgb, inside, kind=kind) > 0).all())
     lying = replace(points, depth=torch.where(points.xy[:, 0] < 20, 99.0, points.depth))
     assert torch.equal(propagate(unknown, lying, rgb, kind=kind), depth)
 
@@ -108,6 +108,6 @@ def test_a_large_image_has_at_every_second_pixel_the_depth_of_that_pixel_alone(
     random = torch.rand(200, 2, generator=torch.Generator().manual_seed(6))
     pixels = 2 * (random * torch.tensor([400.0, 320.0])).round()
     depth = propagate(prediction, points, None, kind=kind)
-    alone = propagate_at(prediction, points, None, pixels, kind=kind)
+    alone = propagate(prediction, points, None, pixels, kind=kind)
     column, row = pixels.long().unbind(1)
     assert torch.allclose(depth[row, column], alone, rtol=rtol)
