@@ -61,14 +61,15 @@ def check_claim(
         raise error(f"{claim}, more than {most:,}{f'; {way_out}' if way_out else ''}")
 
 
-def check_network_file(path: Path, kind: str) -> None:
-    """Raises ModelError if an existing file of a network, or of its weights, is too large.
+def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
+    """Raises ModelError if a file of a network, or of its weights, is missing or too large.
 
     The kind names the file in the message, as in "checkpoint".
     """
-    size = path.stat().st_size
-    claim = f"{kind} {path} has {size:,} bytes"
-    check_claim(claim, size, max_decoded_bytes(), error=ModelError)
+    if not path.is_file():
+        raise ModelError(f"{kind} {path} does not exist")
+    size, most = path.stat().st_size, most or max_decoded_bytes()
+    check_claim(f"{kind} {path} has {size:,} bytes", size, most, error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

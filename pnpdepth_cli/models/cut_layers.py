@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import partial
+from itertools import dropwhile
 from typing import TYPE_CHECKING
 
 import torch
@@ -38,48 +40,27 @@ _SIMILAR_ASPECT = 1.3
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
     """Returns the layer whose output z is updated if no option names one.
 
-    It is the definition's, else the best one for so many points in an image of this size (rows,
-    columns), measured on a synthetic frame. None if the definition has no layers.
+    It is the definition's own, if it states one. Else it is the last of its layers whose
+    influential field in the depth map is wide enough for so many even points in an image of this
+    size (rows, columns), because that costs least; or the one with the widest field. Fields are
+    measured on a synthetic frame. None if the definition has no layers.
     """
-    definition = network.definition
-    if definition.defaults.layer is not None or len(definition.layers) < 2:
+    definition, frame = network.definition, FrameMap.fit(network.definition.size, *size)
+    if definition.defaults.layer is not None or len(definition.layers) < 2 or not point_count:
         return definition.default_layer
-    frame = FrameMap.fit(definition.size, *size)
+    # No field is wider than the image, and of equally wide ones the last layer is taken.
+    enough = min(wanted_field(frame.network, point_count), *frame.network)
+    widths = dict[str, int]()
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
-        return best_layer(network, arguments, frame.network, point_count) or definition.layers[0]
-
-
-def best_layer(
-    network: Network, arguments: tuple[Tensor, ...], size: tuple[int, int], point_count: int
-) -> str | None:
-    """Returns the layer of the definition to cut at for so many points in a frame.
-
-    It is the last one whose influential field in the depth map is wide enough, because that costs
-    least. If none is wide enough, it is the one with the widest field.
-
-    Args:
-        network: Network whose definition's layers are measured.
-        arguments: The network's arguments for the frame, real or synthetic.
-        size: Rows and columns of the network's input.
-        point_count: Sparse points in the frame, taken to be spread evenly.
-
-    Returns:
-        None if there are no points, or no layer that the network can be cut at.
-    """
-    if not point_count:
-        return None
-    # No field is wider than the image, and of equally wide ones the last layer is taken.
-    enough = min(wanted_field(size, point_count), *size)
-    widths = dict[str, int]()
-    for name in reversed(network.definition.layers):
-        # A layer that the network cannot be cut at is left out.
-        with suppress(ModelError), Split(network.module, name) as split, torch.no_grad():
-            z = split.front(*arguments)
-            widths[name] = min(influential_field(split, z, network.known_of, enough)[1])
-            if widths[name] >= enough:
-                return name
-    return max(widths, key=widths.__getitem__, default=None)
+        for name in reversed(definition.layers):
+            # A layer that the network cannot be cut at is left out.
+            with suppress(ModelError), Split(network.module, name) as split, torch.no_grad():
+                z = split.front(*arguments)
+                widths[name] = min(influential_field(split, z, network.known_of, enough)[1])
+                if widths[name] >= enough:
+                    return name
+    return max(widths, key=widths.__getitem__, default=definition.layers[0])
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
@@ -130,9 +111,13 @@ def suggest_layers(
         for name, gradient in zip(useful, gradients, strict=True)
         if gradient is not None and bool(gradient.any())
     }
-    chosen = _last_of_each_resolution(areas)
+    # The last map before each finer one, from the first of the coarsest maps on.
+    coarsest, last_of = min(areas.values(), default=0), dict[int, str]()
+    for name, area in dropwhile(lambda named: named[1] > coarsest, areas.items()):
+        if area >= max(last_of, default=0):
+            last_of[area] = name
     finest = _area(prediction)
-    return tuple(n for n in chosen if areas[n] < finest or len(chosen) == 1)
+    return tuple(n for area, n in last_of.items() if area < finest or len(last_of) == 1)
 
 
 def _area(output: Tensor) -> int:
@@ -146,19 +131,6 @@ def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
     return min(height, width) > 1 and 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
 
 
-def _last_of_each_resolution(areas: Mapping[str, int]) -> list[str]:
-    """The last map before each finer one, from the first of the coarsest maps on."""
-    chosen: list[str] = []
-    names = list(areas)
-    first = names.index(min(names, key=areas.__getitem__)) if names else 0
-    for name in names[first:]:
-        if chosen and areas[chosen[-1]] == areas[name]:
-            chosen[-1] = name
-        elif not chosen or areas[name] > areas[chosen[-1]]:
-            chosen.append(name)
-    return chosen
-
-
 def _observe(
     module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
 ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -166,23 +138,15 @@ def _observe(
     maps: dict[str, Tensor] = {}
     ran: Counter[str] = Counter()
 
-    def keep(name: str, output: object) -> None:
+    def keep(name: str, _part: nn.Module, _inputs: object, output: object) -> None:
         ran[name] += 1
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             maps[name] = output
 
-    hooks = [
-        part.register_forward_hook(lambda m, inputs, output, name=name: keep(name, output))
-        for name, part in module.named_modules()
-        if name and not isinstance(part, torch.jit.ScriptModule)
-    ]
-    try:
-        with torch.enable_grad(), wrap_user_errors("the network's forward"):
-            inputs = tuple(
-                a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments
-            )
-            prediction = prediction_of(module(*inputs))
-    finally:
-        for hook in hooks:
-            hook.remove()
+    with ExitStack() as hooks, torch.enable_grad(), wrap_user_errors("the network's forward"):
+        for name, part in module.named_modules():
+            if name and not isinstance(part, torch.jit.ScriptModule):
+                hooks.enter_context(part.register_forward_hook(partial(keep, name)))
+        inputs = tuple(a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments)
+        prediction = prediction_of(module(*inputs))
     return prediction, {name: output for name, output in maps.items() if ran[name] == 1}

@@ -14,7 +14,7 @@ sense raises ModelError as soon as the object is made.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -36,16 +36,17 @@ _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 
 def _check(owner: object, field: str, good: bool, wanted: str) -> None:
-    """ModelError with the field and its value, unless it is good."""
-    if not good:
-        name, shown = getattr(owner, "name", ""), " ".join(repr(getattr(owner, field)).split())
+    """ModelError with the field and its value, unless that is good or the default."""
+    value = getattr(owner, field)
+    if not good and value is not getattr(type(owner), field, _check):
+        name, shown = getattr(owner, "name", ""), " ".join(repr(value).split())
         named = f"{type(owner).__name__} {name!r}" if name else type(owner).__name__
         raise ModelError(f"{named[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
 
 
-def _check_choice(owner: object, field: str, valid: Collection[str]) -> None:
-    good = getattr(owner, field) in valid
-    _check(owner, field, good, f"one of {', '.join(map(repr, valid))}")
+def _check_choice(owner: object, field: str, choices: object) -> None:
+    valid = get_args(choices)
+    _check(owner, field, getattr(owner, field) in valid, f"one of {', '.join(map(repr, valid))}")
 
 
 def _check_whole(owner: object, *fields: str) -> None:
@@ -70,7 +71,7 @@ class Fixed:
 
     def __post_init__(self) -> None:
         _check_whole(self, "height", "width")
-        _check_choice(self, "fit", get_args(Fit))
+        _check_choice(self, "fit", Fit)
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Multiple:
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
-        _check_whole(self, "of", *["longest"] * (self.longest is not None))
+        _check_whole(self, "of", "longest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +98,7 @@ class Near:
     """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
-        sides = [side for side in ("height", "width") if getattr(self, side) is not None]
-        _check_whole(self, "of", *sides)
+        _check_whole(self, "of", "height", "width")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,26 +208,23 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
-        _check_choice(self, "input_kind", get_args(InputKind))
-        _check_choice(self, "output_kind", get_args(OutputKind))
-        _check_choice(self, "output_scale", get_args(OutputScale))
-        none = type(None)
+        _check_choice(self, "input_kind", InputKind)
+        _check_choice(self, "output_kind", OutputKind)
+        _check_choice(self, "output_scale", OutputScale)
         for field, kinds, wanted in (
-            ("name", (str,), "a text"),
-            ("size", (Fixed, Multiple, Near), "Fixed(height, width), Multiple(of) or Near(of=…)"),
-            ("defaults", (Settings,), "Settings(…)"),
-            ("normalisation", (Normalisation, none), "Normalisation(mean=…, std=…)"),
-            ("image_encoder", (str, none), "the name of a submodule"),
-            ("checkpoint", (Path, none), "a pathlib.Path"),
+            ("name", str, "a text"),
+            ("size", Fixed | Multiple | Near, "Fixed(height, width), Multiple(of) or Near(of=…)"),
+            ("defaults", Settings, "Settings(…)"),
+            ("normalisation", Normalisation | None, "Normalisation(mean=…, std=…)"),
+            ("image_encoder", str, "the name of a submodule"),
+            ("checkpoint", Path, "a pathlib.Path"),
         ):
             _check(self, field, isinstance(getattr(self, field), kinds), wanted)
         good = isinstance(self.layers, tuple | list)
         good = good and all(isinstance(name, str) for name in self.layers)
         _check(self, "layers", good, "a tuple of texts, as in ('encoder', 'decoder.up1')")
         for hook in ("build", "read_checkpoint", "arguments", "output", "verify", "coarse"):
-            value = getattr(self, hook)
-            good = callable(value) or (value is None and hook != "build")
-            _check(self, hook, good, "a function or a class")
+            _check(self, hook, callable(getattr(self, hook)), "a function or a class")
 
     @property
     def default_layer(self) -> str | None:
@@ -269,15 +266,9 @@ def assume_definition(**known: object) -> ModelDefinition:
     It is of rgb, and sides of images are padded to multiples of `ASSUMED_MULTIPLE`, unless other
     things are known. The points decide its normalisation and what its output means.
     """
-    unknown: dict[str, Any] = {
-        "input_kind": "rgb",
-        "size": Multiple(ASSUMED_MULTIPLE),
-        "normalisation": None,
-        "output_kind": "unknown",
-        "output_scale": "unknown",
-        "defaults": UNTUNED_DEFAULTS,
-    }
-    return ModelDefinition(**unknown | known)
+    unknown: dict[str, Any] = {"input_kind": "rgb", "size": Multiple(ASSUMED_MULTIPLE)}
+    unknown |= {"normalisation": None, "output_kind": "unknown", "output_scale": "unknown"}
+    return ModelDefinition(**unknown | {"defaults": UNTUNED_DEFAULTS} | known)
 
 
 def graph_definition(

@@ -27,12 +27,11 @@ _NUMBERS = ("item", "_local_scalar_dense", "equal")
 """Operators of torch whose result is a Python number."""
 
 
-class Unsupported(Exception):
-    """An operator is used in a way that is not covered; the message says which."""
-
-
 class Operation(nn.Module):
-    """One operation of a graph: a function, and what it is called in messages."""
+    """One operation of a graph: a function, and what it is called in messages.
+
+    A ModelError of the function says what use of the operator is not covered.
+    """
 
     def __init__(self, title: str, function: Callable[..., object]) -> None:
         super().__init__()
@@ -42,8 +41,8 @@ class Operation(nn.Module):
         """Returns the function's result."""
         try:
             return self._function(*args, **kwargs)
-        except Unsupported as error:
-            raise ModelError(f"{self.title} with {error} is not covered") from None
+        except ModelError as error:
+            raise ModelError(f"{self.title} is not covered: {error}") from None
 
 
 class FileGraph(nn.Module):
@@ -166,7 +165,7 @@ def _elements(values: object) -> int:
 
 
 class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Inside, an operation with a result of too many elements raises Unsupported without being run.
+    """Inside, an operation with a result of too many elements raises ModelError without being run.
 
     Args:
         largest: Elements of one result.
@@ -192,12 +191,12 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         in_place_or_view = any(each.alias_info is not None for each in func._schema.returns)
         self._left -= 0 if in_place_or_view else sum(elements)
         if max(elements, default=0) > self._largest or self._left < 0:
-            raise Unsupported(f"a result of {sum(elements):.3g} elements")
+            raise ModelError(f"a result of {sum(elements):.3g} elements")
         self._work -= sum(map(torch.numel, _tensors_in((args, kwargs))))
         if elements and func.overloadpacket in flop_registry:
             self._work -= flop_registry[func.overloadpacket](*args, **kwargs, out_val=expected) / 2
         if self._work < 0:
-            raise Unsupported("far more arithmetic on constants than networks have")
+            raise ModelError("far more arithmetic on constants than networks have")
         return func(*args, **kwargs)
 
 
@@ -209,7 +208,7 @@ def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str,
         return func(*args, **kwargs | without)
     except NotImplementedError:
         if func._opname not in _NUMBERS:
-            raise Unsupported("a result of a size that only its values tell") from None
+            raise ModelError("a result of a size that only its values tell") from None
         return None
     except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
         return None

@@ -19,9 +19,9 @@ import torch
 from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from pnpdepth_cli.budget import check_claim
+from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.errors import ModelError, describe
+from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
     UNTUNED_DEFAULTS,
     Fixed,
@@ -29,6 +29,7 @@ from pnpdepth_cli.models.definition import (
     Near,
     Normalisation,
 )
+from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
 
 _MOST_JSON_BYTES = 1 << 24
 _MAX_SIDE = 1 << 16  # pixels
@@ -183,12 +184,9 @@ def _read(file: Path, kind: type[_Kind]) -> _Kind:
             f"{file.parent} is not a Hugging Face folder: {file.name} is missing; take it from the"
             " network's page"
         )
-    size = file.stat().st_size
-    check_claim(f"{file} has {size:,} bytes", size, _MOST_JSON_BYTES, error=ModelError)
-    try:
+    check_network_file(file, "the settings", _MOST_JSON_BYTES)
+    with wrap_content_errors(str(file), msgspec.ValidationError):
         return msgspec.convert(json.loads(file.read_bytes()), kind)
-    except (msgspec.ValidationError, ValueError, OverflowError, RecursionError) as error:
-        raise ModelError(f"{file}: {describe(error)[:160]}") from None
 
 
 def _build(folder: Path) -> nn.Module:

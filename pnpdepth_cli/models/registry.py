@@ -23,6 +23,7 @@ from pathlib import Path
 from types import ModuleType
 
 from pnpdepth_cli import choices
+from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
@@ -135,8 +136,7 @@ def _python_definition(file: Path, attribute: str | None) -> ModelDefinition:
 
 def _run(file: Path) -> ModuleType:
     """The module that a Python file makes."""
-    if not file.is_file():
-        raise ModelError(f"model file {file} does not exist")
+    check_network_file(file, "model file")
     name = f"pnpdepth_user_model_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None

@@ -20,10 +20,10 @@ from torch import Tensor, fx
 from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.errors import ModelError, describe
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.models.definition import ModelDefinition, graph_definition
 from pnpdepth_cli.models.file_graph import FileGraph, Operation
-from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, view_of
+from pnpdepth_cli.models.weights.pickle_reader import view_of, wrap_content_errors
 from pnpdepth_cli.models.weights.pickled_files import refuse_inflated
 
 _OPERATOR = re.compile(r"torch\.ops\.(aten|prims?)\.(\w+)\.(\w+)")
@@ -50,21 +50,14 @@ def exported_definition(file: Path, **stated: object) -> ModelDefinition:
     Raises:
         ModelError: The file cannot be read, would do more than compute, or has other inputs.
     """
-    if not file.is_file():
-        raise ModelError(f"exported program {file} does not exist")
     check_network_file(file, "exported program")
-    try:
+    way_out = f"write it by torch.export.save of about this version of torch ({torch.__version__})"
+    with wrap_content_errors(f"exported program {file} cannot be read, {way_out}"):
         program, tensors = _read(file)
         graph = _graph(program, tensors)
         values = program["graph_module"]["graph"]["tensor_values"]
         sizes = [values[name]["sizes"] for name in graph.inputs]
         shapes = [[dict(side).get("as_int", "?") for side in size] for size in sizes]
-    except CONTENT_ERRORS as error:
-        reason = str(error) if isinstance(error, BrokenFileError) else describe(error)
-        raise ModelError(
-            f"exported program {file} cannot be read: {reason[:160]}; it must be written by"
-            f" torch.export.save of about this version of torch ({torch.__version__})"
-        ) from None
     return graph_definition(
         shapes, file, stated,
         summary="torch.export archive", build=lambda: _graph(program, tensors),
@@ -82,7 +75,7 @@ def _read(file: Path) -> tuple[_Json, dict[str, Tensor]]:
             config = json.loads(archive.read(entries[f"data/{folder}/{kind}_config.json"]))
             for name, stated in dict(config["config"]).items():
                 if stated["use_pickle"]:
-                    raise BrokenFileError(f"{name[:80]!r} is pickled, and no pickle is run")
+                    raise InputError(f"{name[:80]!r} is pickled, and no pickle is run")
                 path = f"data/{folder}/{stated['path_name']}"
                 if path not in storages:
                     storages[path] = bytearray(archive.read(entries[path]))
@@ -100,7 +93,7 @@ def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
         elif kind in ("parameter", "buffer", "tensor_constant"):
             graph.add_tensor(value["arg"]["name"], tensors[value[f"{kind}_name"]])
         else:
-            raise BrokenFileError(f"its input is a {str(kind)[:40]!r}")
+            raise InputError(f"its input is a {str(kind)[:40]!r}")
     for node in module["graph"]["nodes"]:
         if node["outputs"]:  # the others only check what the exporter saw
             _add_node(graph, node["target"], node["inputs"], node["outputs"])
@@ -141,7 +134,7 @@ def _function(target: str) -> Callable[..., object]:
             called = getattr(called, part, None)
         if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
             return called
-    raise BrokenFileError(f"it calls {target[:80]!r}, which is no operator of torch")
+    raise InputError(f"it calls {target[:80]!r}, which is no operator of torch")
 
 
 def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
@@ -169,7 +162,7 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return torch.device(value["type"])
         case "layout" if value == _STRIDED:
             return torch.strided
-    raise BrokenFileError(f"it has an argument {str(kind)[:40]!r}")
+    raise InputError(f"it has an argument {str(kind)[:40]!r}")
 
 
 def _outputs_in(stated: _Json) -> list[str | None]:
@@ -180,5 +173,5 @@ def _outputs_in(stated: _Json) -> list[str | None]:
     if kind == "as_none":
         return [None]
     if kind != "as_tensor":
-        raise BrokenFileError(f"it computes {str(kind)[:40]!r}; export it with fixed sizes")
+        raise InputError(f"it computes {str(kind)[:40]!r}; export it with fixed sizes")
     return [str(value["name"])]

@@ -10,12 +10,7 @@ import torch
 from torch import nn
 
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.models.cut_layers import (
-    best_layer,
-    default_layer,
-    suggest_layers,
-    wanted_field,
-)
+from pnpdepth_cli.models.cut_layers import default_layer, suggest_layers, wanted_field
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.settings import Settings
@@ -64,10 +59,10 @@ def test_a_layer_that_runs_twice_is_not_listed() -> None:
 
 @pytest.fixture
 def network() -> Network:
-    """A layer at stride 16, and one at full size."""
+    """A layer at stride 16, and one at full size whose field is 17 pixels wide."""
     torch.manual_seed(0)
     late = nn.ConvTranspose2d(4, 4, 16, stride=16), nn.Conv2d(4, 4, 3, padding=1)
-    layers = nn.Conv2d(3, 4, 16, stride=16), *late, nn.Conv2d(4, 1, 1)
+    layers = nn.Conv2d(3, 4, 16, stride=16), *late, nn.Conv2d(4, 1, 9, padding=4)
     definition = ModelDefinition(
         name="net", input_kind="rgb", size=Multiple(16), build=lambda: nn.Sequential(*layers),
         complete=True, layers=("0", "2"),
@@ -80,15 +75,11 @@ def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
     assert wanted_field((100, 400), 10_000) == 50
 
 
-def test_few_points_want_a_deep_layer_and_many_a_late_one(network: Network) -> None:
-    assert best_layer(network, (IMAGE,), (32, 48), 20) == "0"
-    assert best_layer(network, (IMAGE,), (1, 1), 36) == "2"
-    assert best_layer(network, (IMAGE,), (32, 48), 0) is None
-
-
-def test_the_default_is_the_definitions_layer_else_the_best_or_the_first(network: Network) -> None:
-    assert default_layer(network, (160, 192), 50) == "0"
-    first = replace(network.definition, layers=("2",))
-    assert default_layer(replace(network, definition=first), (160, 192), 50) == "2"
-    named = replace(network.definition, defaults=Settings(layer="2"))
-    assert default_layer(replace(network, definition=named), (160, 192), 50) == "2"
+@pytest.mark.parametrize(("points", "layer"), [(20, "0"), (1536, "2"), (0, "0")])
+def test_few_points_want_a_deep_layer_and_many_a_late_one_if_the_definition_names_none(
+    points: int, layer: str, network: Network
+) -> None:
+    assert default_layer(network, (32, 48), points) == layer
+    for stated in ({"layers": ("2",)}, {"defaults": Settings(layer="2")}):
+        definition = replace(network.definition, **stated)
+        assert default_layer(replace(network, definition=definition), (32, 48), points) == "2"

@@ -20,17 +20,18 @@ import torch
 from torch import Tensor, nn
 from torch.fx.node import Argument
 
-from pnpdepth_cli.budget import check_claim, max_decoded_bytes
-from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
+from pnpdepth_cli.budget import check_claim, check_network_file, max_decoded_bytes
+from pnpdepth_cli.errors import InputError, ModelError, wrap_user_errors
 from pnpdepth_cli.models.definition import (
     ASSUMED_MULTIPLE,
     ModelDefinition,
     Multiple,
     graph_definition,
 )
-from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit, Unsupported
+from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit
 from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
 from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
+from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
@@ -83,10 +84,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
 def _read(file: Path) -> ModelProto:
     """The onnx.ModelProto with its weights, of an opset that is covered."""
     # The file, and the packages that read it.
-    if not file.is_file():
-        raise ModelError(f"ONNX file {file} does not exist")
-    size = file.stat().st_size
-    check_claim(f"ONNX file {file} has {size:,} bytes", size, _MAX_BYTES, error=ModelError)
+    check_network_file(file, "ONNX file", _MAX_BYTES)
     try:
         import onnx
         import onnxruntime  # noqa: F401
@@ -96,35 +94,35 @@ def _read(file: Path) -> ModelProto:
             f"{file} is an ONNX file, which needs the package {error.name!r}:"
             " pip install 'pnpdepth[onnx]'"
         ) from None
-    try:
+    more = (DecodeError, onnx.checker.ValidationError)
+    with wrap_content_errors(f"ONNX file {file} cannot be read", *more):
         model = onnx.load(str(file), load_external_data=False)
         _load_external(model, file.parent)
-    except (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, OSError) as error:
-        raise ModelError(f"ONNX file {file} cannot be read: {describe(error)}") from None
-    # A graph whose names are text, of an opset that is covered.
+        _check_covered(model)
+    return model
+
+
+def _check_covered(model: ModelProto) -> None:
+    """InputError unless it is one graph whose names are text, of an opset that is covered."""
     if not model.graph.node:
-        raise ModelError(f"ONNX file {file} cannot be read: it holds no graph")
+        raise InputError("it holds no graph")
     if model.functions:
-        raise ModelError(
-            f"ONNX file {file} has functions of its own; onnx.inliner.inline_local_functions writes"
-            " them out"
+        raise InputError(
+            "it has functions of its own; onnx.inliner.inline_local_functions writes them out"
         )
     for node in model.graph.node:
         words = (node.name, node.op_type, node.domain, *node.input, *node.output)
         if not all(isinstance(word, str) for word in words):
-            raise ModelError(f"ONNX file {file} cannot be read: its names are not text in UTF-8")
+            raise InputError("its names are not text in UTF-8")
     if _opset(model) not in _OPSETS:
-        raise ModelError(
-            f"ONNX file {file} is of opset {_opset(model)}; export it with one from"
-            f" {_OPSETS[0]} to {_OPSETS[-1]}"
-        )
-    return model
+        wanted = f"{_OPSETS[0]} to {_OPSETS[-1]}"
+        raise InputError(f"it is of opset {_opset(model)}; export it with one from {wanted}")
 
 
 def _load_external(model: ModelProto, folder: Path) -> None:
     """Reads the tensors that lie in files beside the model into it.
 
-    ValueError if they claim more than these files have, or more than memory holds.
+    InputError if they claim more than these files have, or more than memory holds.
     """
     from onnx import external_data_helper as external
 
@@ -136,9 +134,7 @@ def _load_external(model: ModelProto, folder: Path) -> None:
     sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
     claimed = sum(claim.length or sizes[claim.location] for claim in claims)
     most = min(_SHARED * sum(sizes.values()), max_decoded_bytes())
-    check_claim(
-        f"its tensors have {claimed:,} bytes in other files", claimed, most, error=ValueError
-    )
+    check_claim(f"its tensors have {claimed:,} bytes in other files", claimed, most)
     external.load_external_data_for_model(model, str(folder))
 
 
@@ -169,9 +165,8 @@ def _prune(model: ModelProto, output: str) -> bool:
             nodes.append(node)
             needed.update(filter(None, node.input))
     is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
-    kept = type(graph)()
-    kept.node.extend(reversed(nodes))
-    kept.output.extend(o for o in graph.output if o.name == output)
+    outputs = [each for each in graph.output if each.name == output]
+    kept = type(graph)(node=reversed(nodes), output=outputs)
     graph.ClearField("node")
     graph.ClearField("output")
     graph.MergeFrom(kept)
@@ -296,10 +291,10 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
 def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
     """The node's outputs. Arithmetic on shapes stays on the CPU."""
     if node.outputs > 1 and node.op != "Split":
-        raise Unsupported("more than its first output")
+        raise ModelError("more than its first output")
     for name, only in ONLY.items():
         if node.get(name, only) != only:
-            raise Unsupported(f"{name} {node.get(name)!r}")
+            raise ModelError(f"{name} {node.get(name)!r}")
     devices = [value.device for value in inputs if value is not None and not value.is_cpu]
     moved: list[Any] = []
     for index, value in enumerate(inputs):
@@ -313,11 +308,8 @@ def _opset(model: ModelProto) -> int:
 
 
 def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
-    unknown: Counter[str] = Counter()
-    for proto in nodes:
-        standard = proto.domain in _STANDARD
-        if not standard or proto.op_type not in OPERATORS:
-            unknown[proto.op_type if standard else f"{proto.domain}.{proto.op_type}"] += 1
+    names = [n.op_type if n.domain in _STANDARD else f"{n.domain}.{n.op_type}" for n in nodes]
+    unknown = Counter(name for name in names if name not in OPERATORS)
     if unknown:
         listed = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
         raise ModelError(
@@ -348,11 +340,7 @@ def _attribute(proto: AttributeProto, path: Path) -> object:
 def _tensor(proto: TensorProto, path: Path) -> Tensor:
     from onnx import numpy_helper
 
-    if proto.data_type in (proto.FLOAT16, proto.BFLOAT16):
-        raise ModelError(f"ONNX file {path} is in half precision; export the network in float32")
-    try:
+    with wrap_content_errors(f"ONNX file {path}: tensor {proto.name!r} cannot be read"):
+        if proto.data_type in (proto.FLOAT16, proto.BFLOAT16):
+            raise InputError("it is in half precision; export the network in float32")
         return torch.tensor(numpy_helper.to_array(proto))
-    except (ValueError, TypeError, KeyError, RuntimeError) as error:
-        raise ModelError(
-            f"ONNX file {path}: tensor {proto.name!r} cannot be read ({error})"
-        ) from None

@@ -12,8 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.errors import wrap_user_errors
-from pnpdepth_cli.models.file_graph import Unsupported
+from pnpdepth_cli.errors import ModelError, wrap_user_errors
 from pnpdepth_cli.models.onnx.operators import (
     Inputs,
     Node,
@@ -23,8 +22,6 @@ from pnpdepth_cli.models.onnx.operators import (
     whole_numbers,
 )
 
-_CONV = {1: F.conv1d, 2: F.conv2d, 3: F.conv3d}
-_TRANSPOSED = {1: F.conv_transpose1d, 2: F.conv_transpose2d, 3: F.conv_transpose3d}
 _RESIZE = ("mode", "coordinate_transformation_mode", "nearest_mode", "cubic_coeff_a")
 _MAX_POOL = {1: F.max_pool1d, 2: F.max_pool2d, 3: F.max_pool3d}
 
@@ -61,7 +58,7 @@ def _halves(node: Node, totals: Sequence[int]) -> Pads:
 def conv(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
-        raise Unsupported("double precision")
+        raise ModelError("double precision")
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     pads = _pads(node, x.shape[2:], weight.shape[2:], stride, dilation)
@@ -69,7 +66,8 @@ def conv(node: Node, inputs: Inputs) -> Tensor:
     if not even:
         x = F.pad(x, _sides(pads))
     padding = [begin for begin, _ in pads] if even else [0] * rank
-    return _CONV[rank](x, weight, bias, stride, padding, dilation, node.get("group", 1))
+    group = node.get("group", 1)
+    return torch.convolution(x, weight, bias, stride, padding, dilation, False, [0] * rank, group)
 
 
 @operator("ConvTranspose")
@@ -78,7 +76,7 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
     rank = x.ndim - 2
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     extra, group = node.get("output_padding", [0] * rank), node.get("group", 1)
-    y: Tensor = _TRANSPOSED[rank](x, weight, bias, stride, 0, extra, group, dilation)
+    y = torch.convolution(x, weight, bias, stride, [0] * rank, dilation, True, extra, group)
     # The result without its pads, which may be stated by its shape.
     sizes, wanted = y.shape[2:], node.get("output_shape")
     if wanted is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
@@ -100,7 +98,7 @@ def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
     if all(begin == end <= k // 2 for (begin, end), k in zip(pads, kernel, strict=True)):
         return called | {"padding": [begin for begin, _ in pads]}, []
     if ceil:
-        raise Unsupported("ceil_mode and such pads")
+        raise ModelError("ceil_mode and such pads")
     return called, _sides(pads)
 
 
@@ -117,7 +115,7 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
     x, with_pads = inputs[0], bool(node.get("count_include_pad", 0))
     if x.ndim != 4 or any(d != 1 for d in node.get("dilations", [])):
-        raise Unsupported("other than two spatial axes, or dilations")
+        raise ModelError("other than two spatial axes, or dilations")
     called, sides = _pooling(node, x)
     mean = F.avg_pool2d(F.pad(x, sides), count_include_pad=with_pads, **called)
     if with_pads or not sides:
@@ -160,28 +158,25 @@ def group_norm(node: Node, inputs: Inputs) -> Tensor:
 def resize(node: Node, inputs: Inputs) -> Tensor:
     x, scales, sizes = inputs[0], optional(inputs, 2), optional(inputs, 3)
     if "axes" in node.attributes:
-        raise Unsupported("axes")
-    if sizes is not None and sizes.numel():
-        wanted = whole_numbers(sizes)
-        return _resize(x, node, [size / n for size, n in zip(wanted, x.shape, strict=True)], wanted)
-    if node.op == "Upsample" or node.opset < 11:
+        raise ModelError("axes")
+    wanted = [] if sizes is None else whole_numbers(sizes)
+    if wanted:
+        factors = [size / n for size, n in zip(wanted, x.shape, strict=True)]
+    elif node.op == "Upsample" or node.opset < 11:
         factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
         mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
         more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         node = replace(node, attributes={"mode": mode, **more})
     elif scales is None:
-        raise Unsupported("neither scales nor sizes")
+        raise ModelError("neither scales nor sizes")
     else:
         factors = scales.tolist()
-    wanted = [math.floor(n * factor) for n, factor in zip(x.shape, factors, strict=True)]
-    return _resize(x, node, factors, wanted)
-
-
-def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Tensor:
-    fast = _by_torch(x, node, factors, sizes)
+    wanted = wanted or [math.floor(n * f) for n, f in zip(x.shape, factors, strict=True)]
+    # By torch's own resize where it computes the same.
+    fast = _by_torch(x, node, factors, wanted)
     if fast is not None:
         return fast
-    for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
+    for axis, (size, factor) in enumerate(zip(wanted, factors, strict=True)):
         if factor != 1:
             x = _along(x, axis, _weights(node, x.shape[axis], size, factor))
     return x
@@ -190,8 +185,7 @@ def _resize(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Te
 def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Tensor | None:
     """The result of torch's own resize if it computes the same; else None."""
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
-    is_image = x.ndim == 4 and list(x.shape[:2]) == sizes[:2] and exact
-    if not is_image or not x.is_floating_point():
+    if x.ndim != 4 or list(x.shape[:2]) != sizes[:2] or not exact or not x.is_floating_point():
         return None
     size, mode = (sizes[2], sizes[3]), node.get("mode", "nearest")
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
@@ -223,7 +217,7 @@ def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
     from onnx import TensorProto, helper, numpy_helper
 
     if node.get("coordinate_transformation_mode") == "tf_crop_and_resize":
-        raise Unsupported("a region of interest")
+        raise ModelError("a region of interest")
     torch.empty(out, size, device="meta")  # which a `SizeLimit` refuses if it is too large
     attributes = {name: node.get(name) for name in _RESIZE if name in node.attributes}
     stated, by = ["none", "by"], np.array([out, size])

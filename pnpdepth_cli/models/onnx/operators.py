@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.models.file_graph import Unsupported
+from pnpdepth_cli.errors import ModelError
 
 Inputs = list[Tensor]
 """The inputs of a node in order; `optional` reads those that may be absent or None."""
@@ -85,11 +85,11 @@ def whole_numbers(values: Tensor) -> list[int]:
     return [int(v) for v in values.reshape(-1).tolist()]
 
 
-def stated(node: Node, name: str, inputs: Inputs, index: int) -> list[int] | None:
-    """Returns the numbers of an attribute, or of the input that later took its place."""
+def stated(node: Node, name: str, inputs: Inputs, index: int) -> list[int]:
+    """Returns the numbers of an attribute, or of the input that later took its place; or none."""
     if name not in node.attributes and optional(inputs, index) is not None:
         return whole_numbers(inputs[index])
-    numbers: list[int] | None = node.get(name)
+    numbers: list[int] = node.get(name, [])
     return numbers
 
 
@@ -142,12 +142,7 @@ register(
 def clip(node: Node, inputs: Inputs) -> Tensor:
     low = optional(inputs, 1) if node.opset >= 11 else node.get("min")
     high = optional(inputs, 2) if node.opset >= 11 else node.get("max")
-    x: Tensor = inputs[0]
-    # Two steps: if low > high, the standard's result is high; either may be left out.
-    for bound, function in ((low, torch.maximum), (high, torch.minimum)):
-        if bound is not None:
-            x = function(x, torch.as_tensor(bound, dtype=x.dtype, device=x.device))
-    return x
+    return inputs[0] if low is None and high is None else torch.clamp(inputs[0], low, high)
 
 
 @operator("Softmax", "LogSoftmax")
@@ -157,8 +152,7 @@ def softmax(node: Node, inputs: Inputs) -> Tensor:
     if node.opset >= 13:
         return function(x, node.get("axis", -1))
     axis = node.get("axis", 1) % x.ndim
-    rows = math.prod(x.shape[:axis])
-    return function(x.reshape(rows, -1), 1).reshape(x.shape)
+    return function(x.flatten(axis), axis).reshape(x.shape)
 
 
 @operator("Gemm")
@@ -227,7 +221,6 @@ register(
 @operator("Reshape", host=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
     x, wanted = inputs[0], stated(node, "shape", inputs, 1)
-    assert wanted is not None
     if not node.get("allowzero", 0):
         wanted = [x.shape[i] if n == 0 else n for i, n in enumerate(wanted)]
     return x.reshape(wanted)
@@ -236,7 +229,6 @@ def reshape(node: Node, inputs: Inputs) -> Tensor:
 @operator("Unsqueeze", host=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     x, axes = inputs[0], stated(node, "axes", inputs, 1)
-    assert axes is not None
     rank = x.ndim + len(axes)
     for axis in sorted(a % rank for a in axes):
         x = x.unsqueeze(axis)
@@ -246,12 +238,8 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
 @operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     x, axis = inputs[0], node.get("axis", 0)
-    sizes = stated(node, "split", inputs, 1)
-    if sizes is None:
-        parts, total = node.get("num_outputs", node.outputs), x.shape[axis]
-        each = math.ceil(total / parts)
-        sizes = [min(each, total - each * i) for i in range(parts)]
-    return torch.split(x, sizes, axis)
+    equal = math.ceil(x.shape[axis] / node.get("num_outputs", node.outputs))
+    return torch.split(x, stated(node, "split", inputs, 1) or equal, axis)
 
 
 _PAD_MODES = {"edge": "replicate", "reflect": "reflect"}
@@ -261,16 +249,16 @@ _PAD_MODES = {"edge": "replicate", "reflect": "reflect"}
 def pad(node: Node, inputs: Inputs) -> Tensor:
     x, mode = inputs[0], node.get("mode", "constant")
     if optional(inputs, 3) is not None:
-        raise Unsupported("axes")
+        raise ModelError("axes")
     flat = stated(node, "pads", inputs, 1)
-    assert flat is not None
     sides = list(zip(flat[: x.ndim], flat[x.ndim :], strict=True))
+    last_first = [n for pair in reversed(sides) for n in pair]
     if mode == "constant":
         value = node.get("value", 0.0) if optional(inputs, 2) is None else inputs[2].item()
-        return F.pad(x, [n for pair in reversed(sides) for n in pair], value=value)
-    if mode not in _PAD_MODES or x.ndim < 3 or any((*sides[0], *sides[1])):
-        raise Unsupported(f"mode {mode} of {x.ndim} axes")
-    return F.pad(x, [n for pair in reversed(sides[2:]) for n in pair], _PAD_MODES[mode])
+        return F.pad(x, last_first, value=value)
+    if mode not in _PAD_MODES or x.ndim < 3 or any(last_first[-4:]):
+        raise ModelError(f"mode {mode} of {x.ndim} axes")
+    return F.pad(x, last_first[:-4], _PAD_MODES[mode])
 
 
 @operator("DepthToSpace")
@@ -286,16 +274,14 @@ def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
 def cast(node: Node, inputs: Inputs) -> Tensor:
     kind = node.get("to")
     if kind not in TYPES:
-        raise Unsupported(f"data type {kind}")
+        raise ModelError(f"data type {kind}")
     return inputs[0].to(TYPES[kind])
 
 
 @operator("Constant")
 def constant(node: Node, inputs: Inputs) -> Tensor:
-    ((name, value),) = node.attributes.items()
-    if name not in ("value", "value_float", "value_floats", "value_int", "value_ints"):
-        raise Unsupported("a constant of text or of a sparse tensor")
-    return value if isinstance(value, Tensor) else torch.tensor(value)
+    (value,) = node.attributes.values()
+    return torch.as_tensor(value)
 
 
 @operator("ConstantOfShape", host=(0,))
@@ -317,8 +303,6 @@ def slice_(node: Node, inputs: Inputs) -> Tensor:
         stated(node, name, inputs, n)
         for n, name in enumerate(("starts", "ends", "axes", "steps"), 1)
     )
-    assert starts is not None
-    assert ends is not None
     axes, steps = axes or [*range(len(starts))], steps or [1] * len(starts)
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         size = x.shape[axis]

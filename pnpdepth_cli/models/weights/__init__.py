@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.errors import ModelError, wrap_user_errors
 from pnpdepth_cli.models.definition import ModelDefinition, file_and_part
-from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, BrokenFileError, StandIn
+from pnpdepth_cli.models.weights.pickle_reader import StandIn, wrap_content_errors
 from pnpdepth_cli.models.weights.pickled_files import read_numpy_file, read_torch_file
 from pnpdepth_cli.models.weights.tensor_bundle import read_tensor_bundle
 
@@ -61,17 +61,12 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     path, key = file_and_part(path)
     if path.is_dir():
         return _read_folder(path, notes)
-    if not path.is_file():
-        raise ModelError(f"checkpoint {path} does not exist")
     check_network_file(path, "checkpoint")
     # Its reader gives named tensors, or what a torch file holds.
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
-    try:
+    what = f"checkpoint {path} cannot be read as a {kind}"
+    with wrap_content_errors(what, SafetensorError):
         content = read(path)
-    except (*CONTENT_ERRORS, SafetensorError) as error:
-        fact = "" if isinstance(error, BrokenFileError) else f"{type(error).__name__}: "
-        reason = " ".join(f"{fact}{error}"[:1000].split())[:160]  # parts may come out of the file
-        raise ModelError(f"checkpoint {path} cannot be read as a {kind} ({reason})") from None
     if isinstance(content, dict):
         if key:
             raise ModelError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")

@@ -18,7 +18,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from mmap import mmap
@@ -27,6 +28,7 @@ from typing import Any
 from torch import Tensor
 
 from pnpdepth_cli.budget import check_claim
+from pnpdepth_cli.errors import InputError, ModelError, describe
 
 MAX_STEPS = 3_000_000
 """Opcodes, and entries of dicts; the state dict of 2,000 tensors takes 100,000."""
@@ -49,16 +51,22 @@ LoadStorage = Callable[[tuple[object, ...]], Tensor]
 """Function that returns the flat tensor for ("storage", type, key, location, elements, ...)."""
 
 
-class BrokenFileError(Exception):
-    """A file is not what it should be; the message says how."""
-
-
-CONTENT_ERRORS = (
-    *(BrokenFileError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
+CONTENT_ERRORS: tuple[type[Exception], ...] = (
+    *(InputError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
     *(struct.error, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
     *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""
+
+
+@contextmanager
+def wrap_content_errors(what: str, *more: type[Exception]) -> Iterator[None]:
+    """Turns what readers raise on content, or more, into a ModelError "`what`: …" on one line."""
+    try:
+        yield
+    except (*CONTENT_ERRORS, *more) as error:
+        reason = describe(error).removeprefix("InputError: ")[:160]
+        raise ModelError(f"{what}: {reason}") from None
 
 
 @dataclass(eq=False, repr=False)
@@ -100,17 +108,17 @@ class _Unpickler(pickle._Unpickler):
         try:
             function()
         except AttributeError:  # of an object on the stack
-            raise BrokenFileError("its pickle uses an object as one of another kind") from None
+            raise InputError("its pickle uses an object as one of another kind") from None
 
     def _charge(self, steps: int) -> None:
         self._left -= steps
         if self._left < 0:
-            raise BrokenFileError(f"its pickle takes more than {MAX_STEPS:,} steps")
+            raise InputError(f"its pickle takes more than {MAX_STEPS:,} steps")
 
     def find_class(self, module: str, name: str) -> StandIn:
         """The name itself, that of Python 3."""
         if len(module) + len(name) > MAX_NAME:
-            raise BrokenFileError("its pickle has a name without end")
+            raise InputError("its pickle has a name without end")
         module = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(module, module)
         return StandIn(f"{module}.{name}")
 
@@ -121,7 +129,7 @@ class _Unpickler(pickle._Unpickler):
                 return pid[1]
             if pid[0] == "storage" and self._load_storage is not None:
                 return self._load_storage(pid)
-        raise BrokenFileError("its pickle refers to something outside it")
+        raise InputError("its pickle refers to something outside it")
 
     def load_empty_set(self) -> None:
         self.stack.append([])
@@ -157,7 +165,7 @@ class _Unpickler(pickle._Unpickler):
     def _result(self, function: object, arguments: object) -> object:
         """The result of a call if it is a tensor or a plain container, else what stands for it."""
         if not isinstance(arguments, tuple) or not isinstance(function, StandIn):
-            raise BrokenFileError("its pickle calls something other than a function")
+            raise InputError("its pickle calls something other than a function")
         # Plain containers and tensors are made; nothing is run.
         first = arguments[0] if arguments else None
         match function.path:
@@ -195,7 +203,7 @@ def read_pickle(
 ) -> tuple[object, list[str]]:
     """Returns the content of one pickle, and the functions and classes of its stand-ins.
 
-    A broken pickle raises BrokenFileError or what its parts raise.
+    A broken pickle raises InputError or what its parts raise.
 
     Args:
         file: File that stands at the first opcode, afterwards behind the last. It is in memory or
@@ -210,10 +218,10 @@ def view_of(storage: Tensor, offset: int, shape: Sequence[int], stride: Sequence
     """Returns a tensor over a flat one by `as_strided`, which refuses what lies beyond it.
 
     Raises:
-        BrokenFileError: It has far more elements than the flat one.
+        InputError: It has far more elements than the flat one.
     """
     shape, stride = tuple(map(int, shape)), tuple(map(int, stride))
     count = math.prod(shape)
     most = max(len(storage), _MAX_EXPANDED)
-    check_claim(f"a tensor has {count:.6g} elements", count, most, error=BrokenFileError)
+    check_claim(f"a tensor has {count:.6g} elements", count, most)
     return storage.as_strided(shape, stride, int(offset) if count else 0)

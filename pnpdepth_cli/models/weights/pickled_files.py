@@ -23,10 +23,10 @@ from numpy.lib import format as npy
 from torch import Tensor
 
 from pnpdepth_cli.budget import check_claim
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.models.weights.pickle_reader import (
     CONTENT_ERRORS,
     MAX_NAME,
-    BrokenFileError,
     StandIn,
     read_pickle,
 )
@@ -80,7 +80,7 @@ def _walk(
 ) -> Iterator[tuple[str, Tensor]]:
     endless = next(visited) > _MAX_MODULES or prefix.count(".") > _MAX_DEPTH
     if endless or len(prefix) > MAX_NAME:
-        raise BrokenFileError("its modules contain each other without end")
+        raise InputError("its modules contain each other without end")
     fleeting = module.get("_non_persistent_buffers_set")
     # Not a set, in which other elements may take for ever to hash.
     left_out = [n for n in fleeting if isinstance(n, str)] if isinstance(fleeting, list) else []
@@ -98,15 +98,15 @@ def _read_archive(path: Path) -> tuple[object, list[str]]:
     with zipfile.ZipFile(path) as archive:
         entries = {info.filename: info for info in archive.infolist()}
         if any("/code/" in name for name in entries):
-            raise BrokenFileError("it is TorchScript; save the state_dict() of its module instead")
+            raise InputError("it is TorchScript; save the state_dict() of its module instead")
         refuse_inflated(archive, path)
         pickles = [name for name in entries if name == "data.pkl" or name.endswith("/data.pkl")]
         if len(pickles) != 1:
-            raise BrokenFileError(f"the archive has {len(pickles)} entries named data.pkl")
+            raise InputError(f"the archive has {len(pickles)} entries named data.pkl")
         folder = pickles[0].removesuffix("data.pkl")
         order = entries.get(f"{folder}byteorder")
         if order is not None and archive.read(order).strip() == b"big":
-            raise BrokenFileError("it was written on a big-endian machine")
+            raise InputError("it was written on a big-endian machine")
 
         def read(key: str, _: int) -> bytearray:
             return bytearray(archive.read(entries[f"{folder}data/{key}"]))
@@ -116,11 +116,11 @@ def _read_archive(path: Path) -> tuple[object, list[str]]:
 
 
 def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
-    """Raises BrokenFileError for an archive whose entries are compressed, or overlap."""
+    """Raises InputError for an archive whose entries are compressed, or overlap."""
     if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-        raise BrokenFileError("it is compressed, which torch never does")
+        raise InputError("it is compressed, which torch never does")
     claimed, most = sum(info.file_size for info in archive.infolist()), path.stat().st_size
-    check_claim(f"its entries have {claimed:,} bytes", claimed, most, error=BrokenFileError)
+    check_claim(f"its entries have {claimed:,} bytes", claimed, most)
 
 
 def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
@@ -135,7 +135,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
     except CONTENT_ERRORS:  # of another kind of file
         begins = None
     if begins != _MAGIC:
-        raise BrokenFileError("it begins as no torch file does")
+        raise InputError("it begins as no torch file does")
     for _ in ("protocol", "system"):
         read_pickle(file)
     # The content, with storages of the size that it states.
@@ -143,9 +143,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
 
     def room_for(key: str, count: int) -> bytearray:
         nonlocal promised
-        check_claim(
-            f"a storage has {count:,} bytes", count, len(file) - promised, error=BrokenFileError
-        )
+        check_claim(f"a storage has {count:,} bytes", count, len(file) - promised)
         promised += count
         return bytearray(count)
 
@@ -156,13 +154,13 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
     keys = keys if isinstance(keys, list) else []
     names = [str(key) for key in keys if isinstance(key, str | int)]
     if {*names} != storages.keys():
-        raise BrokenFileError("its storages are not those that its pickle names")
+        raise InputError("its storages are not those that its pickle names")
     for key in names:
         memory = storages[key].view(torch.uint8).numpy()
         stored = int.from_bytes(file.read(8), "little") * storages[key].itemsize
         part = file.read(len(memory))
         if not stored == len(memory) == len(part):
-            raise BrokenFileError(f"storage {key[:20]} is shorter than it should be")
+            raise InputError(f"storage {key[:20]} is shorter than it should be")
         memory[:] = np.frombuffer(part, np.uint8)
     return content, named
 
@@ -176,10 +174,10 @@ def _load_storage(
     """
     kind, key = pid[1].path.rpartition(".")[2] if isinstance(pid[1], StandIn) else "", pid[2]
     if kind not in _DTYPES:
-        raise BrokenFileError(f"a storage of type {kind[:40] or '?'}")
+        raise InputError(f"a storage of type {kind[:40] or '?'}")
     count = pid[4]
     if not isinstance(key, str | int) or not isinstance(count, int):
-        raise BrokenFileError("a storage without a key or a size")
+        raise InputError("a storage without a key or a size")
     key, dtype = str(key), _DTYPES[kind]
     if key not in storages:
         data = read(key, count * dtype.itemsize)
@@ -187,9 +185,9 @@ def _load_storage(
     view = pid[5] if len(pid) > 5 else None
     _, start, count = view if isinstance(view, tuple) else (None, 0, count)
     if min(start, count) < 0 or start + count > len(storages[key]):
-        raise BrokenFileError(f"storage {key[:20]} is shorter than its {count} elements")
+        raise InputError(f"storage {key[:20]} is shorter than its {count} elements")
     if storages[key].dtype != dtype:
-        raise BrokenFileError(f"storage {key[:20]} has two types")
+        raise InputError(f"storage {key[:20]} has two types")
     return storages[key][start : start + count]
 
 
@@ -200,21 +198,21 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
     """
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         if npy.read_magic(content) != (1, 0):
-            raise BrokenFileError("it holds no dict of arrays")
+            raise InputError("it holds no dict of arrays")
         shape, _, dtype = npy.read_array_header_1_0(content)
         if not dtype.hasobject or shape != ():
-            raise BrokenFileError(f"it holds one array of shape {shape}, not named arrays")
+            raise InputError(f"it holds one array of shape {shape}, not named arrays")
         array, _ = read_pickle(content)
         left = len(content)
     objects = _state_of_array(array)[4]
     if not (isinstance(objects, list) and len(objects) == 1 and isinstance(objects[0], Mapping)):
-        raise BrokenFileError("it holds no dict of arrays")
+        raise InputError("it holds no dict of arrays")
     tensors: dict[str, Tensor] = {}
     for name, value in _entries(objects[0]):
         tensors[name] = _unpickle(value, name, left)
         left -= tensors[name].nbytes
         count = len(tensors)
-        check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES, error=BrokenFileError)
+        check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES)
     return tensors
 
 
@@ -229,7 +227,7 @@ def _entries(
 ) -> Iterator[tuple[str, object]]:
     """All that lies in the dict and in the dicts in it, by name; "." joins the keys."""
     if depth > _MAX_DICTS:
-        raise BrokenFileError("its dicts are nested deeper than the layers of any network")
+        raise InputError("its dicts are nested deeper than the layers of any network")
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from _entries(value, f"{prefix}{key}.", depth + 1)
@@ -242,19 +240,19 @@ def _unpickle(value: object, name: str, most: int) -> Tensor:
     _, shape, dtype, fortran, data = _state_of_array(value)
     if not isinstance(shape, tuple):
         kind = value.path if isinstance(value, StandIn) else type(value).__name__
-        raise BrokenFileError(f"{name} is a {kind}, not an array")
+        raise InputError(f"{name} is a {kind}, not an array")
     shape, code, order = tuple(map(int, shape)), dtype.arguments[0], dtype.state[1]
     data = data.encode("latin-1") if isinstance(data, str) else data  # as Python 2 has it
     if not isinstance(data, bytes):
-        raise BrokenFileError(f"{name} holds objects, not numbers")
-    check_claim(f"{name} has {len(data):,} bytes", len(data), most, error=BrokenFileError)
+        raise InputError(f"{name} holds objects, not numbers")
+    check_claim(f"{name} has {len(data):,} bytes", len(data), most)
     if any(side < 0 for side in shape):
-        raise BrokenFileError(f"{name} has a shape of {shape}")
+        raise InputError(f"{name} has a shape of {shape}")
     if not isinstance(code, str) or not isinstance(order, str):
-        raise BrokenFileError("an array without a type")
+        raise InputError("an array without a type")
     number = np.dtype(f"{order[:1]}{code[:8]}")
     array = np.frombuffer(data, number) if data else np.empty(0, number)
     if array.dtype.kind not in "fiub":
-        raise BrokenFileError(f"{name} is an array of {array.dtype.str}, not of numbers")
+        raise InputError(f"{name} is an array of {array.dtype.str}, not of numbers")
     array = array.reshape(shape, order="F" if fortran else "C")
     return torch.from_numpy(array.astype(number.newbyteorder("="), order="C"))

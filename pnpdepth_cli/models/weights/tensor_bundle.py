@@ -17,8 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.budget import check_claim, max_decoded_bytes
-from pnpdepth_cli.models.weights.pickle_reader import BrokenFileError
+from pnpdepth_cli.budget import check_claim, check_network_file
+from pnpdepth_cli.errors import InputError
 
 _FOOTER, _MAGIC = 48, 0xDB4775248B80FB57
 _TYPES = {
@@ -40,30 +40,26 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     table = dict(_table(index.read_bytes()))
     header = _message(table.pop(b"", b""))
     if _last(header, 2) != 0:
-        raise BrokenFileError("it was written on a big-endian machine")
+        raise InputError("it was written on a big-endian machine")
     shards: dict[int, bytes] = {}
     tensors: dict[str, Tensor] = {}
     left = 0
     for key, entry in table.items():
         name, fields = key.decode(), _message(entry)
         if 7 in fields:
-            raise BrokenFileError("a variable is in slices")
+            raise InputError("a variable is in slices")
         if _last(fields, 1) == _TEXT:
             continue
         # The file of its values, read once.
         shard = _last(fields, 3)
         if shard not in shards:
             path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
-            if not path.is_file():
-                raise BrokenFileError(f"{path.name} is not beside the index")
-            size = path.stat().st_size
-            claim = f"{path.name} has {size:,} bytes"
-            check_claim(claim, size, max_decoded_bytes(), error=BrokenFileError)
+            check_network_file(path, f"checkpoint {index}: its file")
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
         # Variables claim no more than the files have.
         size = _last(fields, 5)
-        check_claim(f"{name} has {size:,} bytes", size, left, error=BrokenFileError)
+        check_claim(f"{name} has {size:,} bytes", size, left)
         left -= size
         tensors[name.replace("/", ".")] = _tensor(name, fields, shards[shard])
     return tensors
@@ -72,11 +68,11 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
 def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
     kind, offset, size = (_last(fields, number) for number in (1, 4, 5))
     if kind not in _TYPES:
-        raise BrokenFileError(f"{name} is of TensorFlow's type {kind}, not of numbers")
+        raise InputError(f"{name} is of TensorFlow's type {kind}, not of numbers")
     sides = _message(fields[2][-1]).get(2, []) if 2 in fields else []
     shape = [_last(_message(side), 1) for side in sides]
     if math.prod(shape) * _TYPES[kind].itemsize != size or offset + size > len(content):
-        raise BrokenFileError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
+        raise InputError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
     if not size:
         return torch.empty(shape, dtype=_TYPES[kind])
     part = bytearray(content[offset : offset + size])
@@ -86,14 +82,14 @@ def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
 def _table(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Keys and values of all blocks."""
     if len(data) < _FOOTER or struct.unpack("<Q", data[-8:])[0] != _MAGIC:
-        raise BrokenFileError("it does not end as an index does")
+        raise InputError("it does not end as an index does")
     _, at = _varint(data, len(data) - _FOOTER)  # the block of metadata comes first; it is empty
     _, at = _varint(data, at)
     behind_last = 0
     for _, handle in _block(data, data[at:]):
         offset, size_at = _varint(handle, 0)
         if offset < behind_last:
-            raise BrokenFileError("its blocks overlap")
+            raise InputError("its blocks overlap")
         behind_last = offset + max(1, _varint(handle, size_at)[0])
         yield from _block(data, handle)
 
@@ -103,9 +99,9 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
     offset, at = _varint(handle, 0)
     size, _ = _varint(handle, at)
     if offset + size >= len(data) or size < 4:
-        raise BrokenFileError("a block goes beyond its end")
+        raise InputError("a block goes beyond its end")
     if data[offset + size] != 0:
-        raise BrokenFileError("its index is compressed, which TensorFlow does not do")
+        raise InputError("its index is compressed, which TensorFlow does not do")
     (restarts,) = struct.unpack_from("<I", data, offset + size - 4)
     at, end = offset, offset + size - 4 * (restarts + 1)
     key = b""
@@ -114,9 +110,9 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
         fresh, at = _varint(data, at)
         length, at = _varint(data, at)
         if at + fresh + length > end or shared > len(key):
-            raise BrokenFileError("an entry goes beyond its block")
+            raise InputError("an entry goes beyond its block")
         if shared + fresh > _MAX_NAME:
-            raise BrokenFileError(f"it has a name of {shared + fresh:,} bytes")
+            raise InputError(f"it has a name of {shared + fresh:,} bytes")
         key = key[:shared] + data[at : at + fresh]
         yield key, data[at + fresh : at + fresh + length]
         at += fresh + length
@@ -138,7 +134,7 @@ def _message(data: bytes) -> _Fields:
             case 5:  # a checksum
                 at += 4
             case _:
-                raise BrokenFileError("an entry is not a protocol buffer")
+                raise InputError("an entry is not a protocol buffer")
     return fields
 
 
@@ -146,7 +142,7 @@ def _last(fields: _Fields, number: int) -> int:
     """A number; 0 if it is absent."""
     value = fields.get(number, [0])[-1]
     if not isinstance(value, int) or value >= 1 << 63:
-        raise BrokenFileError("a size is not a number")
+        raise InputError("a size is not a number")
     return value
 
 
@@ -158,4 +154,4 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         at += 1
         if data[at - 1] < 128:
             return value, at
-    raise BrokenFileError("a number without end")
+    raise InputError("a number without end")
