@@ -10,7 +10,6 @@ import click
 
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json, progress_bar
-from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.networks import MeasuredLayer
@@ -79,9 +78,8 @@ def layers(model: str, checkpoint: Path | None, every: bool, as_json: bool) -> N
     """
     from pnpdepth_cli.commands.networks import list_layers
 
-    choice = NetworkChoice(model=model, checkpoint=checkpoint)
     with progress_bar("layers", "layer") as show:
-        listed = list_layers(choice, every=every, on_layer=show)
+        listed = list_layers(model, checkpoint, every=every, on_layer=show)
     if as_json:
         print_json([asdict(layer) for layer in listed])
         return

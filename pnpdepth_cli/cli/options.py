@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice, RefineRequest
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
@@ -77,7 +77,7 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
 
 def refinement(*, without: Collection[str] = ()) -> Decorator:
     """Returns a decorator that adds the options of a `RefineRequest`, but those of some fields."""
-    groups = (ScanOptions, ReadOptions, NetworkChoice, Settings, RefineRequest)
+    groups = (ScanOptions, ReadOptions, Settings, RefineRequest)
 
     def decorate(command: Command) -> Command:
         return models(options_of_groups(*groups, without=["model", *without])(command))
@@ -87,7 +87,7 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
 
 _DECLARED = {
     each.name: each
-    for group in (BatchRequest, RefineRequest, Settings, ReadOptions, NetworkChoice)
+    for group in (BatchRequest, RefineRequest, Settings, ReadOptions)
     for each in options_of(group)
 }
 _MODEL = _DECLARED["model"]

@@ -20,11 +20,7 @@ from click.core import ParameterSource
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, print_json, progress_bar, say
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine_request import (
-    NetworkChoice,
-    RefineRequest,
-    parse_sample,
-)
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
 from pnpdepth_cli.settings import Settings
@@ -34,6 +30,7 @@ if TYPE_CHECKING:
 
 DEFAULT = "default"
 """A value that leaves the option out."""
+_NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
 _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
@@ -53,7 +50,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *("--sparse", "--sparse-mask", "--min-confidence", "--gt"),
             *(ScanOptions, ReadOptions),
         ),
-        "Network": (NetworkChoice,),
+        "Network": _NETWORK,
         "Method": (Settings, "--uncertainty", "--holdout"),
         "Output": ("--output", RefineRequest, "--json"),
     },
@@ -124,7 +121,7 @@ def refine(as_json: bool, **values: Any) -> None:
         ),
         "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
         "Input": (ScanOptions, ReadOptions),
-        "Network": (NetworkChoice,),
+        "Network": _NETWORK,
         "Method": (Settings, "--baselines", "--uncertainty", "--holdout"),
         "Study": ("--vary",),
         "Output": ("--output", RefineRequest, BatchRequest),

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from pnpdepth_cli.commands.refinement.refine_request import NetworkChoice
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.errors import (
@@ -147,7 +146,8 @@ class MeasuredLayer:
 
 
 def list_layers(
-    choice: NetworkChoice,
+    model: str,
+    checkpoint: Path | None,
     *,
     every: bool,
     on_layer: Callable[[int, int], None] = lambda done, of: None,
@@ -157,7 +157,8 @@ def list_layers(
     They are in the order of the definition, or of the network's submodules.
 
     Args:
-        choice: The network, its weights and device.
+        model: The network.
+        checkpoint: Its weights.
         every: Whether all submodules are listed, not only the layers of the definition.
         on_layer: Callback after each layer with the number of layers done and of all.
 
@@ -165,7 +166,7 @@ def list_layers(
         UsageError: The definition lists no layers.
         ModelError, DeviceError: As in loading.
     """
-    network = load_network(choice.model, choice.checkpoint, choice.device)
+    network = load_network(model, checkpoint)
     submodules = [name for name, _ in network.module.named_modules() if name]
     names = submodules if every else list(network.definition.layers)
     if not names:

@@ -99,13 +99,16 @@ def make_folder(folder: Path, *, below: Path | None = None) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Removes what killed writers left, while nobody writes there; returns how many there were."""
-    leftovers = [path for path in folder.glob(".*") if _TEMPORARY.fullmatch(path.name)]
-    for path in leftovers:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+    """Removes what killed writers left in it and below, while nobody writes; returns how many."""
+    leftovers = [path for path in folder.rglob(".*") if _TEMPORARY.fullmatch(path.name)]
+    try:
+        for path in leftovers:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
     return len(leftovers)
 
 

@@ -95,7 +95,7 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
     first = read_requested(lessons[0])
     if why := too_little(len(lessons), first):
         return why
-    choice = lessons[0].network
+    choice = lessons[0]
     network = load_network(choice.model, choice.checkpoint, choice.device)
     network = resolve_definition(network, first.registered())
     frames = ((each.files.name, read_requested(each)) for each in lessons)

@@ -144,7 +144,7 @@ class BatchRequest:
             raise UsageError("--html-3d adds to the report; name its folder with --html")
         if self.pose_kind is not None and self.poses is None:
             raise UsageError("--pose-kind is for --poses")
-        if self.ray is not None and self.refine.network.device not in ("cpu", "cuda"):
+        if self.ray is not None and self.refine.device not in ("cpu", "cuda"):
             raise UsageError("--ray computes on --device cpu, or on all GPUs with --device cuda")
         choose_measures(MEASURES, self.columns)
 

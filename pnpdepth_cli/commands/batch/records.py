@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,13 +34,12 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_of
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.atomic import LOCKS, cannot_write, make_folder, remove_leftovers
+from pnpdepth_cli.io.atomic import LOCKS, make_folder
 from pnpdepth_cli.io.file_bytes import (
-    Fingerprint,
+    fingerprint,
     is_unchanged,
     plain,
     read_bytes,
-    sha256_of,
     write_json,
 )
 from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
@@ -98,39 +96,38 @@ class Records:
                     " names another folder"
                 )
 
-    def reason_to_refine(self, frame: FrameFiles) -> str | None:
-        """Returns why a frame is to be refined; None if it is done with its settings and files."""
-        # The record.
-        request, outputs = request_of(self.request, frame), self.outputs_of(frame)
+    def find(self, frame: FrameFiles) -> FrameRecord | str:
+        """Returns the record of a frame with its present settings, or why there is none."""
+        outputs = self.outputs_of(frame)
         if not outputs["record"].exists():
             return "interrupted" if any(path.exists() for path in outputs.values()) else "new"
-        record = _read(outputs["record"])
-        if record is None:
+        try:
+            record = FrameRecord.read(outputs["record"])
+        except InputError:
             return "record damaged"
-        if record.status == "failed" and record.batch is not None:
+        present = self._digest(request_of(self.request, frame))
+        return record if record.batch and record.batch.settings == present else "other settings"
+
+    def reason_to_refine(self, frame: FrameFiles) -> str | None:
+        """Returns why a frame is to be refined; None if it is done with its settings and files."""
+        record = self.find(frame)
+        if isinstance(record, str):
+            return record
+        if record.batch is None or record.status == "failed":
             return "failed before"
-        if record.batch is None or record.batch.settings != self._digest(request):
-            return "other settings"
         # The files that were read, and those that were written.
-        inputs, known = dict(input_files(request)), record.batch.inputs
+        inputs, known = dict(input_files(request_of(self.request, frame))), record.batch.inputs
         if known.keys() != inputs.keys():
             return "other input files"
         if not all(is_unchanged(path, known[part]) for part, path in inputs.items()):
             return "input changed"
-        there = all(path.exists() for kind, path in outputs.items() if kind not in _IMAGES)
-        return None if there else "result missing"
+        written = [path for kind, path in self.outputs_of(frame).items() if kind not in _IMAGES]
+        return None if all(path.exists() for path in written) else "result missing"
 
-    def record_of(self, frame: FrameFiles) -> FrameRecord | None:
-        """Returns the record of a frame with its present settings; None if there is none."""
-        record = _read(self.outputs_of(frame)["record"])
-        if record is None or record.batch is None:
-            return None
-        present = self._digest(request_of(self.request, frame))
-        return record if record.batch.settings == present else None
-
-    def state(self, request: RefineRequest, inputs: Mapping[str, Fingerprint]) -> BatchState:
-        """Returns by what a frame is known to be done: its settings, and the files by part."""
-        return BatchState(settings=self._digest(request), inputs=dict(inputs))
+    def state(self, request: RefineRequest) -> BatchState:
+        """Returns by what a frame is known to be done: its settings, and the files as they are."""
+        inputs = {part: fingerprint(path) for part, path in input_files(request)}
+        return BatchState(settings=self._digest(request), inputs=inputs)
 
     def fail(self, request: RefineRequest, message: str) -> FrameRecord:
         """Writes a record that says why a frame failed, and returns it."""
@@ -140,7 +137,7 @@ class Records:
             group=files.group,
             status="failed",
             message=message,
-            batch=self.state(request, {}),
+            batch=BatchState(settings=self._digest(request)),
             inputs={part: FileRecord(path=str(path)) for part, path in input_files(request)},
         )
         path = self.outputs_of(files)["record"]
@@ -159,18 +156,14 @@ class Records:
 
 def _settings_of(request: RefineRequest) -> dict[str, object]:
     """The settings that decide a frame's result, in JSON's own types."""
-    groups = [vars(getattr(request, name)) for name in GROUPS]
-    own = {name: value for name, value in vars(request).items() if name not in GROUPS}
-    values = {
-        name: value
-        for group in (*groups, own)
-        for name, value in group.items()
-        if name not in _NO_SETTINGS
-    }
+    values = dict[str, object]()
+    for name, value in vars(request).items():
+        values |= vars(value) if name in GROUPS else {name: value}
+    values = {name: value for name, value in values.items() if name not in _NO_SETTINGS}
     if neighbours := request.files.neighbours:
         values["neighbours"] = [(other.motion, other.apart) for other in neighbours]
     # Devices of one kind give equal results, so shards may use one each.
-    values["device"] = request.network.device.split(":")[0]
+    values["device"] = request.device.split(":")[0]
     scan = asdict(request.reading.scan).items()
     values["scan"] = {name: value for name, value in scan if name not in _NO_SETTINGS}
     return dict(plain(values))
@@ -178,14 +171,14 @@ def _settings_of(request: RefineRequest) -> dict[str, object]:
 
 def _code_of(request: RefineRequest) -> dict[str, object]:
     """The program's version, and names and digests of the networks' and the user's own files."""
-    network, method = request.network, vars(request.method).values()
+    method = vars(request.method).values()
     code = [value for value in method if isinstance(value, str) and value.endswith(".py")]
-    files = [_identity(spec) for spec in (network.model, *network.more_models, *code)]
+    files = [_identity(spec) for spec in (request.model, *request.more_models, *code)]
     return {
         "version": __version__,
         "model": files[0][0],
         "files": files,
-        "checkpoint": network.checkpoint and _identity(str(network.checkpoint)),
+        "checkpoint": request.checkpoint and _identity(str(request.checkpoint)),
     }
 
 
@@ -194,23 +187,7 @@ def _identity(spec: str) -> tuple[str, str | None]:
     path, part = file_and_part(Path(spec))
     if not path.exists():
         return spec, None
-    return f"{path.name}:{part}".rstrip(":"), sha256_of(path)
-
-
-def remove_all_leftovers(output: Path) -> int:
-    """Removes the half-written files of a killed run below the folder; returns how many."""
-    try:
-        return sum(remove_leftovers(Path(folder)) for folder, _, _ in os.walk(output))
-    except OSError as error:
-        raise cannot_write(output, error) from error
-
-
-def _read(path: Path) -> FrameRecord | None:
-    """The record in a file; None if there is none, or it is damaged."""
-    try:
-        return FrameRecord.read(path)
-    except InputError:
-        return None
+    return f"{path.name}:{part}".rstrip(":"), fingerprint(path).sha256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,11 +243,11 @@ def write_summary(
         "pending": len(found.frames) - len(records),
     }
     # Weights of the networks.
-    weights = defaultdict[str, list[float]](list)
-    for record in results:
-        for name, weight in record.weights.items():
-            weights[name].append(weight)
-    means = {name: sum(of_frames) / len(of_frames) for name, of_frames in weights.items()}
+    weights = {}
+    for name in dict.fromkeys(name for record in results for name in record.weights):
+        own = [record.weights[name] for record in results if name in record.weights]
+        weights[name] = {"mean": sum(own) / len(own), "least": min(own), "largest": max(own)}
+    means = {name: weight["mean"] for name, weight in weights.items()}
     summary = BatchSummary(
         source=str(request.source),
         output=str(request.output),
@@ -283,10 +260,7 @@ def write_summary(
         notes=_notes([record for record in results if GT in record.errors]),
         errors=_means(results),
         titles=stage_titles(replace(results[0], weights=means)) if results else {},
-        weights={
-            name: {"mean": means[name], "least": min(all_), "largest": max(all_)}
-            for name, all_ in weights.items()
-        },
+        weights=weights,
         frame_notes=_frame_notes(results),
         unmatched=[str(each) for each in found.unmatched],
         varied=dict(request.varied),

@@ -10,16 +10,11 @@ from dataclasses import replace
 from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames
-from pnpdepth_cli.commands.batch.records import (
-    BatchSummary,
-    Records,
-    remove_all_leftovers,
-    write_summary,
-)
+from pnpdepth_cli.commands.batch.records import BatchSummary, Records, write_summary
 from pnpdepth_cli.commands.pipeline import in_order
 from pnpdepth_cli.commands.tables import count_of, names_of_depths
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder
+from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _MAX_LISTED = 5
@@ -56,7 +51,7 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         own.check_new(found.chosen)
     make_folder(request.output)
     with lock_folder(request.output, request.shard):
-        if request.shard is None and (leftovers := remove_all_leftovers(request.output)):
+        if request.shard is None and (leftovers := remove_leftovers(request.output)):
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
         # Those that are not done are refined; the frames of a sequence may have adapted weights.
         of_frame = dict.fromkeys([frame.name for frame in found.frames], own)
@@ -75,9 +70,10 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
             with closing(refining) as records:
                 _follow(records, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
-        known = in_order(lambda f: of_frame[f.name].record_of(f), found.frames, _READERS)
         with in_turn(request.output):
-            return write_summary(request, found, own.settings, [*filter(None, known)])
+            known = in_order(lambda f: of_frame[f.name].find(f), found.frames, _READERS)
+            results = [record for record in known if isinstance(record, FrameRecord)]
+            return write_summary(request, found, own.settings, results)
 
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:

@@ -24,13 +24,13 @@ from typing import Any
 
 from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
 from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, Listener
-from pnpdepth_cli.commands.batch.find_frames import input_files, request_of
+from pnpdepth_cli.commands.batch.find_frames import request_of
 from pnpdepth_cli.commands.batch.records import Records
 from pnpdepth_cli.commands.pipeline import THREADS, in_order, timed
 from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import (
     DeviceError,
     InputError,
@@ -41,7 +41,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.io.file_bytes import Fingerprint, fingerprint, one_line
+from pnpdepth_cli.io.file_bytes import one_line
 
 DECIDING = 16
 """Number of frames that decide together how images are moved to the points."""
@@ -132,7 +132,7 @@ class _Work:
 
     request: RefineRequest
     seconds: dict[str, float] = field(default_factory=dict)
-    inputs: dict[str, Fingerprint] = field(default_factory=dict)
+    state: BatchState | None = None
     frame: Frame | None = None
     refined: Refined | None = None
     error: Exception | None = None
@@ -163,8 +163,7 @@ def _refine_frames(
     def read(files: FrameFiles) -> _Work:
         work = _Work(request=request_of(records.request, files))
         with work.step("read"):
-            parts = input_files(work.request)
-            work.inputs |= {part: fingerprint(path) for part, path in parts}
+            work.state = records.state(work.request)
             work.frame = read_requested(work.request)
         return work
 
@@ -185,30 +184,24 @@ def _refine_frames(
             yield work
 
     def write(work: _Work) -> FrameRecord:
-        return _write(work, method, records)
+        request, error = work.request, work.error
+        if work.refined is not None and work.frame is not None and method is not None:
+            try:
+                return write_refined(
+                    request, records.outputs_of(request.files), method, work.frame, work.refined,
+                    work.seconds, batch=work.state, folder=records.request.output,
+                )  # fmt: skip
+            except StorageError:
+                raise
+            except Exception as failure:
+                error = failure
+        return records.fail(request, _message(error))
 
     with (
         closing(in_order(read, frames, THREADS)) as reading,
         closing(in_order(write, refine(reading), THREADS)) as done,
     ):
         yield from done
-
-
-def _write(work: _Work, method: Method | None, records: Records) -> FrameRecord:
-    """Writes a frame's results, or why there are none; returns the record."""
-    request, error = work.request, work.error
-    if work.refined is not None and work.frame is not None and method is not None:
-        try:
-            return write_refined(
-                request, records.outputs_of(request.files), method, work.frame, work.refined,
-                work.seconds, batch=records.state(request, work.inputs),
-                folder=records.request.output,
-            )  # fmt: skip
-        except StorageError:
-            raise
-        except Exception as failure:
-            error = failure
-    return records.fail(request, _message(error))
 
 
 def _message(error: Exception | None) -> str:
@@ -314,11 +307,11 @@ def _plan(
 ) -> tuple[int, Callable[[], Any]]:
     """Returns the number of devices of the cluster, and a function that starts a worker on one."""
     # A GPU has its share of the cores; Ray has libraries use as many threads.
-    network, total = records.request.refine.network, ray.cluster_resources()
-    gpus = network.device == "cuda"
+    device, total = records.request.refine.device, ray.cluster_resources()
+    gpus = device == "cuda"
     devices = int(total.get("GPU" if gpus else "CPU", 0))
     if not devices:
-        raise DeviceError(f"the Ray cluster has no device {network.device}; change --device")
+        raise DeviceError(f"the Ray cluster has no device {device}; change --device")
     cores = max(1, int(total["CPU"] // devices)) if gpus else 1
     actor = ray.remote(Worker).options(
         num_cpus=cores, num_gpus=int(gpus), scheduling_strategy="SPREAD"

@@ -93,12 +93,10 @@ def load_method(
         UsageError: The request combines what cannot be combined.
         ModelError: The network cannot be loaded.
     """
-    choice = request.network
-    chosen = [(choice.model, choice.checkpoint), *((spec, None) for spec in choice.more_models)]
-    networks = [load_network(spec, checkpoint, choice.device) for spec, checkpoint in chosen]
-    networks[0] = with_input_range(networks[0], choice.normalise)
+    own = load_network(request.model, request.checkpoint, request.device)
+    others = [load_network(model, None, request.device) for model in request.more_models]
     return Method(
-        networks,
+        [with_input_range(own, request.normalise), *others],
         request.method,
         first,
         more,
@@ -178,7 +176,7 @@ def _record_of(
         camera=CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
         model=ModelRecord(
             name=network.definition.name,
-            spec=request.network.model,
+            spec=request.model,
             checkpoint=str(weights) if weights else None,
             checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
         ),

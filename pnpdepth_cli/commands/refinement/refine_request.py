@@ -20,14 +20,17 @@ from pnpdepth_cli.settings import Settings, option
 Outputs = Mapping[str, Path]
 """The files of a result by kind: depth, sigma, preview, …, and last its record."""
 
-GROUPS = ("files", "reading", "network", "method")
+GROUPS = ("files", "reading", "method")
 """Fields of a `RefineRequest` that hold fields."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkChoice:
-    """Which network, with which weights, and where it runs."""
+class RefineRequest:
+    """Everything the user asks of the refinement of one frame."""
 
+    files: FrameFiles = field(default_factory=FrameFiles)
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    # Which network, with which weights, and where it runs.
     model: str = option(
         "compact",
         "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
@@ -47,22 +50,9 @@ class NetworkChoice:
         "  [default: the network's, else the one that fits best]",
         choices=choices.NORMALISATIONS,
     )
-    device: str = option(
-        "cpu",
-        "cpu, cuda, cuda:1, mps, …",
-        metavar="NAME",
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefineRequest:
-    """Everything the user asks of the refinement of one frame."""
-
-    files: FrameFiles = field(default_factory=FrameFiles)
-    reading: ReadOptions = field(default_factory=ReadOptions)
-    network: NetworkChoice = field(default_factory=NetworkChoice)
+    device: str = option("cpu", "cpu, cuda, cuda:1, mps, …", metavar="NAME")
+    # How it is refined; what is measured and estimated.
     method: Settings = field(default_factory=Settings)
-    # What is measured and estimated.
     baselines: bool = option(False, "Also print every baseline, such as linear interpolation.")
     uncertainty: bool = option(
         False, "Write the depth's standard deviation and a mask of valid depth."
@@ -72,9 +62,7 @@ class RefineRequest:
     output: Path | None = None
     """A folder, or one depth file. None: a folder named after the image."""
     format: str = option(
-        "png",
-        "Format of the depth file in an output folder.",
-        choices=choices.FORMATS,
+        "png", "Format of the depth file in an output folder.", choices=choices.FORMATS
     )
     unknown: str = option(
         "keep",

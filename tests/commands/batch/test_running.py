@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.batch.batch_request import parse_address
-from pnpdepth_cli.commands.batch.records import remove_all_leftovers
 from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
+from pnpdepth_cli.io.atomic import remove_leftovers
 from tests.commands.batches import RecordingListener, add_frame, batch, pairs_on_disk, results
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
@@ -60,7 +60,7 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
     assert sorted(listener.names) == list(NAMES)
     assert result.counts["done"] == len(NAMES)
-    remove_all_leftovers(root / "out")  # of the worker that died, as the next run does
+    remove_leftovers(root / "out")  # of the worker that died, as the next run does
     batch(root, output=root / "plain")
     assert results(root / "out") == results(root / "plain")
 
