@@ -39,6 +39,8 @@ class ExportFrame:
 
     result: ResultFrame
     image: ImageSource
+    image_path: Path
+    """The image in the output folder, or where it is copied to: programs read it there."""
     image_name: str
     """Path of the image below the folder of images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
@@ -59,25 +61,15 @@ class ExportFrame:
         depth, valid = self.result.read()
         return np.where(valid, depth, np.float32(0))
 
-    def image_in(self, folder: Path) -> Path:
-        """Returns the image in this folder, or where it is copied to: programs read it there."""
-        image = self.image
-        if isinstance(image, Path) and image.resolve().is_relative_to(folder.resolve()):
-            return image
-        return folder / "images" / self.image_name
-
-    def copy_image(self, folder: Path) -> None:
-        """Copies the image into the folder, unless it lies there."""
+    def copy_image(self) -> None:
+        """Writes the image to its path."""
         from PIL import Image
 
-        path, image = self.image_in(folder), self.image
-        if path == image:
-            return
-        with atomic_path(path) as temporary:
-            if isinstance(image, Path):
-                shutil.copyfile(image, temporary)
+        with atomic_path(self.image_path) as temporary:
+            if isinstance(self.image, Path):
+                shutil.copyfile(self.image, temporary)
             else:
-                pixels = np.rint(255 * read_image(image)).astype(np.uint8)
+                pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
                 Image.fromarray(pixels).save(temporary, "PNG")
 
     def start_points(self, frames: int) -> PointCloud:
@@ -106,11 +98,8 @@ class Export:
     in_model_units: bool = True
     """Whether the files are in units of the COLMAP model, if there is one; else in those of the
     results."""
-
-
-def copied_images(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    """Returns where images are copied to, of those that do not lie in the folder."""
-    return [path for f in frames if (path := f.image_in(folder)) != f.image]
+    copies_images: bool = False
+    """Whether images that do not lie in the folder are copied there."""
 
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
@@ -149,12 +138,13 @@ def export_results(
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     # The results, all in one unit.
-    frames = [_frame(result, export) for result in result_frames(results)]
+    frames = [_frame(result, export, output) for result in result_frames(results)]
     units = sorted({f"{f.result.record.unit} (unit-scale {f.unit_scale:g})" for f in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
     # Files of different names, none of which is there.
-    written = export.files(output, frames)
+    copied = [f for f in frames if export.copies_images and f.image_path != f.image]
+    written = [*(frame.image_path for frame in copied), *export.files(output, frames)]
     if len(set(written)) < len(written):
         raise InputError(f"{results}: two frames have one image name; refine them again")
     check_outputs(written, overwrite=overwrite)
@@ -164,13 +154,15 @@ def export_results(
     numbers = itertools.count(1)
     show(0, len(frames))
     with all_or_none(written):
+        for frame in copied:
+            frame.copy_image()
         notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
     of_model = export.in_model_units and frames[0].unit_scale != 1
     unit = MODEL_UNITS if of_model else frames[0].result.record.unit
     return f"{count_of(len(frames), 'frame')} in {unit}", notes
 
 
-def _frame(result: ResultFrame, export: Export) -> ExportFrame:
+def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
     # What the program needs must be in the record.
     if camera is None:
@@ -195,9 +187,13 @@ def _frame(result: ResultFrame, export: Export) -> ExportFrame:
             f"{result.depth} is not of the size of {image}; refine the whole image"
             " (--protocol whole)"
         )
+    path = output / "images" / name
+    if isinstance(image, Path) and image.resolve().is_relative_to(output.resolve()):
+        path = image
     return ExportFrame(
         result=result,
         image=image,
+        image_path=path,
         image_name=name,
         size=(height, width),
         camera=camera,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, copied_images, distortion_note
+from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
@@ -29,6 +29,7 @@ from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
 
 _CODES = 2**16
+_PARAMETERS = "depth_params.json"
 _OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"
 _NEAREST_PERCENTILE = 99.9
 """Percentile of an image's inverse depth, so that few near pixels do not set the scale."""
@@ -38,21 +39,22 @@ def _depth_image(folder: Path, frame: ExportFrame) -> Path:
     return folder / "inverse_depths" / f"{frame.stem}.png"
 
 
-def _parameters(folder: Path) -> Path:
-    return folder / "sparse" / "0" / "depth_params.json"
+def _model(folder: Path) -> Path:
+    return folder / "sparse" / "0"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    images = [_depth_image(folder, frame) for frame in frames]
-    model = [_parameters(folder).with_name(f"{part}.txt") for part in MODEL_PARTS]
-    written = [*copied_images(folder, frames), *images, _parameters(folder)]
-    return [*written, *model] if _needs_model(folder, frames) else written
+    names = [_PARAMETERS]
+    if _needs_model(folder, frames):
+        names += [f"{part}.txt" for part in MODEL_PARTS]
+    depths = (_depth_image(folder, frame) for frame in frames)
+    return [*depths, *(_model(folder) / name for name in names)]
 
 
 def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
     """Whether no other's model is in sparse/0/, and one without distortion can be made."""
     usable = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
-    there = model_files(_parameters(folder).parent)
+    there = model_files(_model(folder))
     return usable and (not there or there[0].read_bytes().startswith(_OURS))
 
 
@@ -61,9 +63,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
-    model = _parameters(folder).parent
     if _needs_model(folder, frames):
-        _write_model(model, frames)
+        _write_model(_model(folder), frames)
     # Depth and image of each frame.
     masked, clipped, largest = 0, 0, scale * LARGEST_CODE / _CODES
     for frame in frames:
@@ -72,18 +73,17 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         clipped += int((inverse > largest).sum())
         fitting = np.clip(inverse, scale / _CODES, largest).astype(np.float32)
         write_depth(_depth_image(folder, frame), fitting, scale=_CODES / scale)
-        frame.copy_image(folder)
         done()
     # What the program reads the codes with.
     parameters = {"scale": float(scale), "offset": 0.0}
-    write_json(_parameters(folder), {frame.stem: parameters for frame in frames})
+    write_json(_model(folder) / _PARAMETERS, {frame.stem: parameters for frame in frames})
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
         notes.append(
             f"warning: {masked:,} pixels are unknown or not valid; they have the depth before"
             " the mask or that of the nearest pixel, as 3DGS reads no masks"
         )
-    if not model_files(model):
+    if not model_files(_model(folder)):
         notes.append(
             "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"
             " with poses"
@@ -127,4 +127,4 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
             temporary.write_text("".join(text), encoding="utf-8", newline="\n")
 
 
-EXPORT = Export(needs_pose=False, files=_files, write=_write)
+EXPORT = Export(needs_pose=False, files=_files, write=_write, copies_images=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli.commands.exports import Export, ExportFrame, copied_images
+from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.file_bytes import write_json
@@ -24,20 +24,20 @@ from pnpdepth_cli.io.scans import write_cloud
 
 _CODES_PER_UNIT = 1000.0
 _START = "start.ply"
-_COEFFICIENTS = {
-    "radial-tangential": ("k1", "k2", "p1", "p2", "k3", "k4"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
+_LENSES = {
+    "radial-tangential": ("OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4")),
+    "fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
-_MODELS = {"radial-tangential": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+"""Nerfstudio's model of each lens, and the names of its coefficients."""
 
 
-def _depth_image(folder: Path, frame: ExportFrame) -> Path:
-    return folder / "depths" / f"{frame.stem}.png"
+def _depth_image(frame: ExportFrame) -> str:
+    return f"depths/{frame.stem}.png"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
-    depths = [_depth_image(folder, frame) for frame in frames]
-    return [*copied_images(folder, frames), *depths, folder / _START, folder / "transforms.json"]
+    names = [*map(_depth_image, frames), _START, "transforms.json"]
+    return [folder / name for name in names]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
@@ -56,13 +56,12 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         depth = frame.valid_depth()
         fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
         clipped += int((~fits).sum())
-        write_depth(_depth_image(folder, frame), np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
-        frame.copy_image(folder)
+        write_depth(folder / _depth_image(frame), np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
         done()
     write_cloud(folder / _START, start)
     # Cameras and poses.
     content = {
-        "camera_model": _MODELS[lenses[0]],
+        "camera_model": _LENSES[lenses[0]][0],
         "enable_depth_loading": True,
         "integer_depth_scale": 1 / _CODES_PER_UNIT,
         "ply_file_path": _START,
@@ -80,24 +79,24 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     # The coefficients of the lens, if the program has all of them.
     camera, pose = frame.camera, frame.pose
     assert pose is not None
-    names = _COEFFICIENTS[camera.lens]
+    _, names = _LENSES[camera.lens]
     values = dict(zip(names, camera.distortion, strict=False))
     if any(camera.distortion[len(names) :]):
         raise InputError(
             f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
             f" {len(camera.distortion)} coefficients); undistort the images first"
         )
+    image = os.path.relpath(frame.image_path.resolve(), folder.resolve())
     # The pose, with Nerfstudio's axes: y up, z backwards.
-    depth = _relative(_depth_image(folder, frame), folder)
     matrix = np.eye(4)
     matrix[:3] = pose
     matrix[:3, 1:3] *= -1
     # Principal points count from the image's corner.
     intrinsics = camera.intrinsics
     return {
-        "file_path": _relative(frame.image_in(folder), folder),
-        "depth_file_path": depth,
-        "depth_path": depth,
+        "file_path": Path(image).as_posix(),
+        "depth_file_path": _depth_image(frame),
+        "depth_path": _depth_image(frame),
         "transform_matrix": matrix.tolist(),
         "w": frame.size[1],
         "h": frame.size[0],
@@ -109,8 +108,6 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     }
 
 
-def _relative(path: Path, folder: Path) -> str:
-    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-
-
-EXPORT = Export(needs_pose=True, files=_files, write=_write, in_model_units=False)
+EXPORT = Export(
+    needs_pose=True, files=_files, write=_write, in_model_units=False, copies_images=True
+)

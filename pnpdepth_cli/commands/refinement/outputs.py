@@ -16,20 +16,15 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.completion.interpolation import in_hull
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
-from pnpdepth_cli.io.formats import LARGEST_CODE, format_of_suffix
+from pnpdepth_cli.io.formats import KITTI_SCALE, LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.io.visualisation import depth_scale, improvement, preview, write_mask
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
-
-Image = NDArray[np.float32]
-
-INTEGER_SCALE = 256.0
-"""KITTI's codes per metre, for points that have none of their own and fit."""
 
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
@@ -99,10 +94,10 @@ def output_scale(inputs: Frame) -> float:
         return inputs.depth_scale
     nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
     finest = LARGEST_CODE / (_BEYOND_POINTS * farthest)
-    if nearest * INTEGER_SCALE >= _LEAST_CODES and finest >= INTEGER_SCALE:
-        return INTEGER_SCALE
-    power = _power_of_ten(finest)
-    return power if finest < INTEGER_SCALE else max(power, INTEGER_SCALE)
+    if finest < KITTI_SCALE:
+        return _power_of_ten(finest)
+    is_exact = nearest * KITTI_SCALE >= _LEAST_CODES
+    return KITTI_SCALE if is_exact else max(_power_of_ten(finest), KITTI_SCALE)
 
 
 def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Refined:
@@ -112,10 +107,9 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     """
     if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, after=np.where(frame.valid, frame.after, np.float32(0)))
-    source = inputs.sources.get("sparse")
-    if frame.valid is not None or source is None:
-        return frame
-    if not (source.calibration or scan_pattern(frame.used.xy, frame.used.size)):
+    source = inputs.sources["sparse"]
+    is_scan = source.calibration or scan_pattern(frame.used.xy, frame.used.size)
+    if frame.valid is not None or not is_scan:
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
     note = (
@@ -162,7 +156,8 @@ def write_outputs(
         made_by: Names of what made the depth before and the depth after, for the preview.
     """
     # The image as it was refined.
-    image = replace(inputs, register=frame.registration).registered().image
+    inputs = replace(inputs, register=frame.registration).registered()
+    image = inputs.image
     # Depth, its standard deviation, and where it is valid.
     write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
     if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
@@ -180,11 +175,11 @@ def write_outputs(
             image, frame.before, frame.after, inputs.gt, outputs["improvement"], inputs.unit
         )
     if "view" in outputs:
-        _write_view(outputs["view"], image, inputs, frame)
+        _write_view(outputs["view"], inputs, frame)
     return figures
 
 
-def _write_sigma(path: Path, sigma: Image) -> None:
+def _write_sigma(path: Path, sigma: DepthMap) -> None:
     """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
     scale = _power_of_ten(LARGEST_CODE / max(float(sigma.max()), 1e-9))
     depth_format = format_of_suffix(path.suffix)
@@ -193,7 +188,7 @@ def _write_sigma(path: Path, sigma: Image) -> None:
     write_depth(path, sigma, scale=scale)
 
 
-def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) -> None:
+def _write_view(path: Path, inputs: Frame, frame: Refined) -> None:
     """Writes the 3D view for a report: depths, the ground truth if known, colours and camera.
 
     Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than
@@ -207,12 +202,10 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
     thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     maps = {"before": frame.before, "after": frame.after}
     maps |= {} if inputs.gt is None else {"gt": inputs.gt}
-    depths = {
-        name: np.where(kept_pixels(depth, frame.valid if name == "after" else None), depth, 0)[
-            thinned
-        ]
-        for name, depth in maps.items()
-    }
+    depths = {}
+    for name, depth in maps.items():
+        keep = frame.valid if name == "after" else None
+        depths[name] = np.where(kept_pixels(depth, keep), depth, 0)[thinned]
     # Their range, and the rays of the camera.
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
@@ -231,7 +224,7 @@ def _write_view(path: Path, image: Image | None, inputs: Frame, frame: Refined) 
             "unit": inputs.unit,
             "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
-            "colours": _text(_colours(image, frame)[thinned], "|u1"),
+            "colours": _text(_colours(inputs.image, frame)[thinned], "|u1"),
         },
     )
 
@@ -250,7 +243,7 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
     return rays_of(camera, xy.reshape(-1, 2)).reshape(xy.shape)
 
 
-def _colours(image: Image | None, frame: Refined) -> NDArray[np.uint8]:
+def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.uint8]:
     """(H, W, 3) of the image, or of the depth where there is none."""
     if image is not None:
         return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

@@ -217,26 +217,51 @@ def _record_of(
 
 def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
     """The errors of each stage and of linear interpolation, by each basis that the frame has."""
-    gt, errors = frame.gt, dict[str, Stages]()
-    maps, beside = {BEFORE: refined.before, AFTER: refined.after}, dict[str, DepthMap]()
-    if gt is not None or len(refined.held_out):
-        beside[LINEAR] = linear(frame.points).numpy()
-    at_held_out = _at_points(refined.held_out, maps | beside)
+
+    def baselines(points: SparsePoints, before: Tensor) -> Iterator[tuple[str, Tensor]]:
+        """The prediction of each baseline but the linear one that does not fail on the frame."""
+        for name in BASELINES if with_baselines else ():
+            with suppress(ModelError):  # such as a line through points that are all equally far
+                if name != LINEAR:
+                    yield name, BASELINES[name](points, before)
+
+    errors, validation = dict[str, Stages](), refined.validation
+    before, after = torch.from_numpy(refined.before), torch.from_numpy(refined.after)
+    maps, beside = {BEFORE: before, AFTER: after}, dict[str, Tensor]()
+    if frame.gt is not None or len(refined.held_out):
+        beside[LINEAR] = linear(frame.points)
     # Against the truth, all others are scored on the pixels where the result is known.
-    if gt is not None:
-        if with_baselines:
-            others = _other_baselines(frame.points, torch.from_numpy(refined.before))
-            beside |= {name: depth.numpy() for name, depth in others}
-        known = np.where(refined.after > 0, gt, np.float32(0))
-        stages = {name: depth for name, depth in refined.stages.items() if name != BEFORE}
+    if frame.gt is not None:
+        gt = torch.from_numpy(frame.gt)
+        known = torch.where(after > 0, gt, 0)
+        stages = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+        scored = maps | stages | beside | dict(baselines(frame.points, before))
         errors[GT] = {
-            name: _scores(depth, gt if name == AFTER else known)
-            for name, depth in (maps | stages | beside).items()
+            name: score(depth, gt if name == AFTER else known).to_json()
+            for name, depth in scored.items()
         }
-    errors[HELD_OUT] = at_held_out
-    errors[VALIDATION] = _at_validation_points(refined, with_baselines=with_baselines)
+    errors[HELD_OUT] = _at_points(refined.held_out, maps | beside)
+    # At validation points, each is predicted without them.
+    if validation is not None:
+        others = baselines(validation.kept, validation.network)
+        predicted = {name: validation.points.sample(depth) for name, depth in others}
+        errors[VALIDATION] = {
+            name: {"mae": validation.error(at), "points": len(validation.points)}
+            for name, at in (dict(validation.predicted) | predicted).items()
+        }
     errors[USED] = _at_points(refined.used, maps)
     return {basis: stages for basis, stages in errors.items() if stages}
+
+
+def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
+    """The errors of depth maps (H, W) at points of the same image, where both are known."""
+    stages: Stages = {}
+    for name, depth in maps.items():
+        error = (points.sample(depth) - points.depth)[points.known_in(depth)].double()
+        if len(error):
+            mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
+            stages[name] = {"mae": mae, "rmse": rmse, "points": len(error)}
+    return stages if AFTER in stages and BEFORE in stages else {}
 
 
 def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:
@@ -250,41 +275,3 @@ def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:
     gains = gain(before, after, gt)
     known = gains[np.isfinite(gains)]
     return float((known > 0).mean()) if known.size else None
-
-
-def _other_baselines(points: SparsePoints, before: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """The prediction of each baseline but the linear one that does not fail on the frame."""
-    for name, baseline in BASELINES.items():
-        with suppress(ModelError):  # such as a line through points that are all equally far
-            if name != LINEAR:
-                yield name, baseline(points, before)
-
-
-def _scores(depth: DepthMap, gt: DepthMap) -> Scores:
-    """The errors of depth (H, W) against ground truth (H, W)."""
-    return score(torch.from_numpy(depth), torch.from_numpy(gt)).to_json()
-
-
-def _at_points(points: SparsePoints, maps: dict[str, DepthMap]) -> Stages:
-    """The errors of depth maps (H, W) at points of the same image, where both are known."""
-    stages: Stages = {}
-    for name, values in maps.items():
-        depth = torch.from_numpy(values)
-        error = (points.sample(depth) - points.depth)[points.known_in(depth)].double()
-        if not len(error):
-            continue
-        mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
-        stages[name] = {"mae": mae, "rmse": rmse, "points": len(error)}
-    return stages if AFTER in stages and BEFORE in stages else {}
-
-
-def _at_validation_points(refined: Refined, *, with_baselines: bool) -> Stages:
-    """The MAE of each stage, predicted without the validation points."""
-    validation = refined.validation
-    if validation is None:
-        return {}
-    predicted, count = dict(validation.predicted), len(validation.points)
-    if with_baselines:
-        others = _other_baselines(validation.kept, validation.network)
-        predicted |= {name: validation.points.sample(depth) for name, depth in others}
-    return {name: {"mae": validation.error(at), "points": count} for name, at in predicted.items()}
