@@ -39,6 +39,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import all_definitions
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
@@ -84,7 +85,8 @@ def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, 
     measured = {}
     for state, depth in depths.items():
         standard, fine = (
-            score(torch.from_numpy(depth), kept, *limits) for limits in ((), (FINE_THRESHOLDS,))
+            score(torch.from_numpy(depth), kept, with_thresholds(limits))
+            for limits in (DELTA_THRESHOLDS, FINE_THRESHOLDS)
         )
         measured[state] = {name: getattr(standard, name) for name in MEASURES[:3]}
         measured[state] |= {f"delta{k}": 100 * getattr(standard, f"delta{k}") for k in (1, 2, 3)}

@@ -23,7 +23,7 @@ from pnpdepth_cli.frames.frame import Refined as Refined
 from pnpdepth_cli.frames.frame import Registration
 from pnpdepth_cli.frames.refiner import Refiner as Refiner
 from pnpdepth_cli.frames.refiner import Unit, in_metres
-from pnpdepth_cli.measures import DELTA_THRESHOLDS
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.definition import Fixed as Fixed
 from pnpdepth_cli.models.definition import ModelDefinition as ModelDefinition
@@ -126,4 +126,4 @@ def score(
     if arrays[0].shape != arrays[1].shape:
         raise InputError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
     predicted, known = (torch.from_numpy(values) for values in arrays)
-    return score_tensors(predicted, known, thresholds)
+    return score_tensors(predicted, known, with_thresholds(thresholds))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from pnpdepth_cli.errors import UsageError
@@ -30,49 +30,37 @@ DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of δ1 to δ3 (Eigen et al. 2014). The paper's KITTI rows use 1.01^k."""
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """N scored pixels, (N,) float64 each; all depths are known and positive."""
+OfPixels = Callable[["Tensor", "Tensor"], "Tensor"]
+"""Function of N pixels that returns a scalar.
 
-    predicted: Tensor
-    """Metres."""
-    truth: Tensor
-    """Metres."""
-    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS
-    """Thresholds of δ1 to δ3."""
-
-    @cached_property
-    def error(self) -> Tensor:
-        """p − g, metres."""
-        return self.predicted - self.truth
-
-    @cached_property
-    def log_error(self) -> Tensor:
-        """log p − log g, natural logarithm."""
-        return self.predicted.log() - self.truth.log()
-
-    @cached_property
-    def inverse_error(self) -> Tensor:
-        """1/p − 1/g, 1/km."""
-        return 1000 / self.predicted - 1000 / self.truth
-
-    @cached_property
-    def ratio(self) -> Tensor:
-        """max(p/g, g/p)."""
-        return (self.predicted / self.truth).maximum(self.truth / self.predicted)
-
-
-OfPixels = Callable[[Pixels], "Tensor"]
-"""Function of N pixels that returns a scalar."""
+It takes predicted and true depth (N,) float64, all positive, in metres."""
 
 
 def _rms(values: Tensor) -> Tensor:
     return values.square().mean().sqrt()
 
 
-def _fraction_below(pixels: Pixels, number: int) -> Tensor:
-    """δ: the fraction of pixels whose ratio is below a threshold."""
-    return (pixels.ratio < pixels.thresholds[number - 1]).double().mean()
+def _mean_abs(values: Tensor) -> Tensor:
+    return values.abs().mean()
+
+
+def _log(p: Tensor, g: Tensor) -> Tensor:
+    return p.log() - g.log()
+
+
+def _inv(p: Tensor, g: Tensor) -> Tensor:
+    """1/p − 1/g, 1/km."""
+    return 1000 / p - 1000 / g
+
+
+def _silog(p: Tensor, g: Tensor) -> Tensor:
+    errors = _log(p, g)
+    return 100 * _rms(errors - errors.mean())
+
+
+def _delta(p: Tensor, g: Tensor, threshold: float) -> Tensor:
+    """The fraction of pixels whose ratio max(p/g, g/p) is below the threshold."""
+    return ((p / g).maximum(g / p) < threshold).double().mean()
 
 
 @dataclass(frozen=True)
@@ -143,25 +131,9 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
     return {key: total / count if count else None for key, (total, count) in sums.items()}
 
 
-MEASURES = (
-    Measure("rmse", "RMSE", unit="m", main=True, of_pixels=lambda p: _rms(p.error)),
-    Measure("mae", "MAE", unit="m", main=True, of_pixels=lambda p: p.error.abs().mean()),
-    Measure("mre", "MRE", main=True, of_pixels=lambda p: (p.error.abs() / p.truth).mean()),
-    Measure("sq_rel", "SqRel", unit="m", of_pixels=lambda p: (p.error.square() / p.truth).mean()),
-    Measure("log10", "log10", of_pixels=lambda p: 1 / math.log(10) * p.log_error.abs().mean()),
-    Measure("rmse_log", "RMSE log", of_pixels=lambda p: _rms(p.log_error)),
-    Measure("irmse", "iRMSE", unit="1/km", decimals=2, of_pixels=lambda p: _rms(p.inverse_error)),
-    Measure(
-        "imae", "iMAE", unit="1/km", decimals=2, of_pixels=lambda p: p.inverse_error.abs().mean()
-    ),
-    Measure(
-        "silog",
-        "SILog",
-        unit="100·log m",
-        decimals=2,
-        of_pixels=lambda p: 100 * _rms(p.log_error - p.log_error.mean()),
-    ),
-    *(
+def with_thresholds(thresholds: Sequence[float]) -> tuple[Measure, ...]:
+    """Returns `MEASURES` with other thresholds of δ1, δ2 and δ3."""
+    deltas = (
         Measure(
             f"delta{number}",
             f"δ{number}",
@@ -169,20 +141,35 @@ MEASURES = (
             percent=True,
             decimals=2,
             main=number == 1,
-            of_pixels=partial(_fraction_below, number=number),
+            of_pixels=partial(_delta, threshold=threshold),
         )
-        for number in (1, 2, 3)
-    ),
+        for number, threshold in enumerate(thresholds, 1)
+    )
+    return (*_ERRORS, *deltas)
+
+
+_ERRORS = (
+    Measure("rmse", "RMSE", "m", main=True, of_pixels=lambda p, g: _rms(p - g)),
+    Measure("mae", "MAE", "m", main=True, of_pixels=lambda p, g: _mean_abs(p - g)),
+    Measure("mre", "MRE", main=True, of_pixels=lambda p, g: ((p - g).abs() / g).mean()),
+    Measure("sq_rel", "SqRel", "m", of_pixels=lambda p, g: ((p - g).square() / g).mean()),
+    Measure("log10", "log10", of_pixels=lambda p, g: 1 / math.log(10) * _mean_abs(_log(p, g))),
+    Measure("rmse_log", "RMSE log", of_pixels=lambda p, g: _rms(_log(p, g))),
+    Measure("irmse", "iRMSE", "1/km", decimals=2, of_pixels=lambda p, g: _rms(_inv(p, g))),
+    Measure("imae", "iMAE", "1/km", decimals=2, of_pixels=lambda p, g: _mean_abs(_inv(p, g))),
+    Measure("silog", "SILog", "100·log m", decimals=2, of_pixels=_silog),
 )
+MEASURES = with_thresholds(DELTA_THRESHOLDS)
 """The measures that are computed everywhere, in the order of all tables."""
 COVERAGE = Measure("coverage", "coverage", better="higher", percent=True, decimals=2)
 """The fraction of the ground truth that has a prediction, which stands beside the measures."""
 
 
-def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
-    """Returns the main measures of near, middle and far pixels, by their true depth.
+def by_depth(measures: Sequence[Measure], near_m: float, far_m: float) -> tuple[Measure, ...]:
+    """Returns the main ones of the measures, of near, middle and far pixels by their true depth.
 
     Args:
+        measures: Such as `MEASURES`.
         near_m: Depth below which a pixel is near, metres.
         far_m: Depth from which on a pixel is far, metres.
     """
@@ -200,15 +187,15 @@ def by_depth(near_m: float, far_m: float) -> tuple[Measure, ...]:
             of_pixels=partial(_within, of=measure.of_pixels, low_m=low_m, high_m=high_m),
         )
         for name, title, low_m, high_m in parts
-        for measure in MEASURES
+        for measure in measures
         if measure.main and measure.of_pixels
     )
 
 
-def _within(pixels: Pixels, of: OfPixels, low_m: float, high_m: float) -> Tensor:
+def _within(p: Tensor, g: Tensor, of: OfPixels, low_m: float, high_m: float) -> Tensor:
     """The value of the pixels whose true depth lies in [low_m, high_m)."""
-    inside = (pixels.truth >= low_m) & (pixels.truth < high_m)
-    return of(Pixels(pixels.predicted[inside], pixels.truth[inside], pixels.thresholds))
+    inside = (g >= low_m) & (g < high_m)
+    return of(p[inside], g[inside])
 
 
 _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))

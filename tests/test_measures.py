@@ -10,9 +10,9 @@ import pytest
 import torch
 from scipy.integrate import trapezoid
 
-from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
+from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import DELTA_THRESHOLDS, OF_SIGMA, TABLE, by_depth, frame_means
+from pnpdepth_cli.measures import MEASURES, OF_SIGMA, TABLE, by_depth, frame_means
 from tests.core.test_metrics import brute
 
 SAMPLES = Path(__file__).parents[1] / "samples"
@@ -100,10 +100,9 @@ def test_a_step_in_its_place_scores_one_and_a_shifted_or_a_missing_one_nothing()
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the mean of nothing
 def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
     for depth, truth in frames():
-        measures = by_depth(3.0, 12.0)
+        measures = by_depth(MEASURES, 3.0, 12.0)
         tensors = (torch.from_numpy(each.copy()) for each in (depth, truth))
-        pixels = scored_pixels(*tensors, DELTA_THRESHOLDS)
-        found = list(measure_pixels(pixels, measures).values())
+        found = list(score(*tensors, measures).values.values())
         parts = (truth < 3, (truth >= 3) & (truth < 12), truth >= 12)
         expected = [brute(depth, np.where(part, truth, 0))[key] for part in parts for key in MAIN]
         assert found == pytest.approx(expected, abs=1e-9, nan_ok=True)

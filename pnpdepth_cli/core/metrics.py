@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pnpdepth_cli.measures import DELTA_THRESHOLDS, MEASURES, Measure, Pixels
+from pnpdepth_cli.measures import MEASURES, Measure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,39 +38,24 @@ class Scores:
 
 
 def score(
-    predicted: Tensor,
-    ground_truth: Tensor,
-    thresholds: tuple[float, float, float] = DELTA_THRESHOLDS,
+    predicted: Tensor, ground_truth: Tensor, measures: Sequence[Measure] = MEASURES
 ) -> Scores:
     """Returns the scores of a prediction against the ground truth.
 
     Args:
         predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
         ground_truth: Ground truth depth of the same shape, likewise.
-        thresholds: Thresholds of δ1 to δ3.
+        measures: Measures, of which those that are formulas of pixels are computed.
     """
-    known = int((ground_truth.isfinite() & (ground_truth > 0)).sum())
-    pixels = scored_pixels(predicted, ground_truth, thresholds)
-    count = len(pixels.truth)
-    return Scores(
-        values=measure_pixels(pixels, MEASURES),
-        pixels=count,
-        coverage=count / known if known else math.nan,
-    )
-
-
-def scored_pixels(
-    predicted: Tensor, ground_truth: Tensor, thresholds: tuple[float, float, float]
-) -> Pixels:
-    """Returns the pixels that have a prediction and ground truth; arguments as of `score`."""
     if predicted.shape != ground_truth.shape:
         raise ValueError(
             f"prediction is {tuple(predicted.shape)}, ground truth {tuple(ground_truth.shape)}"
         )
-    scored = predicted.isfinite() & (predicted > 0) & ground_truth.isfinite() & (ground_truth > 0)
-    return Pixels(predicted[scored].double(), ground_truth[scored].double(), thresholds)
-
-
-def measure_pixels(pixels: Pixels, measures: Sequence[Measure]) -> dict[str, float]:
-    """Returns those of the measures that are formulas of pixels by their key; NaN of no pixel."""
-    return {each.key: float(each.of_pixels(pixels)) for each in measures if each.of_pixels}
+    known = ground_truth.isfinite() & (ground_truth > 0)
+    scored = known & predicted.isfinite() & (predicted > 0)
+    p, g = predicted[scored].double(), ground_truth[scored].double()
+    return Scores(
+        values={each.key: float(each.of_pixels(p, g)) for each in measures if each.of_pixels},
+        pixels=len(g),
+        coverage=len(g) / int(known.sum()) if known.any() else math.nan,
+    )

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.measures import MEASURES
+from pnpdepth_cli.measures import MEASURES, with_thresholds
 
 
 def brute(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
@@ -75,5 +75,5 @@ def test_every_measure_is_a_score_with_a_unit() -> None:
 
 def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
     predicted, gt = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
-    scores = score(predicted, gt, (1.01, 1.01**2, 1.01**3))
+    scores = score(predicted, gt, with_thresholds([1.01, 1.01**2, 1.01**3]))
     assert (scores.delta1, scores.delta2, scores.delta3) == (0.25, 0.5, 0.75)

@@ -9,17 +9,20 @@ from pathlib import Path
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.measures import MEASURES, OF_SIGMA, Measure, by_depth, choose_measures, parse_keys
+from pnpdepth_cli.measures import (
+    OF_SIGMA,
+    Measure,
+    by_depth,
+    choose_measures,
+    parse_keys,
+    with_thresholds,
+)
 from pnpdepth_cli.protocols import KITTI_DEVKIT, Protocol, find_protocol
 from pnpdepth_cli.settings import option
 
 WITHOUT_SPARSE = "; without the pixels of sparse points"
 """What titles of tables say where the pixels of input points are excluded."""
 _DELTA = 1.25
-_IN_MILLIMETRES = tuple(
-    replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1) if m.key in ("rmse", "mae") else m
-    for m in MEASURES
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +103,10 @@ class EvalRequest:
         )
 
     @property
+    def _thresholds(self) -> list[float]:
+        return [self.delta, self.delta**2, self.delta**3]
+
+    @property
     def is_devkit(self) -> bool:
         """True if the development kit's definitions replace the usual ones."""
         return self.protocol == KITTI_DEVKIT
@@ -111,10 +118,17 @@ class EvalRequest:
             from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
 
             return DEVKIT_MEASURES
-        base = _IN_MILLIMETRES if self.protocol == "kitti" else MEASURES
-        of_parts = () if self.depth_limits is None else by_depth(*self.depth_limits)
+        usual = with_thresholds(self._thresholds)
+        of_parts = () if self.depth_limits is None else by_depth(usual, *self.depth_limits)
+        if self.protocol == "kitti":
+            usual = tuple(
+                replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1)
+                if m.key in ("rmse", "mae")
+                else m
+                for m in usual
+            )
         named = (key for key in self.columns or () if key in choices.MEASURES)
-        return (*base, *of_parts, *(choices.MEASURES[key] for key in named))
+        return (*usual, *of_parts, *(choices.MEASURES[key] for key in named))
 
     @property
     def shown(self) -> tuple[Measure, ...]:
@@ -136,7 +150,7 @@ class EvalRequest:
             "crop": rules.crop,
             "missing": "min" if rules.clip else "skip",
             "exclude_sparse": rules.exclude_sparse,
-            "thresholds": [self.delta, self.delta**2, self.delta**3],
+            "thresholds": self._thresholds,
             "scale_by": self.scale_by,
             "definitions": KITTI_DEVKIT if self.is_devkit else "usual",
         }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.results import ResultFrame
-from pnpdepth_cli.core.metrics import measure_pixels, scored_pixels
+from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -124,11 +124,9 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     """The measures of depth (H, W) against the scored ground truth."""
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}
-    depths = torch.from_numpy(depth), torch.from_numpy(truth)
-    thresholds = request.delta, request.delta**2, request.delta**3
-    pixels = scored_pixels(*depths, thresholds)
-    values: Scores = {**measure_pixels(pixels, request.measures)}
-    return values | {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
+    of_pixels = score(torch.from_numpy(depth), torch.from_numpy(truth), request.measures).values
+    of_images = {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
+    return {**of_pixels, **of_images}
 
 
 def _read_truth(
