@@ -6,7 +6,7 @@ import functools
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ _SEED = "seed"  # an option whose values are draws of the same
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """The scored frames of one saved run."""
+    """One saved run."""
 
     name: str
     """Name of the folder, or of the file without its ending."""
@@ -47,17 +47,17 @@ class Run:
     measures: list[Measure]
     """Measures that all frames have."""
     scoring: dict[str, object]
-    scores: dict[str, Scores]
-    """What is compared, by frame."""
-    before: dict[str, Scores]
-    """Scores before refinement, where the frame has them."""
-    groups: dict[str, str | None]
-    """The sequence that the data set says a frame is of."""
+    frames: dict[str, FrameRecord]
+    """The scored frames by name; their errors "after" are what is compared."""
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
+    def scores(self, names: Sequence[str], stage: str = AFTER) -> list[Scores]:
+        """Returns the scores of these frames; empty where a frame lacks the stage."""
+        return [self.frames[name].errors[GT].get(stage, {}) for name in names]
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True)
 class Gain:
     """How much better a run is than the first by one measure; NaN for what there is not."""
 
@@ -125,35 +125,32 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     runs = [_read_run(path) for path in paths]
     names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
-    scores = [[[*map(run.scores[name].get, keys)] for name in names] for run in runs]
-    values = np.array(scores, np.float64)  # (runs, frames, measures)
+    # the values that all runs have; None becomes NaN
+    scores = [run.scores(names) for run in runs]
+    values = np.array([[[*map(own.get, keys)] for own in of_run] for of_run in scores], np.float64)
     known = np.asarray(np.isfinite(values).all(axis=0))
-    values[:, ~known] = math.nan
+    values[:, ~known] = math.nan  # (runs, frames, measures)
     # the tests, over frames that count as independent
-    groups = groups_of(names, [runs[0].groups[name] for name in names])
+    groups = groups_of(names, [runs[0].frames[name].group for name in names])
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [
         frame_means(dict(zip(keys, row, strict=True)) for row in of_run)
         for of_run in values.tolist()
     ]
-    gains = _gains(values, means, measures, clusters)
-    run_names = [run.name for run in runs]
-    if len({*run_names}) < len(runs):
-        run_names = [run.path for run in runs]
-    compared = []
-    for run, name, mean, of_first in zip(runs, run_names, means, gains, strict=True):
-        coverage = _means([run.scores[name] for name in names], [COVERAGE.key])
-        compared.append(
-            ComparedRun(
-                name=name,
-                path=run.path,
-                mean=mean,
-                before=_means([run.before[name] for name in names], keys),
-                varied=run.varied,
-                coverage=coverage[COVERAGE.key],
-                gains=of_first,
-            )
+    gains = [{}, *_gains(values, means, measures, clusters)]
+    is_unique = len({run.name for run in runs}) == len(runs)
+    compared = [
+        ComparedRun(
+            name=run.name if is_unique else run.path,
+            path=run.path,
+            mean=mean,
+            before=_means(run.scores(names, BEFORE), keys),
+            varied=run.varied,
+            coverage=_means(run.scores(names), [COVERAGE.key])[COVERAGE.key],
+            gains=of_first,
         )
+        for run, mean, of_first in zip(runs, means, gains, strict=True)
+    ]
     return Comparison(
         frames=names,
         measures=measures,
@@ -181,9 +178,9 @@ def _shared(
                     f"{first.path} and {run.path} were scored by different rules ({rule} {own} and"
                     f" {others}); score both by one protocol"
                 )
-    names = tuple(name for name in first.scores if all(name in run.scores for run in runs))
+    names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
     if not names:
-        own, other = (some_names(run.scores) or "none" for run in (first, runs[-1]))
+        own, other = (some_names(run.frames) for run in (first, runs[-1]))
         raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
     every = [measure for measure in first.measures if measure.key in shared]
@@ -195,26 +192,21 @@ def _gains(
     means: Sequence[Means],
     measures: Sequence[Measure],
     clusters: Clusters,
-) -> list[dict[str, Gain]]:
-    """The gains of each run by measure, none of the first, of values (runs, frames, measures)."""
+) -> Iterator[dict[str, Gain]]:
+    """The gains of each run but the first by measure, of values (runs, frames, measures)."""
     first, *others = values.transpose(0, 2, 1)
     swap = functools.partial(statistics.swap_p_value, clusters=clusters)
     p_values = np.array([[*map(swap, first, other)] for other in others])
     adjusted = statistics.holm(p_values)
-    gains = [dict[str, Gain]() for _ in values]
-    for (run, place), p_value in np.ndenumerate(p_values):
-        key, sign = measures[place].key, measures[place].sign
-        before, after = np.array([each[key] for each in (means[0], means[run + 1])], float)
-        change = functools.partial(statistics.gain, sign=sign)
-        low, high = statistics.interval(change, (first[place], others[run][place]), clusters)
-        gains[run + 1][key] = Gain(
-            percent=float(change(before, after)),
-            low_percent=low,
-            high_percent=high,
-            p_value=float(p_value),
-            p_adjusted=float(adjusted[run, place]),
-        )
-    return gains
+    for run, other in enumerate(others):
+        gains = {}
+        for place, measure in enumerate(measures):
+            change = functools.partial(statistics.gain, sign=measure.sign)
+            before, after = np.array([means[each][measure.key] for each in (0, run + 1)], float)
+            ends = statistics.interval(change, (first[place], other[place]), clusters)
+            ps = float(p_values[run, place]), float(adjusted[run, place])
+            gains[measure.key] = Gain(float(change(before, after)), *ends, *ps)
+        yield gains
 
 
 def _notes(
@@ -228,13 +220,13 @@ def _notes(
     """What not all runs scored, and whether frames are too dependent or too few to conclude."""
     # Frames, pixels and measures that not all runs have.
     for run in runs:
-        if unshared := [name for name in run.scores if name not in names]:
+        if unshared := [name for name in run.frames if name not in names]:
             yield (
                 f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
                 f" left out: {some_names(unshared)}"
             )
-    pixels = (len({run.scores[name].get("pixels") for run in runs}) for name in names)
-    if others := sum(count > 1 for count in pixels):
+    of_runs = zip(*(run.scores(names) for run in runs), strict=True)
+    if others := sum(len({own.get("pixels") for own in each}) > 1 for each in of_runs):
         shares = ", ".join(COVERAGE.text(run.coverage) for run in compared)
         yield (
             f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
@@ -268,19 +260,20 @@ def _read_run(text: str) -> Run:
     # The frames with scores, and the measures that all of them have.
     try:
         records = [FrameRecord.from_json(entry, path) for entry in content.get("frames") or ()]
-        frames = {f.name: f for f in records if f.status != "failed" and GT in f.errors}
-        scores = {name: frame.errors[GT][stage] for name, frame in frames.items()}
+        scored = [frame for frame in records if frame.status != "failed" and GT in frame.errors]
+        scores = [frame.errors[GT][stage] for frame in scored]
         if not scores:
             raise ValueError("no frame has scores")
         measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
-            measures=[m for m in measures if all(m.key in own for own in scores.values())],
+            measures=[m for m in measures if all(m.key in own for own in scores)],
             scoring=dict(content.get("scoring") or _PAPER.scoring),
-            scores=scores,
-            before={name: frame.errors[GT].get(BEFORE, {}) for name, frame in frames.items()},
-            groups={name: frame.group for name, frame in frames.items()},
+            frames={
+                frame.name: replace(frame, errors={GT: frame.errors[GT] | {AFTER: own}})
+                for frame, own in zip(scored, scores, strict=True)
+            },
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
