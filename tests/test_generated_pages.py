@@ -28,7 +28,8 @@ FOR_THE_PROGRAM = {
     "Scores": {"to_json"},
     "Settings": {"fixed_by", "is_paper", "given", "over", "closed"},
     "SparsePoints": {
-        *("cropped", "joined", "mirrored", "resized", "sample", "scatter", "select", "tensors"),
+        *("cropped", "joined", "known_in", "mirrored", "resized", "sample", "scatter", "select"),
+        "tensors",
     },
     "Split": {"static_graph", "in_half"},
     "Network": {
