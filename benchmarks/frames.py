@@ -30,13 +30,33 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class EvalFrame:
-    """rgb (H, W, 3) in 0..1, gt (H, W) metres with 0 unknown, sensor depth (H, W) or None."""
+    """rgb (H, W, 3) in 0..1; depths (H, W) in metres, 0 = unknown.
+
+    sensor: a LiDAR's points on their pixels. pool: the pixels that uniform points are drawn from,
+    None for those of the ground truth.
+    """
 
     name: str
     rgb: NDArray[np.float32]
     gt: Depth
     sensor: Depth | None = None
+    pool: Depth | None = None
     register: Register = None
+
+    def points(self, count: int | None, seed: int = 0) -> Points:
+        """`count` pixels of the pool, or all of the sensor; the same seed gives the same."""
+        if count is None:
+            assert self.sensor is not None
+            depth = self.sensor
+            rows, columns = np.nonzero(depth > 0)
+        else:
+            depth = self.gt if self.pool is None else self.pool
+            rows, columns = np.nonzero(depth > 0)
+            count, generator = min(count, len(rows)), np.random.default_rng(seed)
+            chosen = generator.choice(len(rows), count, replace=False)
+            rows, columns = rows[chosen], columns[chosen]
+        xy = np.stack([columns, rows], axis=1).astype(np.float32)
+        return SparsePoints(xy=xy, depth=depth[rows, columns], size=depth.shape)
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
@@ -86,45 +106,16 @@ MORE_SETS: dict[str, Callable[[Path], Iterator[EvalFrame]]] = {
 """Sets on which nothing was chosen."""
 
 
-def sampled(gt: Depth, count: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of `count` pixels with known ground truth, drawn uniformly."""
-    rows, columns = np.nonzero(gt > 0)
-    chosen = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
-    return rows[chosen], columns[chosen]
-
-
-def frame_pixels(
-    frame: EvalFrame, count: int | None, seed: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Depth]:
-    """Rows, columns and depths of the sensor's points, or of `count` pixels of the ground truth."""
-    if count is None:
-        assert frame.sensor is not None
-        rows, columns = np.nonzero(frame.sensor > 0)
-        return rows, columns, frame.sensor[rows, columns]
-    rows, columns = sampled(frame.gt, count, seed)
-    return rows, columns, frame.gt[rows, columns]
-
-
-def points_on_grid(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], depth: Depth, shape: tuple[int, int]
-) -> SparsePoints:
-    """The depths at these pixels as points of a frame of this shape."""
-    xy = np.stack([columns, rows], axis=1).astype(np.float32)
-    return SparsePoints(
-        xy=torch.from_numpy(xy), depth=torch.from_numpy(depth.astype(np.float32)), size=shape
-    )
-
-
 def without_occluded(frame: EvalFrame) -> EvalFrame:
     """The frame without the LiDAR points that the program drops as occluded from the camera."""
     assert frame.sensor is not None
-    rows, columns, depth = frame_pixels(frame, None, 0)
-    xy = np.stack([columns, rows], axis=1).astype(np.float32)
-    hidden = occluded_in_map(Points(xy=xy, depth=depth, size=frame.gt.shape))
+    points = frame.points(None)
+    hidden = occluded_in_map(points)
     if hidden is None:
         return frame
     sensor = frame.sensor.copy()
-    sensor[rows[hidden], columns[hidden]] = 0.0
+    columns, rows = points.xy[hidden].astype(int).T
+    sensor[rows, columns] = 0.0
     return replace(frame, sensor=sensor)
 
 
@@ -138,10 +129,7 @@ def registered(
     """The frames with how their images are moved into the frame of these points by the program."""
     if how == "off":
         return list(frames)
-    known = []
-    for frame in frames:
-        points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
-        known.append(evidence(frame.rgb, points))
+    known = [evidence(each.rgb, each.points(count, seed).tensors()) for each in frames]
     if how == "set":
         found = [estimate_registration([known[i] for i in spread(len(known))])] * len(frames)
     else:
@@ -149,15 +137,10 @@ def registered(
     return [replace(frame, register=one) for frame, one in zip(frames, found, strict=True)]
 
 
-def frame_inputs(rgb: NDArray[np.float32], points: SparsePoints, gt: Depth) -> Frame:
-    """A frame in memory, as the program reads one from files."""
-    return Frame(rgb=tensor_of(rgb), points=points, gt=gt)
-
-
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
-    """The frame with points of its ground truth, or with all points of its LiDAR (None)."""
-    points = points_on_grid(*frame_pixels(frame, count, seed), frame.gt.shape)
-    return replace(frame_inputs(frame.rgb, points, frame.gt), register=frame.register)
+    """The frame as the program reads one, with `count` points, or all of its LiDAR (None)."""
+    points = frame.points(count, seed).tensors()
+    return Frame(rgb=tensor_of(frame.rgb), points=points, gt=frame.gt, register=frame.register)
 
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
@@ -166,10 +149,7 @@ def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Fram
         return refine_fixed(opened, inputs.registered())
 
 
-WEIGHTS = {
-    "pncnn": "pncnn/kitti_model_best.pth.tar",
-    "nconv": "nconv/CNN_ep0003.pth.tar",
-}
+WEIGHTS = {"pncnn": "pncnn/kitti_model_best.pth.tar", "nconv": "nconv/CNN_ep0003.pth.tar"}
 
 
 def opened(name: str, data: Path) -> Network:
@@ -214,11 +194,7 @@ def with_wrong_tracks(points: SparsePoints, fraction: float, seed: int) -> Spars
     return replace(points, depth=points.depth * torch.from_numpy(factor))
 
 
-OUTLIERS = {
-    "random": with_outliers,
-    "factors": with_wrong_factors,
-    "tracks": with_wrong_tracks,
-}
+OUTLIERS = {"random": with_outliers, "factors": with_wrong_factors, "tracks": with_wrong_tracks}
 """Kinds of outliers."""
 
 
@@ -230,7 +206,12 @@ def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> dict[str, tu
     return {name: (s.mae, s.rmse) for name, s in scores.items()}
 
 
-def print_row(*cells: object, head: bool = False) -> None:
-    """Prints a line of a Markdown table at once, with the line below it if it is the head."""
+def table_row(*cells: object, head: bool = False) -> str:
+    """A line of a Markdown table, with the line below it if it is the head."""
     line = "| " + " | ".join(map(str, cells)) + " |"
-    print(line + ("\n|" + "---|" * len(cells) if head else ""), flush=True)
+    return line + ("\n|" + "---|" * len(cells) if head else "")
+
+
+def print_row(*cells: object, head: bool = False) -> None:
+    """Prints a line of a Markdown table at once."""
+    print(table_row(*cells, head=head), flush=True)

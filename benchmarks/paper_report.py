@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.frames import table_row
 from benchmarks.paper_figures import MEASURES, ROWS, PaperRow
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.atomic import atomic_path
@@ -51,28 +52,27 @@ def paper_row(row: Result, street: bool) -> PaperRow:
 
 
 def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
-    lines = [
-        "| network | input | points | frames | | " + " | ".join(TITLES) + " |",
-        "|" + "---|" * (5 + len(TITLES)),
-    ]
+    lines = [table_row("network", "input", "points", "frames", "", *TITLES, head=True)]
     for row in rows:
         published = paper_row(row, street)
         if beside:
-            before = dict(zip(MEASURES, published.before, strict=True))
-            after = dict(zip(MEASURES, published.after, strict=True))
-            points = published.points or "LiDAR"
-            start = f"| *{published.name}, published* | {published.kind} |"
-            lines.append(f"{start} | | before | {_cells(before, fine=published.fine)} |")
-            after_cells = _cells(after, before, fine=published.fine, printed=published.gains)
-            lines.append(f"| | | {points} | | after | {after_cells} |")
-        points = f"{row['points']:.0f}"
-        start = f"| `{row['network']}` | {row['kind']} | | {row['frames']} | before |"
-        scores, settings = row["scores"], row["settings"]
-        lines.append(f"{start} {_cells(scores['before'])} |")
+            fine, points = published.fine, published.points or "LiDAR"
+            before, after = (
+                dict(zip(MEASURES, figures, strict=True))
+                for figures in (published.before, published.after)
+            )
+            start = (f"*{published.name}, published*", published.kind, "", "", "before")
+            lines.append(table_row(*start, *_cells(before, fine=fine)))
+            after_cells = _cells(after, before, fine=fine, printed=published.gains)
+            lines.append(table_row("", "", points, "", "after", *after_cells))
+        start = (f"`{row['network']}`", row["kind"], "", row["frames"], "before")
+        scores, before = row["scores"], row["scores"]["before"]
+        lines.append(table_row(*start, *_cells(before)))
+        start = ("", "", f"{row['points']:.0f}", "")
         for state, title in STATES.items():
-            how = f"{title}: {described(settings)}" if state == "tuned" else title
-            lines.append(f"| | | {points} | | {how} | {_cells(scores[state], scores['before'])} |")
-        lines.append(f"| | | {points} | | the points interpolated | {_cells(scores['linear'])} |")
+            how = f"{title}: {described(row['settings'])}" if state == "tuned" else title
+            lines.append(table_row(*start, how, *_cells(scores[state], before)))
+        lines.append(table_row(*start, "the points interpolated", *_cells(scores["linear"])))
     if any(row["fine"] for row in rows) and beside:
         lines.append("\n† δ at 1.01^k, in the next table")
     return "\n".join(lines)
@@ -96,7 +96,7 @@ def _cells(
     *,
     fine: bool = False,
     printed: Sequence[float] = (),
-) -> str:
+) -> list[str]:
     """Six cells; with the gains over `before` in per cent, the first as printed."""
     cells = []
     for column, name in enumerate(MEASURES):
@@ -107,7 +107,7 @@ def _cells(
             cells.append(f"{values[name]:.4f}{gain}")
         else:
             cells.append("†" if fine else f"{values[name]:.1f}")
-    return " | ".join(cells)
+    return cells
 
 
 def _gain(after: float, before: float) -> str:
@@ -118,44 +118,40 @@ def _fine(rows: Sequence[Result], *, beside: bool) -> str:
     """The δ at 1.01^k of the depth completion rows, before and after."""
     lines = [
         "\nδ at 1.01, 1.01², 1.01³, as in the paper's depth completion rows, before → after\n",
-        "| network | | δ1 | δ2 | δ3 |",
-        "|---|---|---|---|---|",
+        table_row("network", "", *TITLES[3:], head=True),
     ]
     for row in (row for row in rows if row["fine"]):
         if beside:
             published = paper_row(row, street=True)
             pairs = zip(published.before[3:], published.after[3:], strict=True)
-            cells = " | ".join(f"{before:.1f} → {after:.1f}" for before, after in pairs)
-            lines.append(f"| *{published.name}, published* | | {cells} |")
+            cells = (f"{before:.1f} → {after:.1f}" for before, after in pairs)
+            lines.append(table_row(f"*{published.name}, published*", "", *cells))
         for state, title in STATES.items():
             before, after = row["scores"]["before"], row["scores"][state]
-            cells = " | ".join(
-                f"{before[name]:.1f} → {after[name]:.1f}" for name in ("fine1", "fine2", "fine3")
-            )
-            lines.append(f"| `{row['network']}` | {title} | {cells} |")
+            names = ("fine1", "fine2", "fine3")
+            cells = (f"{before[name]:.1f} → {after[name]:.1f}" for name in names)
+            lines.append(table_row(f"`{row['network']}`", title, *cells))
     return "\n".join(lines)
 
 
 def _steps(rows: Sequence[Result]) -> str:
     """How far the paper's step moves z, and what both settings do at the points themselves."""
+    titles = ("network", "z", "std(z)", "α", "L1, the paper's setting", "loss, our setting")
     lines = [
         "\nThe step against the feature map: standard deviation of the paper's z, α as its"
         " fraction, and the mean L1 in metres at the points before → after\n",
-        "| network | z | std(z) | α | L1, the paper's setting | loss, our setting | MAE fell in |",
-        "|---|---|---|---|---|---|---|",
+        table_row(*titles, "MAE fell in", head=True),
     ]
     for row in rows:
         paper, tuned = (row["settings"][state] for state in STATES)
         fraction = 100 * paper["lr"] / row["std_z"]
         cells = (
-            f"`{row['network']}`",
-            f"`{paper['layer']}`",
-            f"{row['std_z']:.3g}",
+            *(f"`{row['network']}`", f"`{paper['layer']}`", f"{row['std_z']:.3g}"),
             f"{fraction:.2g} %" if fraction < 10 else f"{fraction:.0f} %",
             *(f"{how['loss_before']:.3f} → {how['loss_after']:.3f}" for how in (paper, tuned)),
             " / ".join(f"{how['frames_with_lower_mae']:.0%}" for how in (paper, tuned)),
         )
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(table_row(*cells))
     return "\n".join(lines)
 
 
@@ -188,14 +184,13 @@ def plot(tables: Sequence[Table], path: Path) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError("--plot needs matplotlib: pip install matplotlib") from None
-    table_row = [table for table in tables if table["rows"]]
-    if not table_row:
+    tables = [table for table in tables if table["rows"]]
+    if not tables:
         raise UsageError("--plot: there is no table to draw")
-    figure = Figure(figsize=(9, 2.4 * len(table_row) + 0.4), layout="constrained")
+    figure = Figure(figsize=(9, 2.4 * len(tables) + 0.4), layout="constrained")
     drawn: dict[str, Any] = {}
-    for table, axes in zip(
-        table_row, figure.subplots(len(table_row), squeeze=False)[:, 0], strict=True
-    ):
+    panels = figure.subplots(len(tables), squeeze=False)[:, 0]
+    for table, axes in zip(tables, panels, strict=True):
         bars = bars_of(table)
         width = 0.8 / len(bars)
         for number, (title, heights) in enumerate(bars.items()):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.frames import SETS, Depth, EvalFrame, points_on_grid, sampled
+from benchmarks.frames import SETS, Depth, EvalFrame
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.errors import NoPointsError, UsageError
-from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import NYU_PART, FramePart
 from pnpdepth_cli.sensors.pixels import as_depth_image
 from pnpdepth_cli.sensors.simulation import LIDARS, simulate_lidar
@@ -25,41 +24,14 @@ SCANNER = LIDARS["hdl-64e"]
 VIEWS = 4  # of one scene; frames are rendered a scene at a time
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableFrame:
-    """rgb (H, W, 3) in 0..1; depths (H, W) in metres, 0 = unknown.
-
-    pool: the pixels that uniform points are drawn from. scan: a LiDAR's points on their pixels,
-    None where there is none besides the ground truth.
-    """
-
-    rgb: NDArray[np.float32]
-    gt: Depth
-    pool: Depth
-    scan: Depth | None = None
-
-    def cut_by(self, part: FramePart) -> TableFrame:
-        """What a protocol leaves of the frame."""
-        return TableFrame(
-            rgb=np.ascontiguousarray(part.apply(self.rgb)),
-            gt=np.ascontiguousarray(part.apply(self.gt)),
-            pool=part.apply(self.pool),
-            scan=None if self.scan is None else part.apply(self.scan),
-        )
-
-    def points(self, count: int | None, seed: int) -> SparsePoints:
-        """`count` pixels of the pool, or all of the scan; the same seed gives the same."""
-        if count is None:
-            assert self.scan is not None
-            rows, columns = np.nonzero(self.scan)
-            return points_on_grid(rows, columns, self.scan[rows, columns], self.scan.shape)
-        rows, columns = sampled(self.pool, count, seed)
-        if not len(rows):
-            raise NoPointsError(f"frame {seed} has no pixel with known depth to draw points from")
-        return points_on_grid(rows, columns, self.pool[rows, columns], self.pool.shape)
+def cut_by(frame: EvalFrame, part: FramePart) -> EvalFrame:
+    """What a protocol leaves of the frame."""
+    images = {name: getattr(frame, name) for name in ("rgb", "gt", "sensor", "pool")}
+    left = {name: part.apply(image) for name, image in images.items() if image is not None}
+    return replace(frame, **{name: np.ascontiguousarray(image) for name, image in left.items()})
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FrameSet:
     """frames(): in a fixed order, `count` of them. street: for table II.
 
@@ -69,7 +41,7 @@ class FrameSet:
     name: str
     street: bool
     count: int
-    frames: Callable[[], Iterator[TableFrame]]
+    frames: Callable[[], Iterator[EvalFrame]]
     beside_paper: bool = True
 
 
@@ -104,12 +76,8 @@ def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
     shards = [folder / f"shard_{number:05d}.npz" for number in range(files)]
     if not all(shard.exists() for shard in shards):
         _render(scenes, folder, files * VIEWS, workers)
-    return FrameSet(
-        name=scenes.name,
-        street=scenes.kind == "street",
-        count=count,
-        frames=partial(_rendered_frames, scenes, shards, count),
-    )
+    frames = partial(_rendered_frames, scenes, shards, count)
+    return FrameSet(scenes.name, scenes.kind == "street", count, frames)
 
 
 def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
@@ -130,18 +98,14 @@ def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
     render_all(job, workers=workers)
 
 
-def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator[TableFrame]:
+def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator[EvalFrame]:
     for first, path in zip(range(0, count, VIEWS), shards, strict=True):
         with np.load(path) as shard:
             views = list(zip(shard["rgb"], shard["depth"], shard["intrinsics"], strict=True))
         for number, (rgb, depth, lens) in enumerate(views[: count - first], start=first):
             gt = within(depth, scenes.limit)
-            yield TableFrame(
-                rgb=rgb.astype(np.float32) / 255,
-                gt=gt,
-                pool=gt,
-                scan=scan_of(gt, lens, number) if scenes.kind == "street" else None,
-            )
+            scan = scan_of(gt, lens, number) if scenes.kind == "street" else None
+            yield EvalFrame(f"{number}", rgb.astype(np.float32) / 255, gt, scan)
 
 
 def within(depth: Depth, limit: float) -> Depth:
@@ -160,31 +124,20 @@ def shared(root: Path, most: int) -> list[FrameSet]:
     """The real frames at hand, at most so many of each, evenly taken."""
     sets = []
     for name, read in SETS.items():
-        every = [_shared_frame(frame) for frame in read(root)]
-        if every:
-            chosen = _evenly(every, most)
-            sets.append(
-                FrameSet(
-                    name=name,
-                    street=every[0].scan is not None,
-                    count=len(chosen),
-                    frames=partial(iter, chosen),
-                    beside_paper=False,
-                )
-            )
+        if not (every := [_shared_frame(frame) for frame in read(root)]):
+            continue
+        count = min(most, len(every))
+        chosen = [every[i] for i in np.linspace(0, len(every) - 1, count).astype(int)]
+        street, frames = every[0].sensor is not None, partial(iter, chosen)
+        sets.append(FrameSet(name, street, count, frames, beside_paper=False))
     if not sets:
         raise UsageError(f"{root} holds none of {', '.join(SETS)}; check --shared")
     return sets
 
 
-def _evenly(every: Sequence[TableFrame], most: int) -> list[TableFrame]:
-    count = min(most, len(every))
-    return [every[index] for index in np.linspace(0, len(every) - 1, count).astype(int)]
-
-
-def _shared_frame(frame: EvalFrame) -> TableFrame:
+def _shared_frame(frame: EvalFrame) -> EvalFrame:
     if frame.sensor is None:
         gt = within(frame.gt, ROOM_LIMIT)
-        return TableFrame(rgb=frame.rgb, gt=gt, pool=gt).cut_by(NYU_PART)
+        return cut_by(replace(frame, gt=gt), NYU_PART)
     gt, scan = (within(depth, STREET_LIMIT) for depth in (frame.gt, frame.sensor))
-    return TableFrame(rgb=frame.rgb, gt=gt, pool=scan, scan=scan)
+    return replace(frame, gt=gt, sensor=scan, pool=scan)

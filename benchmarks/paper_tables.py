@@ -31,10 +31,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.frames import Depth, frame_inputs, refined
+from benchmarks.frames import Depth, EvalFrame, drawn_inputs, refined
 from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, PaperRow
 from benchmarks.paper_report import heading, markdown, plot
-from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, TableFrame, rendered, shared
+from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, cut_by, rendered, shared
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import UsageError
@@ -94,11 +94,10 @@ def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, 
     return measured, float(scored.sum() / known.sum())
 
 
-def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any]:
+def frame_figures(entry: Entry, frame: EvalFrame, number: int) -> dict[str, Any]:
     """Scores of a network on one frame, the loss at the points and the standard deviation of z."""
-    frame = frame.cut_by(entry.row.cut)
-    points = frame.points(entry.row.points, number)
-    inputs = frame_inputs(frame.rgb, points, frame.gt)
+    frame = cut_by(frame, entry.row.cut)
+    inputs = drawn_inputs(frame, entry.row.points, number)
     layer, paper = entry.settings["paper"]
     results = {"paper": refined(entry.network, layer, paper, inputs)}
     same = entry.settings["tuned"] == entry.settings["paper"]
@@ -107,11 +106,11 @@ def frame_figures(entry: Entry, frame: TableFrame, number: int) -> dict[str, Any
     )
     # A step of 100 % is what the engine takes for the standard deviation of z_0.
     moved = refined(entry.network, layer, replace(paper, iterations=1, lr="100%"), inputs)
-    depths = {"linear": linear(points).numpy(), "before": results["paper"].before}
+    depths = {"linear": linear(inputs.points).numpy(), "before": results["paper"].before}
     depths |= {state: result.after for state, result in results.items()}
     scores, coverage = scores_of(depths, frame.gt)
     return {
-        "points": len(points),
+        "points": len(inputs.points),
         "coverage": coverage,
         "std_z": moved.step,
         "diverged": sum(result.diverged is not None for result in results.values()),
@@ -145,12 +144,15 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     settings = {}
     for state, (layer, how) in entry.settings.items():
-        settings[state] = {"layer": layer, **asdict(how)}
-        settings[state] |= {"loss_before": mean("loss", state, 0)}
-        settings[state] |= {"loss_after": mean("loss", state, 1)}
-        settings[state] |= {"gains": gains(states["before"], states[state])}
         won = [f["scores"][state]["mae"] < f["scores"]["before"]["mae"] for f in frames]
-        settings[state] |= {"frames_with_lower_mae": float(np.mean(won))}
+        settings[state] = {
+            "layer": layer,
+            **asdict(how),
+            "loss_before": mean("loss", state, 0),
+            "loss_after": mean("loss", state, 1),
+            "gains": gains(states["before"], states[state]),
+            "frames_with_lower_mae": float(np.mean(won)),
+        }
     return {
         "network": entry.name,
         "paper_row": entry.row.name,
@@ -175,7 +177,7 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
     bar = tqdm(frame_set.frames(), frame_set.name, frame_set.count, unit="frame", disable=None)
     for number, frame in enumerate(bar):
         for entry, measured in zip(entries, figures, strict=True):
-            if entry.row.points is not None or frame.scan is not None:
+            if entry.row.points is not None or frame.sensor is not None:
                 measured.append(frame_figures(entry, frame, number))
     rows = []
     for entry, measured in zip(entries, figures, strict=True):

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.frames import EvalFrame
 from benchmarks.paper_figures import ROWS, PaperRow
 from benchmarks.paper_report import bars_of, markdown
-from benchmarks.paper_sets import FrameSet, TableFrame
+from benchmarks.paper_sets import FrameSet
 from benchmarks.paper_tables import entries_of, scores_of, table_of
 
 
@@ -35,11 +36,9 @@ def test_the_table_has_a_row_for_each_network_that_takes_the_points(tmp_path: Pa
     scan[20::2, ::2] = 15.0
     image = np.zeros((100, 400, 3), np.float32)
     entries = entries_of(["sparseconv-tiny", "adnn-tiny"])[0]
-    with_scan = TableFrame(rgb=image, gt=wall, pool=scan, scan=scan)
-    walls = {"name": "walls", "street": True, "count": 1}
     tables = [
-        table_of(FrameSet(**walls, frames=lambda frame=frame: iter([frame])), entries)
-        for frame in (with_scan, TableFrame(rgb=image, gt=wall, pool=wall))
+        table_of(FrameSet("walls", True, 1, lambda frame=frame: iter([frame])), entries)
+        for frame in (EvalFrame("", image, wall, scan), EvalFrame("", image, wall))
     ]
     rows = [[(row["network"], row["points"]) for row in table["rows"]] for table in tables]
     assert rows == [[("sparseconv-tiny", 40 * 200), ("adnn-tiny", 40 * 200)], []]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchmarks.frames import frame_pixels, kitti_dc, points_on_grid
+from benchmarks.frames import kitti_dc
 from model_zoo_defs.latefusion import Encoder
 from model_zoo_defs.nconv import NConv
 from model_zoo_defs.pncnn import Pncnn
@@ -41,7 +41,7 @@ def test_published_weights_give_about_the_published_errors_on_kitti(
 ) -> None:
     network = load_network(name, shared_data / "weights" / weights)
     frame = next(iter(kitti_dc(shared_data)))
-    points = points_on_grid(*frame_pixels(frame, None, 0), frame.gt.shape)
+    points = frame.points(None).tensors()
     fit = FrameMap.fit(network.definition.size, *frame.gt.shape)
     with torch.no_grad():
         output = network.module(*network.arguments_of(None, fit.points_to_network(points)))
