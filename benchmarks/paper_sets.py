@@ -56,10 +56,6 @@ class Scenes:
     seed: int
     limit: float
 
-    def folder(self, cache: Path) -> Path:
-        """Where the frames lie."""
-        return cache / f"{self.kind}-{self.size[0]}x{self.size[1]}-seed{self.seed}"
-
 
 ROOMS = Scenes(
     name="rendered rooms", camera="nyu", kind="room", size=(228, 304), seed=900041, limit=ROOM_LIMIT
@@ -72,10 +68,10 @@ STREETS = Scenes(
 
 def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
     """`count` frames of these scenes; what of them is not in the cache is rendered first."""
-    folder, files = scenes.folder(cache), -(-count // VIEWS)
-    shards = [folder / f"shard_{number:05d}.npz" for number in range(files)]
+    folder = cache / f"{scenes.kind}-{scenes.size[0]}x{scenes.size[1]}-seed{scenes.seed}"
+    shards = [folder / f"shard_{number:05d}.npz" for number in range(-(-count // VIEWS))]
     if not all(shard.exists() for shard in shards):
-        _render(scenes, folder, files * VIEWS, workers)
+        _render(scenes, folder, len(shards) * VIEWS, workers)
     frames = partial(_rendered_frames, scenes, shards, count)
     return FrameSet(scenes.name, scenes.kind == "street", count, frames)
 

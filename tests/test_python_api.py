@@ -26,12 +26,13 @@ SAMPLE = Path(__file__).parent.parent / "samples" / "indoor"
 Frame = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
+PART = slice(0, 128), slice(0, 160)
+BLACK = np.zeros((4, 4, 3))
+
+
 @pytest.fixture(scope="module")
 def network() -> pnp.Network:
     return pnp.load_network("compact")
-
-
-PART = slice(0, 128), slice(0, 160)
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +108,7 @@ def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(
     as_floats = (image / 255).astype(np.float32), (codes / 1000).astype(np.float32)
     expected = pnp.refine(network, *as_floats, settings).depth
     assert np.array_equal(pnp.refine(network, image, codes, settings, unit="mm").depth, expected)
-    rows = np.argwhere(codes)[:, ::-1]
-    rows = np.column_stack([rows, codes[codes > 0]])
+    rows = np.column_stack([np.argwhere(codes)[:, ::-1], codes[codes > 0]])
     assert np.array_equal(pnp.refine(network, image, rows, settings, unit="mm").depth, expected)
     truth = np.full((2, 2), 1500, np.int32)
     assert pnp.score(np.full((2, 2), 1.25), truth, unit="mm").mae == 0.25
@@ -123,9 +123,9 @@ def test_depth_that_may_be_in_another_unit_needs_one(
     depth: NDArray[Any], network: pnp.Network
 ) -> None:
     with pytest.raises(pnp.InputError, match="the sparse depth"):
-        pnp.refine(network, np.zeros((4, 4, 3)), depth)
+        pnp.refine(network, BLACK, depth)
     with pytest.raises(pnp.UsageError, match="unit must be one of m, mm, got 'cm'"):
-        pnp.refine(network, np.zeros((4, 4, 3)), depth, unit="cm")  # type: ignore[arg-type]
+        pnp.refine(network, BLACK, depth, unit="cm")  # type: ignore[arg-type]
     with pytest.raises(pnp.InputError, match="the ground truth"):
         pnp.score(np.ones(depth.shape), depth)
 
@@ -135,12 +135,12 @@ def test_depth_that_may_be_in_another_unit_needs_one(
     [
         (np.zeros((6, 6, 2)), np.ones((6, 6)), pnp.InputError, "image"),
         (np.full((4, 4, 3), 1.5), np.ones((4, 4)), pnp.InputError, "image"),
-        (np.zeros((4, 4, 3)), np.ones((4, 4, 1)), pnp.InputError, "sparse"),
         ("photo.png", np.ones((4, 4)), pnp.InputError, "image"),
-        (np.zeros((4, 4, 3)), [[1, 2], [3]], pnp.InputError, "sparse"),
-        (np.zeros((4, 4, 3)), np.ones((5, 4)), pnp.InputError, "image"),
-        (np.zeros((4, 4, 3)), np.zeros((4, 4)), pnp.NoPointsError, "sparse"),
-        (np.zeros((4, 4, 3)), np.array([[9.0, 9, 1]]), pnp.NoPointsError, "image"),
+        (BLACK, np.ones((4, 4, 1)), pnp.InputError, "sparse"),
+        (BLACK, [[1, 2], [3]], pnp.InputError, "sparse"),
+        (BLACK, np.ones((5, 4)), pnp.InputError, "image"),
+        (BLACK, np.zeros((4, 4)), pnp.NoPointsError, "sparse"),
+        (BLACK, np.array([[9.0, 9, 1]]), pnp.NoPointsError, "image"),
         (None, np.ones((5, 3)), pnp.InputError, "image"),
     ],
 )
@@ -186,28 +186,22 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
 
 
 @pytest.mark.parametrize(
-    ("wrong", "error"),
+    ("error", "wrong"),
     [
-        (lambda network: pnp.load_network(3), pnp.UsageError),
-        (
-            lambda network: pnp.load_network("compact", definition=network.definition),
-            pnp.UsageError,
-        ),
-        (lambda network: pnp.Refiner("compact"), pnp.UsageError),
-        (lambda network: pnp.Refiner([]), pnp.UsageError),
-        (
-            lambda network: pnp.Refiner(network, pnp.Settings(method="alone", layer="0")),
-            pnp.UsageError,
-        ),
-        (lambda network: pnp.Refiner([network] * 2, pnp.Settings(iterations=3)), pnp.UsageError),
-        (lambda network: LOSSES["no_such.py"], pnp.UsageError),
-        (lambda network: pnp.Refiner(network).share_registration([np.ones(3)]), pnp.InputError),
-        (lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")]), pnp.InputError),
-        (lambda network: pnp.score(np.ones((2, 2)), np.ones((2, 3))), pnp.InputError),
+        (pnp.UsageError, lambda network: pnp.load_network(3)),
+        (pnp.UsageError, lambda net: pnp.load_network("compact", definition=net.definition)),
+        (pnp.UsageError, lambda network: pnp.Refiner("compact")),
+        (pnp.UsageError, lambda network: pnp.Refiner([])),
+        (pnp.UsageError, lambda net: pnp.Refiner(net, pnp.Settings(method="alone", layer="0"))),
+        (pnp.UsageError, lambda net: pnp.Refiner([net] * 2, pnp.Settings(iterations=3))),
+        (pnp.UsageError, lambda network: LOSSES["no_such.py"]),
+        (pnp.InputError, lambda net: pnp.Refiner(net).share_registration([np.ones(3)])),
+        (pnp.InputError, lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")])),
+        (pnp.InputError, lambda network: pnp.score(np.ones((2, 2)), np.ones((2, 3)))),
     ],
 )
 def test_wrong_arguments_have_an_error_of_their_kind(
-    wrong: Callable[[Any], Any], error: type[pnp.PnpDepthError], network: pnp.Network
+    error: type[pnp.PnpDepthError], wrong: Callable[[Any], Any], network: pnp.Network
 ) -> None:
     with pytest.raises(error):
         wrong(network)
