@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -39,16 +39,8 @@ _PERSPECTIVE, _FROM_CAMERA_0 = "perspective.txt", "calib_cam_to_velo.txt"  # of 
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
-_MATRICES = ("camera_matrix", "cameraMatrix", "K", "k", "intrinsics")
-_DISTORTIONS = (
-    "distortion_coefficients",
-    "distCoeffs",
-    "distortion_coeffs",
-    "distortion",
-    "D",
-    "d",
-)
-_POSES = ("T_camera_lidar", "T_cam_lidar")
+_MATRICES = ("camera_matrix", "cameraMatrix", "intrinsics", "k", "K")
+_OF_LENS = ("distortion_coefficients", "distCoeffs", "distortion_coeffs", "distortion", "D", "d")
 _LENSES = dict.fromkeys(
     ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"),
     "radial-tangential",
@@ -88,17 +80,16 @@ class _Fields:
     def __init__(self, path: Path, values: Mapping[str, object]) -> None:
         self.path, self.values = path, values
 
-    def first(self, names: Iterable[str]) -> str | None:
-        """Returns the first of the names that is there."""
-        return next((name for name in names if name in self.values), None)
-
     def text(self, name: str, default: str) -> str:
         """Returns a value as a word; an empty one is the default."""
         return str(self.values.get(name) or default).strip(" \n\"'") or default
 
-    def numbers(self, name: str, count: int | None = None) -> list[float]:
-        """Returns the finite numbers of a value; so many, if there is a count."""
+    def numbers(self, *names: str, count: int | None = None, optional: bool = False) -> list[float]:
+        """Returns the finite numbers of the first of the names that is there."""
+        name = next((name for name in names if name in self.values), names[-1])
         if name not in self.values:
+            if optional:
+                return []
             raise InputError(f"{self.path} has no {name}; it is incomplete or of another kind")
         numbers = numbers_in(self.values[name])
         if numbers is None or not (np.abs(numbers) <= _LARGEST).all():
@@ -108,13 +99,14 @@ class _Fields:
             raise InputError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
         return numbers
 
-    def matrix(self, name: str, *shape: int) -> Floats:
-        """Returns the numbers of a value as an array of this shape."""
-        return np.reshape(self.numbers(name, math.prod(shape)), shape)
+    def matrix(self, *names: str, columns: int = 3) -> Floats:
+        """Returns the numbers of the first of the names that is there, as three rows."""
+        return np.reshape(self.numbers(*names, count=3 * columns), (3, columns))
 
     def pose(self, shift: str) -> Extrinsics:
         """Returns the pose of the rotation R and a translation of this name."""
-        return check_pose(self.path, "R", self.matrix("R", 3, 3), self.matrix(shift, 3))
+        translation = np.array(self.numbers(shift, count=3))
+        return check_pose(self.path, "R", self.matrix("R"), translation)
 
 
 def read_calibration(path: Path, camera: int | None = None) -> Calibration:
@@ -143,7 +135,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         fields = _Fields(path, read_json(path))
         if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
             size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
-            by_rows = fields.matrix("K", 3, 3).T.ravel().tolist()
+            by_rows = fields.matrix("K").T.ravel().tolist()
             fields = _Fields(path, {"K": by_rows, "size": size})
     elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
         fields = _named_values(path, text)
@@ -152,8 +144,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         sized = {"K": numbers[:4], "size": numbers[4:]}
         fields = _Fields(path, sized if len(numbers) == 6 else {"K": text})
     if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
-        name = fields.first(("Tr", "Tr_velo_cam")) or "Tr_velo_to_cam"
-        return _kitti(fields, camera, "KITTI", pose_of_matrix(path, name, fields.numbers(name)))
+        numbers = fields.numbers("Tr", "Tr_velo_cam", "Tr_velo_to_cam")
+        return _kitti(fields, camera, "KITTI", pose_of_matrix(path, "Tr", numbers))
     if unknown := sorted(set(fields.values) - set(_PLAIN)):
         fact = f"{unknown[0]!r} is not part of a calibration"
         raise InputError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
@@ -190,10 +182,8 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
     Whether transforms lead to the rectified camera (kitti2bag) or to the raw one, which R and the
     last column of P turn and shift into it, no file says.
     """
-    p, r = (
-        np.array([] if (name := fields.first(names)) is None else fields.numbers(name))
-        for names in (("projection_matrix", "P", "p"), ("rectification_matrix", "R", "r"))
-    )
+    p = np.array(fields.numbers("projection_matrix", "P", "p", optional=True))
+    r = np.array(fields.numbers("rectification_matrix", "R", "r", optional=True))
     if p.size != 12 or min(p[0], p[5], np.linalg.det(p.reshape(3, 4)[:, :3])) <= 0:
         return {}
     intrinsics, column = p.reshape(3, 4)[:, :3], p.reshape(3, 4)[:, 3]
@@ -224,19 +214,17 @@ def _kitti(
         raise UsageError(f"{path} has no camera {number}; --camera can be one of: {listing}")
     # Its intrinsics, and the rotation and offset that rectify it. Odometry's pose is already
     # rectified; of raw data and KITTI-360, camera 0's rectification is that of all.
-    projection = fields.matrix(fields.first((f"P{number}",)) or f"P_rect_0{number}", 3, 4)
-    turn = fields.first(("R_rect", "R_rect_00")) or "R0_rect"
-    rectify = np.eye(3) if "Tr" in fields.values else fields.matrix(turn, 3, 3)
+    projection = fields.matrix(f"P{number}", f"P_rect_0{number}", columns=4)
+    turn = np.eye(3)
+    if "Tr" not in fields.values:
+        turn = fields.matrix("R_rect", "R_rect_00", "R0_rect")
     intrinsics = _check_intrinsics(path, projection[:, :3])
     offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
-    pose = check_pose(path, "rectification", rectify, offset)
-    size = fields.first((f"S_rect_0{number}",))
+    pose = check_pose(path, "rectification", turn, offset)
+    size = _height_width(path, fields.numbers(f"S_rect_0{number}", count=2, optional=True))
+    source = f"{kind} calibration, camera {number}"
     return Calibration(
-        camera=Camera(
-            intrinsics=intrinsics,
-            size=_height_width(path, fields.numbers(size, 2)) if size else None,
-            source=f"{kind} calibration, camera {number}",
-        ),
+        camera=Camera(intrinsics=intrinsics, size=size, source=source),
         scanner=None if scanner is None else pose @ scanner,
         rectification=pose,
     )
@@ -267,49 +255,41 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
     # The intrinsics: fx fy cx cy, 3×3, or 4×4 as ScanNet has them.
-    name = fields.first(_MATRICES) or "K"
-    numbers = fields.numbers(name)
+    numbers = fields.numbers(*_MATRICES)
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
     if len(numbers) not in (9, 16):
-        raise InputError(f"{path}: {name} has {len(numbers)} numbers, not 4, 9 or 16")
+        raise InputError(f"{path}: K has {len(numbers)} numbers, not 4, 9 or 16")
     matrix = np.reshape(numbers, (math.isqrt(len(numbers)), -1))[:3, :3]
+    matrix = _check_intrinsics(path, matrix)
     lens, distortion = _lens(fields)
     if distortion:
         source += f", {lens} lens"
     # The pose of the scanner, as a matrix or as R and t.
     scanner = None
-    if pose := fields.first(_POSES):
-        scanner = pose_of_matrix(path, pose, fields.numbers(pose))
+    if pose := fields.numbers("T_camera_lidar", "T_cam_lidar", optional=True):
+        scanner = pose_of_matrix(path, "T_cam_lidar", pose)
     elif "R" in fields.values or "t" in fields.values:
         scanner = fields.pose("t")
     # The size of the image.
-    size, sides = None, [fields.first((f"image_{side}", side)) for side in ("width", "height")]
-    if both := fields.first(("size", "resolution")):
-        size = _height_width(path, fields.numbers(both, 2))
-    elif None not in sides:
-        size = _height_width(path, [fields.numbers(str(side), 1)[0] for side in sides])
-    camera_read = Camera(
-        intrinsics=_check_intrinsics(path, matrix),
-        lens=lens,
-        distortion=distortion,
-        size=size,
-        source=source,
-    )
-    return Calibration(camera=camera_read, scanner=scanner)
+    sides = fields.numbers("size", "resolution", count=2, optional=True)
+    for side in () if sides else ("width", "height"):
+        sides += fields.numbers(f"image_{side}", side, count=1, optional=True)
+    size = _height_width(path, sides)
+    seen = Camera(intrinsics=matrix, lens=lens, distortion=distortion, size=size, source=source)
+    return Calibration(camera=seen, scanner=scanner)
 
 
 def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
-    model = fields.text(fields.first(("lens", "distortion_model")) or "lens", "none")
+    model = fields.text("lens", fields.text("distortion_model", "none"))
     if "distortion_model" not in fields.values and fields.text("fisheye_model", "0") not in _FALSE:
         model = "fisheye"  # of OpenCV
     lens = _LENSES.get(model)
     if lens is None:
         known, model = ", ".join(_LENSES), one_line(model)[:30]
         raise InputError(f"{fields.path}: distortion model {model!r} is none of {known}")
-    name = fields.first(_DISTORTIONS)
-    coefficients = () if name is None else tuple(fields.numbers(name))
+    coefficients = tuple(fields.numbers(*_OF_LENS, optional=True))
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _COEFFICIENTS[lens]:
@@ -336,7 +316,10 @@ def _check_intrinsics(path: Path, matrix: Floats) -> Floats:
     return matrix
 
 
-def _height_width(path: Path, size: Sequence[float]) -> tuple[int, int]:
+def _height_width(path: Path, size: list[float]) -> tuple[int, int] | None:
+    """(H, W) of width and height; None without both."""
+    if len(size) < 2:
+        return None
     width, height = (round(value) for value in size)
     check_pixel_count(path, width, height)
     return height, width

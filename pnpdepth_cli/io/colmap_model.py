@@ -183,13 +183,9 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
     if lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
     # whole numbers are at pixel centres, where COLMAP has .5
-    return Camera(
-        intrinsics=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]),
-        lens=lens,
-        distortion=distortion,
-        size=(height, width),
-        source=f"{name} camera",
-    )
+    intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    size, source = (height, width), f"{name} camera"
+    return Camera(intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source)
 
 
 def _pose(numbers: Sequence[float]) -> Extrinsics:

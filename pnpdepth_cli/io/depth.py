@@ -31,13 +31,19 @@ from pnpdepth_cli.io.formats import (
 )
 from pnpdepth_cli.points import SparsePoints
 
-TABLE: dict[str, DepthFormat] = {
-    "png": images.PNG,
-    "exr": images.EXR,
-    "npy": array_files.NPY,
-    "npz": array_files.NPZ,
-    "pfm": array_files.PFM,
-    "tiff": images.TIFF,
+TABLE = {
+    name.lower(): DepthFormat(
+        name=name, suffixes=suffixes, magic=magic, read=read, write=write, integer=name == "PNG"
+    )
+    for name, suffixes, magic, read, write in (
+        ("PNG", (".png",), (b"\x89PNG\r\n\x1a\n",), images.read_png, images.write_png),
+        ("EXR", (".exr",), (b"v/1\x01",), images.read_exr, images.write_exr),
+        ("TIFF", (".tif", ".tiff"), (b"II*\0", b"MM\0*"), images.read_tiff, images.write_tiff),
+        ("NPY", (".npy",), (b"\x93NUMPY",), array_files.read_npy, array_files.write_npy),
+        # an archive with an array, and an empty one
+        ("NPZ", (".npz",), (b"PK\3\4", b"PK\5\6"), array_files.read_npz, array_files.write_npz),
+        ("PFM", (".pfm",), (b"Pf",), array_files.read_pfm, array_files.write_pfm),
+    )
 }
 """The formats of this package by their names in `choices.FORMATS`."""
 
@@ -234,9 +240,7 @@ def _from_rows(
     if not known.any():
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     if size is None:
-        raise InputError(
-            f"{path} is a list of points, which needs an image to say the frame's size"
-        )
+        raise InputError(f"{path} is a list of points, which needs an image for the frame's size")
     if lost := len(rows) - int(np.count_nonzero(known)):
         source += f", without {lost:,} rows that have no depth above 0 or no pixel"
     xy = rows[known, :2].astype(np.float32)

@@ -22,10 +22,7 @@ Panel = tuple[str, str, Pixels]
 UNKNOWN = 70
 """The grey of a pixel without depth: turbo has no such colour."""
 
-_SIGNED = {
-    "gain": ((25, 90, 190), (220, 105, 0)),
-    "change": ((1, 102, 94), (118, 42, 131)),
-}
+_SIGNED = {"gain": ((25, 90, 190), (220, 105, 0)), "change": ((1, 102, 94), (118, 42, 131))}
 """Colours of 1 and -1: better and worse, farther and nearer. Blue and orange are told apart by
 colour-blind eyes."""
 

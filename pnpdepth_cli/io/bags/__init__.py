@@ -63,11 +63,8 @@ class Bag:
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
         """Returns the topics of these message types with their number of messages."""
         with _as_our_errors(self.path):
-            return {
-                name: int(info.msgcount)
-                for name, info in sorted(self.reader.topics.items())
-                if info.msgtype in kinds
-            }
+            topics = sorted(self.reader.topics.items())
+            return {name: int(info.msgcount) for name, info in topics if info.msgtype in kinds}
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""

@@ -22,8 +22,8 @@ from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORM
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.depth import known_metres
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.io.formats import format_of_content
-from pnpdepth_cli.io.formats.images import PNG
+from pnpdepth_cli.io.formats import kind_of
+from pnpdepth_cli.io.formats.images import read_png
 from pnpdepth_cli.io.poses import Trajectory, pose_of_quaternion, trajectory_of
 
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -116,10 +116,10 @@ def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
         values = _grid(message, topic, number, int(message.step))
         return known_metres(values if number.kind == "f" else values / _MM_PER_M)
     data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
-    if kind not in _DEPTH or format_of_content(data[_DEPTH_HEADER:]) is not PNG:
+    if kind not in _DEPTH or kind_of(data[_DEPTH_HEADER:]) != "PNG":
         kind = one_line(message.format)[:40]
         raise InputError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
-    codes = PNG.read(Path(topic), data[_DEPTH_HEADER:]).values
+    codes = read_png(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
         return known_metres(codes / _MM_PER_M)
     a, b = np.frombuffer(data, "<f4", 2, offset=4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import lzma
 import math
 import re
 import struct
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.budget import check_claim, max_image_bytes
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
-from pnpdepth_cli.io.formats import DepthFile, DepthFormat, Reading
+from pnpdepth_cli.io.formats import DepthFile, Reading
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HEADER_ERRORS = (
@@ -31,9 +30,8 @@ _HEADER_ERRORS = (
 )
 """What NumPy raises as it evaluates a damaged header, or one of another version of the format."""
 _ARCHIVE_ERRORS = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, OSError, EOFError),
-    *(ValueError, LookupError, OverflowError),
-    RuntimeError,  # encrypted, or of another version
+    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError),
+    *(OverflowError, RuntimeError),  # the last if encrypted, or of another version
 )
 """What zipfile raises on damaged archives."""
 _MOST_AXES = 32  # of an array of NumPy 1
@@ -71,27 +69,24 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
     return array.reshape(shape, order="F" if is_fortran else "C")
 
 
-def _read_npy(path: Path, data: bytes) -> DepthFile:
+def read_npy(path: Path, data: bytes) -> DepthFile:
+    """Returns the array of an NPY file."""
     array = parse_npy(path, data)
     return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
 
 
-def _write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+def write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    """Writes depth (H, W) as an NPY file."""
     with file.open("wb") as stream:
         np.save(stream, metres)
-
-
-NPY = DepthFormat(
-    name="NPY", suffixes=(".npy",), magic=(b"\x93NUMPY",), read=_read_npy, write=_write_npy
-)
 
 
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
 
-def _read_npz(path: Path, data: bytes) -> DepthFile:
-    """The only array of an archive."""
+def read_npz(path: Path, data: bytes) -> DepthFile:
+    """Returns the only array of an NPZ archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
@@ -111,26 +106,18 @@ def _read_npz(path: Path, data: bytes) -> DepthFile:
     return DepthFile(values=array, reading=reading, is_image=False)
 
 
-def _write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+def write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    """Writes depth (H, W) as the array `depth` of an NPZ archive."""
     with file.open("wb") as stream:
         np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
-
-
-NPZ = DepthFormat(
-    name="NPZ",
-    suffixes=(".npz",),
-    magic=(b"PK\x03\x04", b"PK\x05\x06"),  # the second is an archive without any array
-    read=_read_npz,
-    write=_write_npz,
-)
 
 
 _NUMBER = rb"[-+]?\d{0,20}\.?\d{1,20}(?:[eE][-+]?\d{1,2})?"
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(" + _NUMBER + rb")[ \t]*\r?\n")
 
 
-def _read_pfm(path: Path, data: bytes) -> DepthFile:
-    """Rows are stored from the bottom; the sign of the scale factor gives the byte order."""
+def read_pfm(path: Path, data: bytes) -> DepthFile:
+    """Returns the only channel of a PFM, whose scale factor's sign gives the byte order."""
     match = _PFM_HEADER.match(data)
     if match is None or float(match[3]) == 0:
         raise damaged(path, "PFM", "has no valid header of one channel (Pf)")
@@ -142,14 +129,12 @@ def _read_pfm(path: Path, data: bytes) -> DepthFile:
         raise damaged(path, "PFM", fact)
     values = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
     unused = "" if abs(factor) == 1 else f", scale factor {abs(factor):g} of its header not applied"
-    values = np.ascontiguousarray(values[::-1], dtype=np.float32)
+    values = np.ascontiguousarray(values[::-1], dtype=np.float32)  # stored from the bottom
     return DepthFile(values=values, reading=Reading(f"PFM{unused}"))
 
 
-def _write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+def write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    """Writes depth (H, W) as a PFM of one channel."""
     height, width = metres.shape
     header = f"Pf\n{width} {height}\n-1.0\n".encode()  # little-endian
     file.write_bytes(header + metres[::-1].astype("<f4").tobytes())
-
-
-PFM = DepthFormat(name="PFM", suffixes=(".pfm",), magic=(b"Pf",), read=_read_pfm, write=_write_pfm)

@@ -21,7 +21,6 @@ from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
 from pnpdepth_cli.io.formats import (
     SCALE_KEY,
     DepthFile,
-    DepthFormat,
     Reading,
     check_scale,
     no_depth,
@@ -136,7 +135,8 @@ def orientation_of(image: PIL.Image.Image) -> int:
 _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4 per cent larger
 
 
-def _read_png(path: Path, data: bytes) -> DepthFile:
+def read_png(path: Path, data: bytes) -> DepthFile:
+    """Returns the codes of a 16-bit PNG of one channel, and the scale that it states."""
     with open_image(path, data, "PNG") as image:
         mode = raw_mode(image)
         if not mode.startswith("I;16"):
@@ -151,7 +151,8 @@ def _read_png(path: Path, data: bytes) -> DepthFile:
     return DepthFile(values=codes, reading=Reading("16-bit PNG", scale))
 
 
-def _write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
+def write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
+    """Writes codes (H, W) and texts by their keys."""
     from PIL import Image, PngImagePlugin
 
     chunks = PngImagePlugin.PngInfo()
@@ -160,17 +161,8 @@ def _write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -
     Image.fromarray(codes).save(file, "PNG", pnginfo=chunks, compress_level=_COMPRESSION_LEVEL)
 
 
-PNG = DepthFormat(
-    name="PNG",
-    suffixes=(".png",),
-    magic=(b"\x89PNG\r\n\x1a\n",),
-    read=_read_png,
-    write=_write_png,
-    integer=True,
-)
-
-
-def _read_tiff(path: Path, data: bytes) -> DepthFile:
+def read_tiff(path: Path, data: bytes) -> DepthFile:
+    """Returns the numbers of a TIFF of one channel, floats or 16-bit codes."""
     with open_image(path, data, "TIFF") as image:
         if image.mode == "F":
             return DepthFile(values=np.asarray(image), reading=Reading("32-bit float TIFF"))
@@ -180,21 +172,13 @@ def _read_tiff(path: Path, data: bytes) -> DepthFile:
         raise no_depth(path, f"a TIFF of mode {image.mode}, not F or I;16")
 
 
-def _write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+def write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    """Writes depth (H, W) as a TIFF of floats."""
     from PIL import Image
 
     encoded = io.BytesIO()  # libtiff prints to standard error when a disk is full
     Image.fromarray(metres).save(encoded, "TIFF", compression="tiff_adobe_deflate")
     file.write_bytes(encoded.getvalue())
-
-
-TIFF = DepthFormat(
-    name="TIFF",
-    suffixes=(".tif", ".tiff"),
-    magic=(b"II*\x00", b"MM\x00*"),
-    read=_read_tiff,
-    write=_write_tiff,
-)
 
 
 _DEPTH_NAMES = frozenset({"z", "depth"})
@@ -247,8 +231,8 @@ def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
         raise InputError(f"{path} {fact}; export one flat image of its whole frame")
 
 
-def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """One float32 channel Z, ZIP compressed."""
+def write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
+    """Writes depth (H, W) as an EXR of one channel Z, ZIP compressed."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -260,8 +244,8 @@ def _write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str])
         raise OSError(str(error)) from error
 
 
-def _read_exr(path: Path, data: bytes) -> DepthFile:
-    """The only channel, or the only one named for depth, or R of a grey image in R, G, B."""
+def read_exr(path: Path, data: bytes) -> DepthFile:
+    """Returns the only channel, or the one named for depth, or R of a grey image in R, G, B."""
     channels = read_exr_channels(path, data)
     names = [name for name in channels if name != "A"] or list(channels)
     named = [name for name in names if not _DEPTH_NAMES.isdisjoint(name.lower().split("."))]
@@ -274,8 +258,3 @@ def _read_exr(path: Path, data: bytes) -> DepthFile:
         raise InputError(f"{path} has several channels ({listing}); export the depth alone")
     (name,) = names if len(names) == 1 else named
     return DepthFile(values=channels[name], reading=Reading(f"EXR channel {name}"))
-
-
-EXR = DepthFormat(
-    name="EXR", suffixes=(".exr",), magic=(b"v/1\x01",), read=_read_exr, write=_write_exr
-)
