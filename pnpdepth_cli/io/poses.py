@@ -184,11 +184,11 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     """The matrices (N, 3, 4) of the frames of these names in a transforms.json."""
     content = read_json(path)
     try:
-        entries = [(each["file_path"], each["transform_matrix"]) for each in content["frames"]]
         listed: dict[str, list[tuple[str, object]]] = {}
-        for file, matrix in entries:
-            whole = PurePosixPath(file).with_suffix("").as_posix()
-            listed.setdefault(whole.rpartition("/")[2], []).append((f"/{whole}", matrix))
+        for each in content["frames"]:
+            whole = PurePosixPath(each["file_path"]).with_suffix("")
+            entry = f"/{whole.as_posix()}", each["transform_matrix"]
+            listed.setdefault(whole.name, []).append(entry)
         poses = np.empty((len(names), 3, 4))
         for index, name in enumerate(names):
             found = listed.get(name.rpartition("/")[2], [])

@@ -213,12 +213,10 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
         }
         if not values["k"].any():
             return None  # an uncalibrated camera
-        content: dict[str, object] = {
-            "distortion_model": str(message.distortion_model) if values["d"].size else "none",
-            "width": int(message.width),
-            "height": int(message.height),
-        }
-        content |= {name: v.tolist() for name, v in values.items() if np.isfinite(v).all()}
+        content: dict[str, object]
+        content = {name: v for name, v in values.items() if np.isfinite(v).all()}
+        model = str(message.distortion_model) if values["d"].size else "none"
+        content |= {"distortion_model": model, "width": message.width, "height": message.height}
         calibration = camera_in_yaml(bag.path, content, None)
         camera = replace(calibration.camera, source=topic)
         return replace(calibration, camera=camera), frame_of(message)

@@ -49,10 +49,9 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
     try:
         with _LOCK:
             shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
-        if min(shape, default=0) < 0 or any(isinstance(side, bool) for side in shape):
+        are_sizes = (type(side) is int and 0 <= side <= sys.maxsize for side in shape)
+        if len(shape) > _MOST_AXES or not all(are_sizes):
             raise ValueError(f"a shape of {shape}")
-        if len(shape) > _MOST_AXES or max(shape, default=0) > sys.maxsize:
-            raise ValueError("a shape that no array has")
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
     if dtype.hasobject:
