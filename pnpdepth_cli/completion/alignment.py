@@ -57,7 +57,11 @@ class Alignment:
         The gradient is that of the unclamped depth, so that a loss still pulls back a pixel that
         is outside.
         """
-        return from_space(_clamp(self.scale * x + self.shift, *self._limits), self.space)
+        line, (low, high) = self.scale * x + self.shift, self._limits
+        clamped = line.clamp(low, high)
+        if x.requires_grad:
+            clamped = clamped.detach() + (line - line.detach())
+        return from_space(clamped, self.space)
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
@@ -242,9 +246,3 @@ def to_space(depth: Tensor, space: str) -> Tensor:
 def from_space(value: Tensor, space: str) -> Tensor:
     """Returns the depth of a value in one of `choices.SPACES`."""
     return {"depth": lambda: value, "inverse": value.reciprocal, "log": value.exp}[space]()
-
-
-def _clamp(x: Tensor, low: float, high: float) -> Tensor:
-    """x within low … high; the gradient is that of x."""
-    clamped = x.clamp(low, high)
-    return clamped if not x.requires_grad else clamped.detach() + (x - x.detach())

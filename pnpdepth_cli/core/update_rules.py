@@ -13,7 +13,6 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.points import SparsePoints
 
 Update = Callable[[Tensor], Tensor]
@@ -114,17 +113,9 @@ def step_size(lr: float | str, z0: Tensor) -> float:
         lr: A positive number, or a text such as "3%": that percentage of the standard deviation
             of z_0.
         z0: z_0, of any shape.
-
-    Raises:
-        UsageError: `lr` is neither.
     """
     text = str(lr).strip()
-    try:
-        value = float(text.removesuffix("%"))
-    except ValueError:
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise UsageError(f"lr {lr!r} is not a step size; give a positive number, or one like 3%")
+    value = float(text.removesuffix("%"))
     return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
 
 

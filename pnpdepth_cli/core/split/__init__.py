@@ -11,9 +11,9 @@ output: they work in place on their input, or hooks listen to their parts. Saved
 protected from in-place operations. Submodules behind the cut that do not depend on z are cached as
 well.
 
-The resulting `Recording` holds for other arguments of the same shapes, if no value of a tensor
-reached Python, where the network could branch on it. Then further frames are only replayed
-(`Replay`), neither watched nor copied.
+What is recorded holds for other arguments of the same shapes, if no value of a tensor reached
+Python, where the network could branch on it. Then further frames are only replayed (`Replay`),
+neither watched nor copied.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class Split:
 
         It is if no value of a tensor reaches Python, or if it was promised.
         """
-        recording = None if self._replay is None else self._replay.recording
-        return recording is not None and recording.complete and recording.static_graph
+        replay = self._replay
+        return replay is not None and replay.complete and replay.static_graph
 
     @property
     def in_half(self) -> bool:
@@ -98,7 +98,7 @@ class Split:
         In float32 if the layer gives a shorter type, in which small steps would be rounded away.
         """
         replay = self._replay
-        if replay is not None and replay.recording.holds_for(arguments):
+        if replay is not None and replay.holds_for(arguments):
             replay.next_frame(arguments)
             self._run_front(replay)
         else:
@@ -115,7 +115,7 @@ class Split:
         if replay is None or replay.z0 is None:
             raise RuntimeError("rear() needs front() first")
         replay.z = z
-        if replay.recording.complete:
+        if replay.complete:
             return self._run(replay)
         recorder = self._recorder(replay)
         output = self._run(replay, recorder)
@@ -132,19 +132,19 @@ class Split:
                 return replay
 
     def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> None:
-        """Runs the network up to the cut. Raises LayerError if it does not come there."""
+        """Runs the network up to the cut. Raises ModelError if it does not come there."""
         try:
             self._run(replay, recorder)
         except PnpDepthError:
             if not replay.has_front:
                 raise
         if not replay.has_front:
-            ran = {module for module, _ in replay.recording.calls}
+            ran = {module for module, _ in replay.outputs}
             ran = ran if recorder is None else recorder.ran
             raise self._cut.never_ran(ran, replay.calls[self._cut.module])
 
     def _recorder(self, replay: Replay) -> Recorder:
-        saved = [output for output in replay.outputs if output is not None]
+        saved = [output for output in replay.outputs.values() if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, escapes=not self._promised_static)
         return Recorder(self._cut, watch, replay, self._uncacheable)

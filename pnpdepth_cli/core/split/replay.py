@@ -1,15 +1,14 @@
-"""Passes of a cut network: learning which calls of submodules can be cached, then by a recording.
+"""Passes of a cut network: learning which calls of submodules can be cached, then replaying them.
 
-A pass by a recording returns saved outputs in front of the cut, and z at it.
+A replayed pass returns saved outputs in front of the cut, and z at it.
 """
 
 from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +20,9 @@ from pnpdepth_cli.errors import ModelError, PnpDepthError
 
 Run = Callable[[], object]
 """Runs a call of a submodule; returns its output."""
+
+Call = tuple[nn.Module, int]
+"""A recorded call: its submodule, and the number of that submodule's recorded calls before it."""
 
 Handler = Callable[[nn.Module, object, Run], object]
 """Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
@@ -51,24 +53,6 @@ def _stand_in(
     return forward
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Recording:
-    """The calls of a pass in their order, up to the cut or to the end."""
-
-    calls: Mapping[tuple[nn.Module, int], int] = field(default_factory=dict)
-    """Index of the call by its submodule and the number of its recorded calls before it. Recorded
-    are calls that are cached, or that contain the cut or calls of their own."""
-    cut: int | None = None  # index of the call that is the cut; None before it was reached
-    path: tuple[str, ...] = ()  # path of z in the output of that call
-    shapes: object = None  # shapes and other properties of the arguments for which this holds
-    static_graph: bool = True  # whether it holds for all arguments of these shapes, as far as known
-    complete: bool = False  # whether the calls behind the cut are in it, too
-
-    def holds_for(self, arguments: tuple[object, ...]) -> bool:
-        """Whether a pass with these arguments makes the same calls."""
-        return self.complete and self.static_graph and self.shapes == shapes_of(arguments)
-
-
 def shapes_of(arguments: object) -> object:
     """Returns what arguments must share for a network without branches to treat them alike."""
     tensors = [(t.shape, t.dtype, t.device) for _, t in tensors_in(arguments)]
@@ -76,9 +60,9 @@ def shapes_of(arguments: object) -> object:
 
 
 class Replay:
-    """The saved tensors of the frame at hand, and the handler of intercepted calls.
+    """Recorded calls, with the saved tensors of the frame at hand; handles intercepted calls.
 
-    In the learning passes, calls that the recording does not know go to the `recorder`.
+    In the learning passes, calls that are not recorded yet go to the `recorder`.
 
     Args:
         arguments: Arguments of the network for the first frame.
@@ -86,10 +70,15 @@ class Replay:
 
     def __init__(self, cut: CutPoint, arguments: Sequence[object]) -> None:
         self._cut = cut
-        self.recording = Recording()
         self.arguments = SavedTensors(_copies(arguments))
-        self.outputs: list[SavedTensors | None] = []
-        """Output of each recorded call: None where not cached, of value None before it ran."""
+        self._shapes = shapes_of(self.arguments.value)
+        self.outputs: dict[Call, SavedTensors | None] = {}
+        """Outputs of recorded calls in their order: None where not cached, of value None before it
+        ran. Calls that are not cached are recorded if they contain the cut or recorded calls."""
+        self.cut_call: Call | None = None  # that is the cut; None before it was reached
+        self.path: tuple[str, ...] = ()  # path of z in the output of that call
+        self.static_graph = True  # whether arguments of the same shapes all make the same calls
+        self.complete = False  # whether the calls behind the cut are recorded, too
         self.z0: Tensor | None = None
         self.z: Tensor | None = None
         self.calls: Counter[nn.Module] = Counter()
@@ -98,10 +87,15 @@ class Replay:
         self.in_pass = False
         self._fills = False  # inside a call whose output will be saved as a whole
 
+    def holds_for(self, arguments: tuple[object, ...]) -> bool:
+        """Whether a pass with these arguments makes the recorded calls."""
+        return self.complete and self.static_graph and self._shapes == shapes_of(arguments)
+
     def next_frame(self, arguments: Sequence[object]) -> None:
         """Forgets the frame at hand; `arguments` are those of the next one."""
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
-        self.outputs = [saved and SavedTensors(copied=saved.copied) for saved in self.outputs]
+        for call, saved in self.outputs.items():
+            self.outputs[call] = saved and SavedTensors(copied=saved.copied)
         self.z0 = self.z = None
 
     @property
@@ -123,16 +117,16 @@ class Replay:
             raise self.end_of_front()
         if self.recorder is not None:
             run = functools.partial(self.recorder.run, module, run)
-        index = self.recording.calls.get((module, self.calls[module]))
+        call = module, self.calls[module]
         self.calls[module] += 1
-        if index is None:
+        if call not in self.outputs:
             return run() if self.recorder is None else self.recorder.record(module, inputs, run)
-        is_cut = index == self.recording.cut
+        is_cut = call == self.cut_call
         if is_cut and self.z0 is not None:
             return self._output_with_z(run)
-        output = self._saved_output(index, run)
+        output = self._saved_output(call, run)
         if is_cut:
-            self.z0 = dict(tensors_in(output))[self.recording.path].detach()
+            self.z0 = dict(tensors_in(output))[self.path].detach()
             raise self.end_of_front()
         return output
 
@@ -142,12 +136,12 @@ class Replay:
         is_cut = module is self._cut.module and self.calls[module] == 1
         return self._output_with_z(run) if in_backward and is_cut else run()
 
-    def _saved_output(self, index: int, run: Run) -> object:
+    def _saved_output(self, call: Call, run: Run) -> object:
         """The saved output of a recorded call. A call that may be saved runs once, others always.
 
         Calls inside the one that runs are not replayed meanwhile (`_fills`).
         """
-        saved = self.outputs[index]
+        saved = self.outputs[call]
         if saved is None:
             return run()
         if saved.value is not None:
@@ -157,22 +151,22 @@ class Replay:
             output = run()
         finally:
             self._fills = False
-        self.outputs[index] = SavedTensors.of(output, copied=saved.copied)
+        self.outputs[call] = SavedTensors.of(output, copied=saved.copied)
         return output
 
     def _output_with_z(self, run: Run) -> object:
         assert self.z is not None
         assert self.z0 is not None
-        assert self.recording.cut is not None
+        assert self.cut_call is not None
         # A copy, because the network may go on in place and z may be a leaf.
         z = self.z.to(self.z0.dtype, copy=True)
-        saved = self.outputs[self.recording.cut]
+        saved = self.outputs[self.cut_call]
         # Without a saved output the layer runs for what else it does, as changing its input.
         output = run() if saved is None else saved.fresh()
         if self.recorder is not None:
-            original = None if saved else dict(tensors_in(output))[self.recording.path]
+            original = None if saved else dict(tensors_in(output))[self.path]
             self.recorder.watch.injected(z, original)
-        return map_tensors(output, lambda path, t: z if path == self.recording.path else t)
+        return map_tensors(output, lambda path, t: z if path == self.path else t)
 
 
 def _copies(arguments: Sequence[object]) -> object:
@@ -181,11 +175,11 @@ def _copies(arguments: Sequence[object]) -> object:
 
 
 class Recorder:
-    """Notes the calls of one pass that the replay's recording does not know yet.
+    """Notes the calls of one pass that the replay does not know yet.
 
     Args:
         watch: Sees the operations of the pass.
-        replay: Handles the pass; gets the longer recording when the pass is over.
+        replay: Handles the pass; gets the recorded calls when the pass is over.
         uncacheable: Submodules that contain something which forbids to cache them as a whole;
             more are added. Their submodules are then recorded one by one.
     """
@@ -195,9 +189,8 @@ class Recorder:
     ) -> None:
         self.watch, self.ran = watch, set[nn.Module]()
         self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
-        self._calls = [module for module, _ in replay.recording.calls]
-        self._saved = list(replay.outputs)  # of each call; None where it cannot be cached
-        self._known = len(self._calls)  # before this pass; in the rear's, those up to the cut
+        self._saved = dict(replay.outputs)
+        self._known = len(self._saved)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
 
     def run(self, module: nn.Module, run: Run) -> object:
@@ -210,9 +203,9 @@ class Recorder:
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
-        index, since = len(self._calls), self.watch.now()
-        self._calls.append(module)
-        self._saved.append(None)
+        call, since = (module, sum(m is module for m, _ in self._saved)), self.watch.now()
+        self._saved[call] = None
+        first_inside = len(self._saved)
         before = list(tensors_in(inputs))
         outer, self._inside_one = self._inside_one, self._may_be_one(module)
         try:
@@ -228,20 +221,19 @@ class Recorder:
             and [(path, id(t)) for path, t in before]
             == [(path, id(t)) for path, t in tensors_in(inputs)]
         ):
-            self._drop_from(index + 1)
-            self._saved[index] = saved = SavedTensors.of(output)
+            self._drop_from(first_inside)
+            self._saved[call] = saved = SavedTensors.of(output)
             self.watch.protect(saved)
         elif tried and next(module.children(), None) is not None:
             self._uncacheable.add(module)
         if self._is_cut(module):
-            path, z0 = self._cut.choose(output)
-            self._replay.z0 = z0
-            self._replay.recording = Recording(cut=index, path=path)
+            self._replay.path, self._replay.z0 = self._cut.choose(output)
+            self._replay.cut_call = call
             raise self._replay.end_of_front()
         return output
 
     def finish_rear(self) -> None:
-        """Gives the replay the whole recording.
+        """Gives the replay all recorded calls.
 
         Raises:
             ModelError: The cut is ambiguous, or its output cannot be replaced.
@@ -259,36 +251,29 @@ class Recorder:
         # no call there is recorded, and saved outputs stay whole, as it may read or change them.
         if self.watch.data_dependent:
             self._drop_from(self._known)
-            for saved in self._saved:
+            for saved in self._saved.values():
                 if saved is not None:
                     saved.copied = True
         self.finish(complete=True)
 
     def finish(self, *, complete: bool) -> None:
-        """Gives the replay the recording, up to the cut or complete."""
-        replay, calls = self._replay, self._calls
-        replay.outputs = self._saved
-        replay.recording = replace(
-            replay.recording,
-            calls={(m, calls[:index].count(m)): index for index, m in enumerate(calls)},
-            shapes=shapes_of(replay.arguments.value),
-            # No value may reach Python in front of the cut or behind it.
-            static_graph=replay.recording.static_graph and not self.watch.escaped,
-            complete=complete,
-        )
+        """Gives the replay the recorded calls, up to the cut or all."""
+        self._replay.outputs, self._replay.complete = self._saved, complete
+        # No value may reach Python in front of the cut or behind it.
+        self._replay.static_graph &= not self.watch.escaped
 
     def _is_cut(self, module: nn.Module) -> bool:
-        reached = self._replay.recording.cut is not None
+        reached = self._replay.cut_call is not None
         chosen = self._cut.call in (None, self._replay.calls[module])
         return not reached and module is self._cut.module and chosen
 
     def _may_be_one(self, module: nn.Module) -> bool:
         """True if it ends before the cut, so that what is inside needs no record."""
         apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
-        return self._replay.recording.cut is None and not any(module in group for group in apart)
+        return self._replay.cut_call is None and not any(module in group for group in apart)
 
     def _drop_from(self, first: int) -> None:
-        for saved in self._saved[first:]:
+        for call in list(self._saved)[first:]:
+            saved = self._saved.pop(call)
             if saved is not None:
                 saved.value = None  # the watch would hold its tensors
-        del self._calls[first:], self._saved[first:]
