@@ -201,7 +201,12 @@ def predict(field: ResidualField, queries: SparsePoints | None = None) -> Tensor
     It is smooth where the prediction is not, so that every pixel's is predicted on a coarser grid.
     """
     if queries is not None:
-        return _predict_at(field, queries)
+        features = _sample(field.features, queries)
+        if _is_exact(field) or len(field.points) <= NEIGHBOURS:
+            return _solve(field, _all_points(field), features[None])[0]
+        _, near = nearest_points(field.points, queries.xy.double(), NEIGHBOURS)
+        return _solve(field, near, features[:, None])[:, 0]
+    # At every pixel, on a grid.
     size = field.points.size
     rows, columns = _steps(field.points)
     if rows == columns == 1:
@@ -211,14 +216,6 @@ def predict(field: ResidualField, queries: SparsePoints | None = None) -> Tensor
     grid = replace(field, features=features, points=field.points.resized(*coarse))
     values = _predict_grid(grid)[None, None]
     return F.interpolate(values, size, mode="bilinear", align_corners=False)[0, 0]
-
-
-def _predict_at(field: ResidualField, queries: SparsePoints) -> Tensor:
-    features = _sample(field.features, queries)
-    if _is_exact(field) or len(field.points) <= NEIGHBOURS:
-        return _solve(field, _all_points(field), features[None])[0]
-    _, near = nearest_points(field.points, queries.xy.double(), NEIGHBOURS)
-    return _solve(field, near, features[:, None])[:, 0]
 
 
 def leave_one_out(

@@ -25,10 +25,7 @@ Patch = tuple[int, int]
 
 
 def influential_field(
-    split: Split,
-    z: Tensor,
-    depth_of: Callable[[object], Tensor],
-    enough: float | None = None,
+    split: Split, z: Tensor, depth_of: Callable[[object], Tensor], enough: float | None = None
 ) -> tuple[Patch | None, Patch]:
     """Returns the largest patch of z in elements, and of the output in pixels.
 

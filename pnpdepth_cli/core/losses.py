@@ -17,9 +17,6 @@ from pnpdepth_cli.errors import ModelError, wrap_user_errors
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
-TABLE: dict[str, Loss] = {}
-"""The losses by name."""
-
 MIN_DEPTH = 1e-3
 """Metres; a prediction is at least this before its logarithm is taken."""
 
@@ -29,11 +26,6 @@ MAD_TO_STD = 1.4826
 MIN_CAUCHY_SCALE = 0.1
 """Least c of Cauchy's loss, in log depth. On rendered rooms 0.02 and 0.05 gave larger errors; 0.2
 gave equal ones, but larger ones where a fifth of the points were outliers."""
-
-
-def loss(name: str) -> Callable[[Loss], Loss]:
-    """Enters the decorated function in the table."""
-    return lambda function: TABLE.setdefault(name, function)
 
 
 def checked_loss(name: str) -> Loss:
@@ -51,25 +43,21 @@ def checked_loss(name: str) -> Loss:
     return checked
 
 
-@loss("l1")
 def l1(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean |p − d|, the paper's loss."""
     return (predicted - true).abs().mean()
 
 
-@loss("l2")
 def l2(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean (p − d)²."""
     return (predicted - true).square().mean()
 
 
-@loss("huber")
 def huber(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean of e²/2 for |e| ≤ 1 m and of |e| − 1/2 above, e = p − d (Huber)."""
     return F.huber_loss(predicted, true)
 
 
-@loss("berhu")
 def berhu(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean of |e| up to c and of (e² + c²)/2c above, e = p − d, c = max|e|/5.
 
@@ -80,7 +68,6 @@ def berhu(predicted: Tensor, true: Tensor) -> Tensor:
     return torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)).mean()
 
 
-@loss("cauchy")
 def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
     """Mean c·log(1 + (e/c)²), e = log p − log d: robust to outliers.
 
@@ -91,3 +78,7 @@ def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
     error = predicted.clamp_min(MIN_DEPTH).log() - true.log()
     c = (MAD_TO_STD * error.detach().abs().median()).clamp_min(MIN_CAUCHY_SCALE)
     return (c * (error / c).square().log1p()).mean()
+
+
+TABLE = {"l1": l1, "l2": l2, "huber": huber, "berhu": berhu, "cauchy": cauchy}
+"""The losses by name."""

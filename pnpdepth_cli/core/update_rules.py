@@ -1,6 +1,6 @@
 """U and α of equation 3: from the gradient at z to the direction and the size of its update.
 
-A decorated function makes a new rule. A rule is called with the gradients of one refinement, in
+A function of `TABLE` makes a new rule. A rule is called with the gradients of one refinement, in
 order, and returns a direction of the same shape; z moves by −α × direction.
 `pnpdepth_cli.choices.UPDATES` lists the names. The gradient may be blurred before.
 """
@@ -8,7 +8,6 @@ order, and returns a direction of the same shape; z moves by −α × direction.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,30 +15,18 @@ from torch import Tensor
 from pnpdepth_cli.points import SparsePoints
 
 Update = Callable[[Tensor], Tensor]
-Rule = TypeVar("Rule", bound=Callable[..., Update])
-
-TABLE: dict[str, Callable[[], Update]] = {}
-"""Functions that make a rule, by name."""
 
 
-def update_rule(name: str) -> Callable[[Rule], Rule]:
-    """Enters the decorated function in the table."""
-    return lambda function: TABLE.setdefault(name, function)  # type: ignore[return-value]
-
-
-@update_rule("sign")
 def sign() -> Update:
     """Returns the rule g → sign(g), the paper's (after Kurakin et al. 2017)."""
     return torch.sign
 
 
-@update_rule("sgd")
 def sgd() -> Update:
     """Returns the rule g → g: gradient descent."""
     return lambda gradient: gradient
 
 
-@update_rule("normalised")
 def normalised() -> Update:
     """Returns the rule g → g / rms(g); an all-zero gradient stays zero.
 
@@ -57,7 +44,6 @@ def normalised() -> Update:
     return update
 
 
-@update_rule("momentum")
 def momentum(decay: float = 0.9) -> Update:
     """Returns the rule v ← decay·v + g, whose direction is v.
 
@@ -73,7 +59,6 @@ def momentum(decay: float = 0.9) -> Update:
     return update
 
 
-@update_rule("adam")
 def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update:
     """Returns Adam's rule with bias correction (Kingma & Ba 2014).
 
@@ -98,6 +83,15 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
 
     return update
 
+
+TABLE: dict[str, Callable[[], Update]] = {
+    "sign": sign,
+    "sgd": sgd,
+    "normalised": normalised,
+    "momentum": momentum,
+    "adam": adam,
+}
+"""Functions that make a rule, by name."""
 
 SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda done: 1.0,

@@ -77,7 +77,6 @@ class OpenNetwork:
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
-        self._output: object = None
         self._encoded: dict[str, object] = {}
 
     def __enter__(self) -> OpenNetwork:
@@ -91,7 +90,7 @@ class OpenNetwork:
 
     def next_image(self) -> None:
         """Forgets what was computed for the last image."""
-        self._z0 = self._output = None
+        self._z0 = None
         self._encoded.clear()
 
     def cut(self) -> Split:
@@ -162,15 +161,8 @@ class OpenNetwork:
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
         """The depth without updates: one pass of the whole network, which need not be cut."""
-        output = self._output
-        if output is None:
-            with torch.no_grad(), wrap_user_errors("the network's forward"):
-                if self._z0 is None:
-                    output = self.network.module(*prepared.arguments)
-                else:
-                    output = self.cut().rear(self._z0)
-        if self._of_image_only:
-            self._output = output
+        with torch.no_grad(), wrap_user_errors("the network's forward"):
+            output = self.network.module(*prepared.arguments)
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
         known = at_points.isfinite()
