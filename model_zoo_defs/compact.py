@@ -183,13 +183,6 @@ class Compact(nn.Module):
         finally:
             self._full_size = None
 
-    def with_sigma(
-        self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Depth, and the expected absolute error of log depth, both (B, 1, H, W)."""
-        outputs = self.outputs(rgb, sparse, prior)
-        return outputs.depths[-1], self.sigma(outputs)
-
     def sigma(self, outputs: Outputs) -> Tensor:
         """The expected absolute error of log depth (B, 1, H, W); no gradient reaches the depth."""
         return cast(Tensor, self.scale(outputs.features.detach(), outputs.hints.detach()))

@@ -23,12 +23,8 @@ def test_the_wheel_holds_every_package_and_file_but_the_training_code() -> None:
     find_packages = pytest.importorskip("setuptools").find_packages
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     packages = set(find_packages(str(ROOT), **settings["packages"]["find"]))
-    files = {
-        path
-        for package in ("pnpdepth_cli", "model_zoo_defs")
-        for path in (ROOT / package).rglob("*")
-        if path.is_file() and "training" not in path.parts
-    }
+    found = [*ROOT.glob("pnpdepth_cli/**/*"), *ROOT.glob("model_zoo_defs/**/*")]
+    files = {path for path in found if path.is_file() and "training" not in path.parts}
     folders = {path.parent for path in files if path.name == "__init__.py"}
     assert packages == {".".join(folder.relative_to(ROOT).parts) for folder in folders}
     patterns = settings["package-data"].items()
@@ -42,9 +38,8 @@ def test_the_version_is_that_of_the_citation_and_of_the_changelog() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     (released,) = re.findall(r'^date-released: "?([\d-]+)"?$', citation, re.MULTILINE)
     assert f"\nversion: {pnp.__version__}\n" in citation
-    sections = [line for line in (ROOT / "CHANGELOG.md").open() if line.startswith("## ")]
-    first = next(line for line in sections if line != "## Unreleased\n")
-    assert first == f"## {pnp.__version__} ({released})\n"
+    sections = re.findall("^## (?!Unreleased)(.*)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert sections[0] == f"{pnp.__version__} ({released})"
 
 
 def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() -> None:
@@ -58,12 +53,9 @@ def test_the_line_of_the_documentation_completes_commands_and_options_in_bash() 
         COMP_WORDS=(pnpdepth refine --unc) COMP_CWORD=2
         _pnpdepth_completion pnpdepth; echo "${{COMPREPLY[@]}}"
     """
-    path = os.pathsep.join([str(scripts), os.environ["PATH"]])
-    done = subprocess.run(
-        ["bash", "-c", script], capture_output=True, text=True, env={**os.environ, "PATH": path},
-        check=True,
-    )  # fmt: skip
-    assert done.stdout.split() == ["cloud", "--uncertainty"]
+    environment = os.environ | {"PATH": os.pathsep.join([str(scripts), os.environ["PATH"]])}
+    shown = subprocess.check_output(["bash", "-c", script], text=True, env=environment)
+    assert shown.split() == ["cloud", "--uncertainty"]
 
 
 def test_the_public_ci_runs_every_part_of_the_script_on_the_lowest_and_the_highest_python() -> None:
@@ -85,12 +77,11 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
     # The wheel, built from a copy of the sources.
     pytest.importorskip("build", reason="needs build")
     source, installed, empty = (tmp_path / name for name in ("source", "installed", "empty"))
-    source.mkdir()
     empty.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
     for name in ("pnpdepth_cli", "model_zoo_defs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist"]
     done = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -108,7 +99,6 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
     )
     command = [sys.executable, "-c", code, "refine", sample / "rgb.png"]
     command += ["--sparse", sample / "sparse.png", "-o"]
-
     for more, exit_code, message in (
         (["out"], 0, ""),
         (["other", "--model", "eigen-tiny"], 4, "eigen-tiny.safetensors"),

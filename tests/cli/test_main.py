@@ -22,7 +22,6 @@ from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.models.weights import read_checkpoint
 from tests.bags import write_bag
-from tests.commands.frames import scan_on_disk
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 GT = SAMPLES / "indoor" / "gt.png"
@@ -32,8 +31,6 @@ COMMANDS = {
     "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
     "batch": f"drive -o out {NETWORK}",
     "sample": "drive/gt/a.png -o sparse.png",
-    "simulate": "drive/gt/a.png --calib calib.txt --sensor vlp-16 -o sparse.png",
-    "project": "img.bin --calib calib.txt -o sparse.png",
     "eval": "drive/gt drive/gt",
 }
 
@@ -47,7 +44,6 @@ COMMANDS = {
         ("refine", "--device cuda:9", 6, "device cpu"),
         ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--poses one_pose.txt", 3, "has 1 poses for 2 frames"),
-        ("batch", "--accumulate -1", 2, "-1 is not in the range x>=0"),
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),
         ("batch", "--vary colour=red", 2, "choose from sample, model"),
         ("batch", "--vary lr=1%,,3%", 2, "empty"),
@@ -56,7 +52,6 @@ COMMANDS = {
         ("batch", "--vary lr=1%,3% --lr 1%", 2, "--lr is varied"),
         ("--max-pixels 10 sample", "--count 5", 3, "pixels"),
         ("sample", "--count many", 2, "neither a number such as 500 nor 5%"),
-        ("project", "--image missing.png", 3, "missing.png"),
         ("eval", "--protocol kiti", 2, "kitti"),
         ("eval", "--columns rmse,none", 2, "--columns none is not one of rmse, mae"),
         ("compare a.json b.json", "--csv x --latex ./x", 2, "--csv and --latex are the same file"),
@@ -69,7 +64,6 @@ COMMANDS = {
 def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
 ) -> None:
-    scan_on_disk(root.parent)
     Path("one_pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     Path("bad.json").write_text('{"frames": [{"name": "a", "scores": 3}]}')
     before = sorted(root.rglob("*"))
@@ -81,7 +75,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     assert (out, "Traceback" in err) == ("", False)
     assert sorted(root.rglob("*")) == before
     # a network is loaded in the folder of its results, which stays
-    outputs = ("sparse.png", "w.safetensors", "x", *(["out"] if code < 4 else []))
+    outputs = ("sparse.png", "x", *(["out"] if code < 4 else []))
     assert not any(Path(name).exists() for name in outputs)
 
 
@@ -148,9 +142,7 @@ def test_an_error_of_the_system_is_one_line_and_a_bug_its_traceback(
     assert run(["doctor"]) == code
     *traceback, last = capsys.readouterr().err.strip().splitlines()
     assert line in last
-    assert (
-        (code == 1) == any("in _execute_mock_call" in each for each in traceback) == bool(traceback)
-    )
+    assert [each[:9] for each in traceback[:1]] == ["Traceback"] * (code == 1)
 
 
 def onnx(path: Path) -> None:
