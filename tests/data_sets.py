@@ -191,7 +191,7 @@ def read_frames(root: Path, name: str | None = None) -> list[FrameFiles]:
     """The frames of a data set, all of which are complete."""
     _, frames, unmatched = list_frames(root, name)
     if unmatched and not frames:
-        raise InputError(str(unmatched[0]))
+        raise InputError(" ".join(map(str, unmatched[0])))
     return frames
 
 

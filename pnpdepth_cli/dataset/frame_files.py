@@ -110,7 +110,7 @@ class FrameFiles:
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks):
             if source is not None:
-                _check_path(file_of(source))
+                check_path(file_of(source))
 
     @property
     def image_file(self) -> Path | None:
@@ -212,22 +212,13 @@ class ReadOptions:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Unmatched:
-    """A file or folder that belongs to no frame."""
-
-    path: Path
-    why: str  # the reason, as the end of a sentence that begins with the path
-
-    def __post_init__(self) -> None:
-        _check_path(self.path)
-
-    def __str__(self) -> str:
-        return f"{self.path} {self.why}"
+Unmatched = tuple[Path, str]
+"""A file or folder that belongs to no frame, and why: the end of a sentence that the path begins.
+"""
 
 
-def _check_path(path: Path) -> None:
-    """InputError for a path that no file can have: an index file may hold any text."""
+def check_path(path: Path) -> None:
+    """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
     if not _can_be_named(str(path)):
         raise InputError(f"{str(path)!r}: no file can have this name; correct the list")
 
@@ -263,15 +254,13 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     return [(int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
 
 
-def one_of_each(
-    named: Iterable[tuple[str, Path]],
-) -> tuple[dict[str, Path], list[Unmatched]]:
+def one_of_each(named: Iterable[tuple[str, Path]]) -> tuple[dict[str, Path], list[Unmatched]]:
     """Returns the files whose name no other file has, by name, and the others."""
     files: dict[str, list[Path]] = {}
     for name, path in named:
         files.setdefault(name, []).append(path)
     ambiguous = [
-        Unmatched(path=path, why=f"and {paths[0].name} are one frame; keep one")
+        (path, f"and {paths[0].name} are one frame; keep one")
         for paths in files.values()
         for path in paths[1:]
     ]
@@ -286,8 +275,7 @@ def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Ite
         paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        why = f"cannot be read ({reason}); what is in it is left out"
-        problems.append(Unmatched(path=folder, why=why))
+        problems.append((folder, f"cannot be read ({reason}); what is in it is left out"))
         return
     for path in paths:
         if path.is_dir():

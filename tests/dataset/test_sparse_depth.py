@@ -169,7 +169,7 @@ def test_each_registered_photo_of_the_largest_model_is_a_frame(project: Path) ->
     layout, frames, unmatched = list_frames(project)
     assert (layout, [each.name for each in frames]) == ("colmap", ["a", "b"])
     assert frames[1].pose == ((1, 0, 0, -0.1), (0, 1, 0, 0), (0, 0, 1, 0))
-    lost = [each.path.relative_to(project).as_posix() for each in unmatched]
+    lost = [path.relative_to(project).as_posix() for path, _ in unmatched]
     assert lost == ["images/new.png", "sparse/1", "images/c.png"]
 
 

@@ -17,7 +17,6 @@ from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     Neighbour,
-    Unmatched,
     as_pose,
     file_of,
     groups_of,
@@ -45,7 +44,7 @@ class BatchFrames:
     """All frames of the source."""
     chosen: Sequence[FrameFiles]
     """Frames of these that the names, the limit and the shard choose."""
-    unmatched: tuple[Unmatched, ...]
+    unmatched: Sequence[str]
     poses: str | None
     """Where the poses of the frames are from, as a line; None without poses."""
 
@@ -90,7 +89,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         )
     # There must be some, with sparse depth and names that are fit for results.
     if not frames:
-        first = f" ({lost[0]})" if lost else ""
+        first = " ({} {})".format(*lost[0]) if lost else ""
         raise InputError(
             f"{source} looks like {layout!r} but has no frame in it{first};"
             f" layouts are {', '.join(LAYOUTS)}"
@@ -114,7 +113,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         layout=layout,
         frames=frames,
         chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
-        unmatched=tuple(each for each in lost if not _is_inside(each.path, output)),
+        unmatched=[f"{path} {why}" for path, why in lost if not _is_inside(path, output)],
         poses=poses,
     )
 

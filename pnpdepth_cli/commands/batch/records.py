@@ -262,7 +262,7 @@ def write_summary(
         titles=stage_titles(replace(results[0], weights=means)) if results else {},
         weights=weights,
         frame_notes=_frame_notes(results),
-        unmatched=[str(each) for each in found.unmatched],
+        unmatched=[*found.unmatched],
         varied=dict(request.varied),
     )
     # The files.

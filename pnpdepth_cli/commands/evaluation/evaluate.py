@@ -232,8 +232,8 @@ def _depth_files(folder: Path) -> dict[str, Path]:
     found, problems = find_files(folder, DEPTH_SUFFIXES)
     marked = {stem: path for stem, path in found.items() if _MARK.search(stem)} or found
     files, ambiguous = one_of_each((_frame_name(stem), path) for stem, path in marked.items())
-    if problems or ambiguous:
-        raise InputError(str([*problems, *ambiguous][0]))
+    if lost := [*problems, *ambiguous]:
+        raise InputError("{} {}".format(*lost[0]))
     if not files:
         suffixes = " ".join(DEPTH_SUFFIXES)
         raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, check_path
 from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest
 from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import InputError
@@ -169,7 +169,9 @@ def list_frames(
         for folder, each in found
         if isinstance(each, FrameFiles)
     ]
-    lost = dict.fromkeys(each for _, each in found if isinstance(each, Unmatched))
+    lost = dict.fromkeys(each for _, each in found if isinstance(each, tuple))
+    for path, _ in lost:
+        check_path(path)
     return layouts[0], frames, list(lost)
 
 

@@ -69,7 +69,7 @@ def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
         why = f"has no partner within {LONGEST_GAP_S} s that is not another's"
         for timed in (*images, *depths):
             if timed not in used:
-                yield Unmatched(path=timed[1], why=why)
+                yield timed[1], why
     # The frames, with poses where motion capture has them.
     poses = root / "groundtruth.txt"
     trajectory = read_trajectory(poses) if poses.is_file() else None
@@ -146,17 +146,15 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     yield from unreadable
     for path in files.values():
         if path.relative_to(photos).as_posix() not in model.images:
-            why = f"is not registered in {model.folder}"
-            yield Unmatched(path=path, why=why)
+            yield path, f"is not registered in {model.folder}"
     for other in models:
         if other is not model:
             why = f"is another model, of {len(other.images):,} images, in a unit of its own"
-            yield Unmatched(path=other.folder, why=why)
+            yield other.folder, why
     for name, image in sorted(model.images.items()):
         path = photos / name
         if not path.is_file():
-            why = f"is missing, but registered in {model.folder}; add it"
-            yield Unmatched(path=path, why=why)
+            yield path, f"is missing, but registered in {model.folder}; add it"
             continue
         pose = as_pose(np.column_stack(image.pose.inverse()))  # COLMAP's is of the world
         stem = Path(name).with_suffix("").as_posix()

@@ -110,9 +110,9 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
         dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)
         images = _of_drive(drive, Path(camera, "data"), *dates)
         parts = {
-            "sparse": Part(scans, "*.png"),
-            "image": Part(images, "*.IMAGE"),
-            "gt": Part(_truth_of(drive, camera), "*.png?"),
+            "sparse": (scans, "*.png"),
+            "image": (images, "*.IMAGE"),
+            "gt": (_truth_of(drive, camera), "*.png?"),
         }
         shared = replace(_OF_MAPS, calib=_calibration_of(images.parents[1]))
         yield from _frames_of_camera(drive, camera, parts, shared)
@@ -133,13 +133,12 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
     for camera in _raw_cameras(root):
         drive, calibration = camera.parent, _calibration_of(camera.parent)
         if calibration is None:
-            why = f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
-            yield Unmatched(path=drive, why=why)
+            yield drive, f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
             continue
         parts = {
-            "image": Part(camera / "data", "*.IMAGE"),
-            "sparse": Part(drive / _SCANS, "*.bin"),
-            "gt": Part(_truth_of(drive, camera.name), "*.png?"),
+            "image": (camera / "data", "*.IMAGE"),
+            "sparse": (drive / _SCANS, "*.bin"),
+            "gt": (_truth_of(drive, camera.name), "*.png?"),
         }
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
         yield from _frames_of_camera(drive, camera.name, parts, shared)
@@ -149,7 +148,7 @@ def _frames_of_camera(
     drive: Path, camera: str, parts: Mapping[str, Part], shared: FrameFiles
 ) -> Iterator[FrameFiles | Unmatched]:
     for found in join_parts(parts, replace(shared, camera=int(camera[-1]))):
-        if isinstance(found, Unmatched):
+        if isinstance(found, tuple):
             yield found
         else:
             yield replace(found, name=f"{drive.name}_{found.name}_{camera}")

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from pnpdepth_cli.dataset.frame_files import (
     IMAGE_SUFFIXES,
@@ -41,43 +40,41 @@ class Layout:
     """The frames of a folder or file that matches, and what is in no frame."""
 
 
-class Part(NamedTuple):
-    """Where the files of one part of a frame lie, and what they are called."""
+Part = tuple[Path, str]
+"""The folder of one part of a frame, and a pattern of the names of its files.
 
-    folder: Path
-    names: str
-    """A pattern. The stem is what * stands for, or groups of a regular expression; ** stands for
-    paths below the folder. A part whose pattern ends with ? may be missing."""
+The stem of a name is what * stands for, or groups of a regular expression; ** stands for paths
+below the folder. A part whose pattern ends with ? may be missing."""
 
-    @property
-    def optional(self) -> bool:
-        """Whether a frame may lack it."""
-        return self.names.endswith("?")
 
-    @property
-    def video(self) -> Path | None:
-        """The video that lies there instead of the folder of images."""
-        if not self.names.endswith(".IMAGE") or self.folder.is_dir():
-            return None
-        paths = (self.folder.with_name(self.folder.name + suffix) for suffix in VIDEO_SUFFIXES)
-        return next((path for path in paths if path.is_file()), None)
+def _video(folder: Path, names: str) -> Path | None:
+    """The video that lies there instead of the folder of images."""
+    if not names.endswith(".IMAGE") or folder.is_dir():
+        return None
+    paths = (folder.with_name(folder.name + suffix) for suffix in VIDEO_SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
 
-    def files(self) -> tuple[dict[str, Path], list[Unmatched]]:
-        """Returns the files by stem, sorted by number, and what belongs to no frame."""
-        stem, _, suffix = self.names.removesuffix("?").rpartition(".")
-        suffixes = _SUFFIXES.get(suffix, (f".{suffix}",))
-        if stem == "**":
-            return find_files(self.folder, suffixes)
-        stem = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
-        endings = "|".join(map(re.escape, suffixes))
-        pattern = re.compile(f"{stem}(?:{endings})", re.IGNORECASE | re.DOTALL)
-        paths = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
-        files, ambiguous = one_of_each(
-            ("".join(match.groups("")), path)
-            for path in paths
-            if (match := pattern.fullmatch(path.name)) and path.is_file()
-        )
-        return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
+
+def _exists(part: Part) -> bool:
+    return part[0].is_dir() or _video(*part) is not None
+
+
+def _files(folder: Path, names: str) -> tuple[dict[str, Path], list[Unmatched]]:
+    """The files of a part by stem, sorted by number, and what belongs to no frame."""
+    stem, _, suffix = names.removesuffix("?").rpartition(".")
+    suffixes = _SUFFIXES.get(suffix, (f".{suffix}",))
+    if stem == "**":
+        return find_files(folder, suffixes)
+    stem = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
+    endings = "|".join(map(re.escape, suffixes))
+    pattern = re.compile(f"{stem}(?:{endings})", re.IGNORECASE | re.DOTALL)
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    files, ambiguous = one_of_each(
+        ("".join(match.groups("")), path)
+        for path in paths
+        if (match := pattern.fullmatch(path.name)) and path.is_file()
+    )
+    return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
 def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
@@ -86,23 +83,23 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
     `shared` is a frame whose fields all frames have.
     """
     # The images may be a video, which has each frame by its number.
-    video = parts["image"].video
+    video = _video(*parts["image"])
     parts = {field: part for field, part in parts.items() if field != "image" or video is None}
     first, *others = parts
-    needed = [field for field in others if not parts[field].optional]
+    needed = [field for field in others if not parts[field][1].endswith("?")]
     for field in needed:
-        if not (folder := parts[field].folder).is_dir():
-            yield Unmatched(path=parts[first].folder, why=f"has no {folder}; add it")
+        if not (folder := parts[field][0]).is_dir():
+            yield parts[first][0], f"has no {folder}; add it"
             return
     files = dict[str, dict[str, Path]]()
     for field, part in parts.items():
-        files[field], unreadable = part.files()
+        files[field], unreadable = _files(*part)
         yield from unreadable
     # Files without a partner.
     for field, other in [*((first, each) for each in needed), *((each, first) for each in others)]:
         for stem in (stem for stem in files[field] if stem not in files[other]):
-            why = f"has no partner {stem}.* in {parts[other].folder}; add or remove one"
-            yield Unmatched(path=files[field][stem], why=why)
+            why = f"has no partner {stem}.* in {parts[other][0]}; add or remove one"
+            yield files[field][stem], why
     # The frames.
     for stem in files[first]:
         own = {field: found[stem] for field, found in files.items() if stem in found}
@@ -111,8 +108,7 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
         image: Path | VideoFrame | None = own.get("image")
         if video is not None:
             if (number := re.search(r"\d+$", stem)) is None:
-                why = f"has no number of a frame of {video} in its name"
-                yield Unmatched(path=own[first], why=why)
+                yield own[first], f"has no number of a frame of {video} in its name"
                 continue
             image = VideoFrame(path=video, index=int(number[0]))
         yield replace(
@@ -155,7 +151,7 @@ def row(
     probe = marks[0] if marks else needed[-1].split("|")[0]
 
     def is_place(place: Path) -> bool:
-        there = (p.optional or p.folder.is_dir() or p.video for p in parts_in(place).values())
+        there = (part[1].endswith("?") or _exists(part) for part in parts_in(place).values())
         return all(there) and all(next(place.glob(mark), None) for mark in marks)
 
     def find(root: Path) -> list[Path]:
@@ -170,7 +166,7 @@ def row(
             own = place / calib if calib and (place / calib).is_file() else None
             complete = more(place) if more else replace
             for found in join_parts(parts_in(place), replace(shared, calib=own)):
-                if isinstance(found, Unmatched):
+                if isinstance(found, tuple):
                     yield found
                 elif (frame := complete(found)) is not None:
                     yield replace(frame, name=name(root, place, frame.name))
@@ -181,5 +177,5 @@ def row(
 def _part(place: Path, text: str) -> Part:
     """The part of a place in the first of its folders, or videos, that exists."""
     folders, _, names = text.rpartition("/")
-    parts = [Part(place / folder, names) for folder in folders.split("|")]
-    return next((part for part in parts if part.folder.is_dir() or part.video), parts[0])
+    parts = [(place / folder, names) for folder in folders.split("|")]
+    return next(filter(_exists, parts), parts[0])

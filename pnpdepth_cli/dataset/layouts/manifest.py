@@ -34,7 +34,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     """A frame for each line of the file; missing files are unmatched."""
     # The frame of each line.
     frames: dict[int, FrameFiles] = {}
-    broken = []
+    broken = list[Unmatched]()
     for number, row in _rows(root):
         paths = {column: root.parent / row[column] for column in _PATHS if column in row}
         try:
@@ -43,8 +43,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
             raise InputError(f"{root}, line {number}: {one_line(error)}") from error
         for path in paths.values():
             if not path.exists():
-                why = f"does not exist; correct line {number} of {root}"
-                broken.append(Unmatched(path=path, why=why))
+                broken.append((path, f"does not exist; correct line {number} of {root}"))
     # No two frames may share a name, on file systems that ignore capitals either.
     named = _name_frames(list(frames.values()))
     first: dict[str, FrameFiles] = {}
