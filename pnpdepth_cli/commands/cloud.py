@@ -26,6 +26,7 @@ from pnpdepth_cli.sensors.point_cloud import (
     consistent_depth,
     merge_in_voxels,
     neighbouring_views,
+    points_of_depth,
 )
 
 _IN_MEMORY = 12
@@ -57,7 +58,7 @@ def write_depth_cloud(
     # The cloud, part by part.
     coloured = all(request.image or frame.image for frame in frames)
     placed = [np.eye(3, 4) if pose is None else pose for pose in poses]
-    parts = _some_points(request, _parts(request, frames, placed, coloured, notes, show))
+    parts = _parts(request, frames, placed, coloured, notes, show)
     make_folder(request.output.parent)
     merged = parts if request.voxel is None else [merge_in_voxels(parts, request.voxel)]
     points = write_cloud(request.output, merged)
@@ -95,34 +96,32 @@ def _parts(
     notes: list[str],
     show: Callable[[int, int], None],
 ) -> Iterator[PointCloud]:
-    """Yields the clouds of all depth maps, in the world's coordinates."""
+    """Yields the clouds of all depth maps in the world. Raises InputError if there is no point."""
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
-    def view(index: int) -> View:
+    def depth_and_camera(index: int) -> tuple[NDArray[np.float32], Camera]:
         depth = _depth(request, frames[index], notes)
         camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
         notes.extend(note for note in found if note not in notes)
-        return View(depth=depth, camera=camera, pose=poses[index])
+        return depth, camera
 
+    @functools.lru_cache(maxsize=_IN_MEMORY)
+    def view(index: int) -> View:
+        depth, camera = depth_and_camera(index)
+        return points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
+
+    empty = True
     for index, frame in enumerate(frames):
         show(index, len(frames))
-        here = view(index)
-        depth = here.depth
+        depth, camera = depth_and_camera(index)
         if request.min_views > 1:
             others = (view(other) for other in neighbouring_views(np.stack(poses), index))
-            depth = consistent_depth(here, others, request.min_views)
+            depth = consistent_depth(view(index), others, request.min_views)
         image = request.image or frame.image
         rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
-        for part in cloud_from_depth(depth, here.camera, rgb=rgb):
+        for part in cloud_from_depth(depth, camera, rgb):
+            empty &= not len(part.xyz)
             yield part.transform(poses[index])
-
-
-def _some_points(request: CloudRequest, parts: Iterator[PointCloud]) -> Iterator[PointCloud]:
-    """The parts. Raises InputError at the end if there was no point."""
-    empty = True
-    for part in parts:
-        empty &= not len(part.xyz)
-        yield part
     if empty:
         raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
 

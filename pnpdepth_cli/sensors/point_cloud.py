@@ -7,9 +7,7 @@ MVSNet fuses depth maps: Yao et al., 2018, section 4.2).
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +18,9 @@ from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, rays_of_image
 from pnpdepth_cli.sensors.pixels import Floats, Mask, pixel_index
 
-EDGE = 0.05
-"""Default jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps
-floors down to a grazing angle of about 5 degrees."""
+_EDGE = 0.05
+"""Jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps floors
+down to a grazing angle of about 5 degrees."""
 
 _NEIGHBOURS = 8
 _WIDEST_DEG = 60.0
@@ -51,25 +49,24 @@ class PointCloud(NamedTuple):
         return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)
 
 
+View = tuple[NDArray[np.float32], Camera, Floats]
+"""The points (H, W, 3) of a depth map in its camera's coordinates, 0 where depth is unknown; the
+camera; and its pose (3, 4) in the world."""
+
+
 def cloud_from_depth(
-    depth: NDArray[np.float32],
-    camera: Camera,
-    *,
-    rgb: NDArray[np.float32] | None = None,
-    keep: Mask | None = None,
-    edge: float = EDGE,
+    depth: NDArray[np.float32], camera: Camera, rgb: NDArray[np.float32] | None = None
 ) -> Iterator[PointCloud]:
     """Yields the points of a depth map in the camera's coordinates, some rows of pixels at a time.
+
+    Pixels beside a jump of depth are left out.
 
     Args:
         depth: (H, W), 0 = unknown.
         camera: Intrinsics and distortion of the image that the depth belongs to.
         rgb: (H, W, 3) 0…1.
-        keep: (H, W) false for pixels that are left out.
-        edge: A pixel is left out if the depth of one of its four neighbours differs by more than
-            this fraction from what continues its own surface. 0 keeps all pixels.
     """
-    known = kept_pixels(depth, keep, edge)
+    known = kept_pixels(depth)
     height, width = depth.shape
     rays = rays_of_image(camera, (height, width))
     rows = max(1, _PART_PIXELS // width)
@@ -88,21 +85,23 @@ def cloud_from_depth(
         )
 
 
-def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None, edge: float = EDGE) -> Mask:
-    """Returns (H, W) true for the pixels of which `cloud_from_depth` makes points."""
-    known: Mask = (depth > 0) & np.isfinite(depth)
+def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None) -> Mask:
+    """Returns (H, W) true for the pixels of `keep` of which `cloud_from_depth` makes points."""
+    known = _known_pixels(depth)
     if keep is not None:
         known &= keep
-    if edge:
-        known &= ~depth_edges(np.where(known, depth, 0), edge)
-    return known
+    return known & ~depth_edges(np.where(known, depth, 0))
 
 
-def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
+def _known_pixels(depth: NDArray[np.float32]) -> Mask:
+    return np.asarray((depth > 0) & np.isfinite(depth))
+
+
+def depth_edges(depth: NDArray[np.float32]) -> Mask:
     """Returns (H, W) true for pixels beside a jump of depth, on both of its sides.
 
-    A jump is a second difference of inverse depth of more than `edge` of the inverse depth. A
-    plane has none, whatever its slope: inverse depth is linear in the pixel coordinates.
+    A jump is a second difference of inverse depth that is large beside the inverse depth. A plane
+    has none, whatever its slope: inverse depth is linear in the pixel coordinates.
     """
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
@@ -111,16 +110,20 @@ def depth_edges(depth: NDArray[np.float32], edge: float) -> Mask:
         values = np.moveaxis(inverse, axis, 0)
         middle = values[1:-1]
         bend = np.abs(values[2:] - 2 * middle + values[:-2])
-        jump = bend > edge * middle  # false beside unknown pixels
+        jump = bend > _EDGE * middle  # false beside unknown pixels
         np.moveaxis(result, axis, 0)[1:-1] |= jump
     return result
 
 
 def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
     """Returns (H, W, 3) unit normals towards the camera; 0 where depth is unknown."""
-    known = kept_pixels(depth, edge=0)
+    return _normals(points_of_depth(depth, camera), _known_pixels(depth))
+
+
+def points_of_depth(depth: NDArray[np.float32], camera: Camera) -> Floats:
+    """Returns (H, W, 3) points in the camera's coordinates, 0 where depth is unknown."""
     rays = rays_of_image(camera, (depth.shape[0], depth.shape[1]))
-    return _normals(_points(depth, known, rays), known)
+    return _points(depth, _known_pixels(depth), rays)
 
 
 def _points(depth: NDArray[np.float32], known: Mask, rays: Floats) -> Floats:
@@ -175,27 +178,6 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """A depth map with its camera."""
-
-    depth: NDArray[np.float32]  # (H, W), 0 = unknown
-    camera: Camera
-    pose: Floats  # (3, 4) from the camera's coordinates to the world's
-
-    @functools.cached_property
-    def known(self) -> NDArray[np.intp]:
-        """(N,) row-major indices of the pixels with known depth."""
-        return np.flatnonzero(kept_pixels(self.depth, edge=0))
-
-    @functools.cached_property
-    def points(self) -> NDArray[np.float32]:
-        """(H·W, 3) point of each pixel in the camera's coordinates, 0 where unknown."""
-        known = kept_pixels(self.depth, edge=0)
-        rays = rays_of_image(self.camera, (self.depth.shape[0], self.depth.shape[1]))
-        return _points(self.depth, known, rays).reshape(-1, 3).astype(np.float32)
-
-
 def neighbouring_views(poses: Floats, index: int) -> list[int]:
     """Returns the views, of poses (N, 3, 4), nearest to one that look about the same way."""
     distance = np.linalg.norm(poses[:, :, 3] - poses[index, :, 3], axis=1)
@@ -210,32 +192,35 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
 
     `min_views` have to agree, this one included.
     """
-    rows, columns = np.divmod(here.known, here.depth.shape[1])
-    xy, depth = np.column_stack([columns, rows]), here.depth.ravel()[here.known].astype(float)
-    world = _apply(here.points[here.known], here.pose)
+    points, camera, pose = here
+    known = points[:, :, 2] > 0
+    rows, columns = np.nonzero(known)
+    xy, depth = np.column_stack([columns, rows]), points[known][:, 2].astype(float)
+    world = _apply(points[known], pose)
     total, count = depth.copy(), np.ones(len(depth))
     for other in others:
-        index, back = _project_back(world, here, other)
-        away = np.linalg.norm(pixels_of(here.camera, back) - xy[index], axis=1)
+        index, back = _project_back(world, pose, other)
+        away = np.linalg.norm(pixels_of(camera, back) - xy[index], axis=1)
         same = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
         agrees = (away <= _RETURN_PX) & same
         total[index[agrees]] += back[agrees, 2]
         count[index[agrees]] += 1
-    result = np.zeros(here.depth.size, np.float32)
-    result[here.known] = np.where(count >= min_views, total / count, 0)
-    return result.reshape(here.depth.shape)
+    result = np.zeros(known.shape, np.float32)
+    result[known] = np.where(count >= min_views, total / count, 0)
+    return result
 
 
-def _project_back(world: Floats, here: View, other: View) -> tuple[NDArray[np.intp], Floats]:
-    """Indices of points that another view has depth of, and its points there, seen from here."""
-    seen = _apply_inverse(world, other.pose)
+def _project_back(world: Floats, here: Floats, other: View) -> tuple[NDArray[np.intp], Floats]:
+    """Indices of points that another view has depth of, and its points there, seen from a pose."""
+    points, camera, pose = other
+    seen = _apply_inverse(world, pose)
     index = np.flatnonzero(seen[:, 2] > 0)
-    xy = pixels_of(other.camera, seen[index])
-    size = (other.depth.shape[0], other.depth.shape[1])
+    xy = pixels_of(camera, seen[index])
+    size = (points.shape[0], points.shape[1])
     inside = in_frame(xy, size)
-    index, points = index[inside], other.points[pixel_index(xy[inside], size)]
-    back = _apply_inverse(_apply(points, other.pose), here.pose)
-    usable = (points[:, 2] > 0) & (back[:, 2] > 0)
+    index, met = index[inside], points.reshape(-1, 3)[pixel_index(xy[inside], size)]
+    back = _apply_inverse(_apply(met, pose), here)
+    usable = (met[:, 2] > 0) & (back[:, 2] > 0)
     return index[usable], back[usable]
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +18,15 @@ from pnpdepth_cli.sensors.point_cloud import (
     depth_edges,
     merge_in_voxels,
     neighbouring_views,
+    points_of_depth,
 )
 
 HEIGHT, WIDTH = 24, 32
 CAMERA = Camera(intrinsics=np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]]))
 
 
-def whole(depth: np.ndarray, **options: Any) -> PointCloud:
-    return joined(cloud_from_depth(depth, CAMERA, **options))
+def whole(depth: np.ndarray) -> PointCloud:
+    return joined(cloud_from_depth(depth, CAMERA))
 
 
 def joined(clouds: Iterable[PointCloud]) -> PointCloud:
@@ -53,18 +52,15 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
     depth[:, 20:] = 2
     expected = np.zeros_like(depth, bool)
     expected[:, 19:21] = True
-    assert (depth_edges(depth, 0.05) == expected).all()
+    assert (depth_edges(depth) == expected).all()
     assert len(whole(depth).xyz) == HEIGHT * (WIDTH - 2)
-    assert len(whole(depth, edge=0).xyz) == HEIGHT * WIDTH
 
 
-def test_unknown_and_excluded_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
+def test_unknown_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
     depth = np.full((HEIGHT, WIDTH), 3, np.float32)
     depth[8, 4], depth[5, 6] = 0, np.inf
-    keep = np.ones(depth.shape, bool)
-    keep[:2] = False
-    cloud = whole(depth, keep=keep)
-    assert len(cloud.xyz) == HEIGHT * WIDTH - 2 * WIDTH - 2
+    cloud = whole(depth)
+    assert len(cloud.xyz) == HEIGHT * WIDTH - 2
     assert (cloud.xyz[:, 2] == 3).all()
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     moved = cloud.transform(np.column_stack([turn, [1.0, 2, 3]]))
@@ -91,32 +87,37 @@ WALL_SIZE = (36, 48)
 WALL_CAMERA = Camera(intrinsics=np.array([[40.0, 0, 23.5], [0, 40, 17.5], [0, 0, 1]]))
 
 
-def view_of_a_wall(x: float, scale: float = 1.0) -> View:
-    """A camera at (x, 0, 0) before the wall z = 5 + 0.2 x."""
+def depth_of_a_wall(x: float) -> np.ndarray:
+    """What a camera at (x, 0, 0) sees of the wall z = 5 + 0.2 x."""
     columns = np.broadcast_to((np.arange(WALL_SIZE[1]) - 23.5) / 40, WALL_SIZE)
-    depth = (5 + 0.2 * x) / (1 - 0.2 * columns)
-    pose = np.column_stack([np.eye(3), [x, 0, 0]])
-    return View(depth=(scale * depth).astype(np.float32), camera=WALL_CAMERA, pose=pose)
+    return ((5 + 0.2 * x) / (1 - 0.2 * columns)).astype(np.float32)
+
+
+def view_at(x: float, depth: np.ndarray) -> View:
+    points = points_of_depth(depth, WALL_CAMERA).astype(np.float32)
+    return points, WALL_CAMERA, np.column_stack([np.eye(3), [x, 0, 0]])
 
 
 def test_a_wrong_view_is_outvoted_and_does_not_move_the_mean() -> None:
-    here, right, wrong = view_of_a_wall(0.0), view_of_a_wall(0.4), view_of_a_wall(0.2, 1.2)
+    depth = depth_of_a_wall(0.0)
+    here, right = view_at(0.0, depth), view_at(0.4, depth_of_a_wall(0.4))
+    wrong = view_at(0.2, np.float32(1.2) * depth_of_a_wall(0.2))
     kept = consistent_depth(here, [right, wrong], 2)
     known = kept > 0
     assert known.mean() > 0.8
-    np.testing.assert_allclose(kept[known], here.depth[known], rtol=0.005)
+    np.testing.assert_allclose(kept[known], depth[known], rtol=0.005)
     assert not consistent_depth(wrong, [here, right], 2).any()
     assert not consistent_depth(here, [right, wrong], 3).any()
 
 
 def test_a_pixel_that_is_unknown_occluded_or_outside_elsewhere_is_left_out() -> None:
-    here, other = view_of_a_wall(0.0), view_of_a_wall(0.0)
-    depth = other.depth.copy()
-    depth[:10], depth[10:20], depth[20:25] = 0, 1.0, np.inf
-    kept = consistent_depth(here, [replace(other, depth=depth)], 2)
+    depth = depth_of_a_wall(0.0)
+    here, other = view_at(0.0, depth), depth.copy()
+    other[:10], other[10:20], other[20:25] = 0, 1.0, np.inf
+    kept = consistent_depth(here, [view_at(0.0, other)], 2)
     assert not kept[:25].any()
-    np.testing.assert_allclose(kept[25:], here.depth[25:], rtol=1e-6)
-    aside = consistent_depth(here, [view_of_a_wall(0.5)], 2)
+    np.testing.assert_allclose(kept[25:], depth[25:], rtol=1e-6)
+    aside = consistent_depth(here, [view_at(0.5, depth_of_a_wall(0.5))], 2)
     assert (aside[:, :2] == 0).all()  # the other camera stands to the right
     assert (aside[:, 6:] > 0).all()
 

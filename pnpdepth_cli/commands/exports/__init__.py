@@ -76,7 +76,7 @@ class ExportFrame:
         """Returns the frame's share of the points to begin with, in the world's coordinates."""
         assert self.pose is not None
         rgb = image_of_size(self.image, self.size)
-        parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb=rgb))
+        parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
         step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
         cloud = PointCloud(
             xyz=np.concatenate([part.xyz for part in parts])[::step],
