@@ -21,8 +21,7 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.sensors.pixels import Points
-from pnpdepth_cli.sensors.projection import occluded_in_map
+from pnpdepth_cli.sensors.projection import Points, occluded_in_map
 from pnpdepth_cli.settings import ClosedSettings, Settings
 
 Depth = NDArray[np.float32]

@@ -14,7 +14,7 @@ from benchmarks.frames import SETS, Depth, EvalFrame
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import NYU_PART, FramePart
-from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import LIDARS, simulate_lidar
 
 ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0

@@ -106,9 +106,7 @@ def sample(**values: Any) -> None:
 )
 @options.seed
 @options.sparse_files
-def simulate(
-    sensor: str | None, beams: int | None, vertical_fov: tuple[float, float] | None, **values: Any
-) -> None:
+def simulate(**values: Any) -> None:
     """Simulate the sparse depth of a LiDAR in the scene of the dense DEPTH.
 
     \b
@@ -117,9 +115,9 @@ def simulate(
     pnpdepth simulate gt.png --beams 40 --vertical-fov 15 -25 --calib calib.txt -o sparse.exr
     """
     from pnpdepth_cli.cli.printing import print_sparse
-    from pnpdepth_cli.commands.make_sparse import lidar_of, simulate_scan
+    from pnpdepth_cli.commands.make_sparse import simulate_scan
 
-    print_sparse(simulate_scan(sensor=lidar_of(sensor, beams, vertical_fov), **values))
+    print_sparse(simulate_scan(**values))
 
 
 @click.command(short_help="Write the frames of a ROS bag as files.")

@@ -55,7 +55,7 @@ from pnpdepth_cli.io.poses import POSES_FILE
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan, write_cloud
 from pnpdepth_cli.sensors.lens import unproject
-from pnpdepth_cli.sensors.pixels import describe_dropped
+from pnpdepth_cli.sensors.projection import describe_dropped
 
 RECORD = "frames.json"
 _NOT_IN_RECORD = ("output", "overwrite")

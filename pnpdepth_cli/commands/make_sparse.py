@@ -15,7 +15,7 @@ from pnpdepth_cli.dataset.arrays import check_size, record_of
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
-from pnpdepth_cli.errors import OutputError, UsageError
+from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
@@ -24,14 +24,8 @@ from pnpdepth_cli.io.file_bytes import plain, write_json
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.visualisation import overlay
-from pnpdepth_cli.sensors.pixels import Points, as_depth_image
-from pnpdepth_cli.sensors.simulation import (
-    LIDARS,
-    Lidar,
-    ideal_lidar,
-    sample_points,
-    simulate_lidar,
-)
+from pnpdepth_cli.sensors.projection import Points, as_depth_image
+from pnpdepth_cli.sensors.simulation import lidar_of, sample_points, simulate_lidar
 
 Written = tuple[Points, list[str], list[Path]]
 """The points, lines for a person, and the files that were written."""
@@ -136,20 +130,26 @@ def simulate_scan(
     depth: Path,
     calib: Path,
     output: Path,
-    sensor: Lidar,
     *,
+    sensor: str | None = None,
+    beams: int | None = None,
+    vertical_fov: tuple[float, float] | None = None,
     seed: int = 0,
     depth_scale: float | None = None,
     overwrite: bool = False,
 ) -> Written:
-    """Writes the points of a sensor at the camera's place; returns what was written."""
+    """Writes the points of a sensor at the camera's place; returns what was written.
+
+    The sensor is one by name, or of so many beams between two elevations, degrees.
+    """
+    lidar = lidar_of(sensor, beams, vertical_fov)
     files = _outputs(output, (depth, calib), overwrite)
     dense, notes = _dense(depth, depth_scale)
     calibration = read_calibration(calib)
     notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
-    points = simulate_lidar(dense, calibration.camera, sensor, seed)
-    notes.append(f"sparse: {describe_range(points.depth, Reading(f'{sensor.name}, seed {seed}'))}")
-    settings = {"command": "simulate", "sensor": plain(asdict(sensor)), "seed": seed}
+    points = simulate_lidar(dense, calibration.camera, lidar, seed)
+    notes.append(f"sparse: {describe_range(points.depth, Reading(f'{lidar.name}, seed {seed}'))}")
+    settings = {"command": "simulate", "sensor": plain(asdict(lidar)), "seed": seed}
     read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
     return _write(files, points, settings, inputs, notes)
@@ -160,18 +160,3 @@ def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[s
     dense = read_depth(path, scale=scale)
     values, notes = plausible_map(dense.values, dense.reading, "depth", "--depth-scale", scale)
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]
-
-
-def lidar_of(
-    name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
-) -> Lidar:
-    """Returns the sensor of this name, or one of so many beams between two elevations, degrees.
-
-    Raises:
-        UsageError: Neither or both are given.
-    """
-    if name is not None and beams is None and vertical_fov is None:
-        return LIDARS[name]
-    if name is not None or beams is None or vertical_fov is None:
-        raise UsageError("give --sensor, or --beams and --vertical-fov")
-    return ideal_lidar(beams, *vertical_fov)

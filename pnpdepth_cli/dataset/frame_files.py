@@ -306,18 +306,14 @@ def name_problem(name: str) -> str | None:
 _FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
 
 
-def groups_by_name(names: Sequence[str]) -> list[str]:
-    """Returns the sequence of each frame: its name before the frame number, or else its folder.
-
-    `drive_0002_sync_0000000008_image_02` is of `drive_0002_sync`, and `office/0012` of `office`.
-    Unless all names end in a number, only folders make groups.
-    """
-    stems = [_FRAME_NUMBER.sub("", name) for name in names]
-    if all(stem != name for stem, name in zip(stems, names, strict=True)):
-        return stems
-    return [name.rpartition("/")[0] for name in names]
-
-
 def groups_of(names: Sequence[str], stated: Sequence[str | None]) -> list[str]:
-    """Returns the sequence of each frame: the one that the data set states, else by its name."""
-    return [own or name for own, name in zip(stated, groups_by_name(names), strict=True)]
+    """Returns the sequence of each frame: the one that the data set states, else by its name.
+
+    That is its name before the frame number, or else its folder: of `drive_02_sync_008_image_02`
+    it is `drive_02_sync`, of `office/0012` `office`. Unless all names end in a number, only folders
+    make groups.
+    """
+    groups = [_FRAME_NUMBER.sub("", name) for name in names]
+    if any(group == name for group, name in zip(groups, names, strict=True)):
+        groups = [name.rpartition("/")[0] for name in names]
+    return [own or group for own, group in zip(stated, groups, strict=True)]

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.dataset.arrays import read_image, record_of
-from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, Neighbour, file_of
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, file_of
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.file_bytes import fingerprint
@@ -24,7 +24,7 @@ from pnpdepth_cli.sensors.accumulation import (
     motion_of_images,
 )
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.pixels import Floats, Points
+from pnpdepth_cli.sensors.projection import Points
 
 _CONTRADICTION = 0.0075
 """Fraction of the image's width by which contradicting poses move points off what images show. On a
@@ -65,19 +65,26 @@ def read_neighbours(
     own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
     scans, records, notes = dict[int, list[Scan]](), list[FileRecord](), list[str]()
     for each in files.neighbours:
-        # The neighbour's points, and its motion, from poses or from the images.
+        # The neighbour's points, and the motion that the images show where it is of use.
         points, source = points_of(each.files), each.files.sparse or each.files.gt
         assert source is not None
-        poses, off = each.poses, None
-        if each.motion is None:
-            motion, basis = _motion_shown(files, each.files, points, camera)
-            poses = f"{each.poses}: {basis}"
-        else:
-            motion, basis = np.array(each.motion), each.poses
-            # Poses of the nearest neighbour are compared with the images.
-            if each.apart == 1 and 1 not in scans:
-                off = _off_images(files, each, points, camera)
-                notes += [off] if off else []
+        here, there, shown, basis = files.image, each.files.image, None, ""
+        is_nearest = each.apart == 1 and 1 not in scans
+        if here is not None and there is not None and (each.motion is None or is_nearest):
+            seen = _keypoints_of(here, files.part), _keypoints_of(there, each.files.part)
+            shown, basis = motion_of_images(*seen, points, camera)
+        # Its motion is that, or of poses, which must not contradict the images.
+        motion, poses, off_px = shown, f"{each.poses}: {basis}", 0.0
+        if each.motion is not None:
+            motion, poses = np.array(each.motion), each.poses
+            off_px = 0.0 if shown is None else _distance_px(motion, shown, points, camera)
+        off = not off_px <= _CONTRADICTION * points.size[1]
+        if off:
+            notes.append(
+                f"warning: the poses contradict the images: the motion from {_name_of(each.files)}"
+                f" on, by {basis}, puts points {off_px:.0f} px elsewhere; give poses of these"
+                " frames, or none"
+            )
         # A neighbour of known motion joins.
         if motion is None:
             notes.append(
@@ -90,7 +97,7 @@ def read_neighbours(
             record_of(source),
             poses=poses,
             motion=None if motion is None else motion.tolist(),
-            contradicts_images=off is not None,
+            contradicts_images=off,
         )
         records.append(record)
     # At least one must join.
@@ -102,39 +109,17 @@ def read_neighbours(
     return accumulate(own, scans, camera).tensors(), records, notes
 
 
-def _off_images(
-    files: FrameFiles, neighbour: Neighbour, points: Points, camera: Camera
-) -> str | None:
-    """A warning if the motion by the poses is not the one that the images of two frames show."""
-    if files.image is None or neighbour.files.image is None:
-        return None
-    shown, basis = _motion_shown(files, neighbour.files, points, camera)
-    if shown is None:
-        return None
-    motions = (np.array(neighbour.motion), shown)
+def _distance_px(one: Floats, other: Floats, points: Points, camera: Camera) -> float:
+    """The median distance in the image between where two motions put points."""
     xyz = unproject(camera, points.xy, points.depth)
-    moved = [xyz @ motion[:, :3].T + motion[:, 3] for motion in motions]
+    moved = [xyz @ motion[:, :3].T + motion[:, 3] for motion in (one, other)]
     seen = (moved[0][:, 2] > 0) & (moved[1][:, 2] > 0)
     pixels = [pixels_of(camera, each[seen]) for each in moved]
-    off_px = float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)))
-    if off_px <= _CONTRADICTION * points.size[1]:
-        return None
-    return (
-        f"warning: the poses contradict the images: the motion from {_name_of(neighbour.files)} on,"
-        f" by {basis}, puts points {off_px:.0f} px elsewhere; give poses of these frames, or none"
-    )
+    return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)))
 
 
-def _motion_shown(
-    here: FrameFiles, there: FrameFiles, points: Points, camera: Camera
-) -> tuple[Floats | None, str]:
-    """The motion that two images show, and its basis; `points` are those of `there`."""
-    return motion_of_images(_keypoints_of(here), _keypoints_of(there), points, camera)
-
-
-def _keypoints_of(files: FrameFiles) -> Keypoints:
-    assert files.image is not None
-    return _keypoints(files.image, files.part, fingerprint(file_of(files.image)).sha256)
+def _keypoints_of(image: ImageSource, part: FramePart) -> Keypoints:
+    return _keypoints(image, part, fingerprint(file_of(image)).sha256)
 
 
 @functools.lru_cache(maxsize=16)  # images

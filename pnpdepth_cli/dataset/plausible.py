@@ -29,6 +29,7 @@ from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.depth import metres, scale_warning
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.sensors.projection import DropCounter, Mask
 
 _AT_SENSOR_M = 1e-3
 _FARTHEST_M = 1e5  # of a coordinate of a scan
@@ -51,8 +52,6 @@ _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of
 MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
 """The smallest and the largest median, metres, of depth maps and of ranges of scans."""
 
-Mask = NDArray[np.bool_]
-
 
 def scan_returns(
     path: Path | str, xyz: NDArray[np.floating], scale: float | None = None
@@ -68,53 +67,48 @@ def scan_returns(
         InputError: Many coordinates are none of a scan, or are implausible in metres.
         NoPointsError: No point is left.
     """
-    counts, keep = dict[str, int](), np.ones(len(xyz), bool)
-
-    def drop(mask: Mask, why: str) -> None:
-        counts[why] = int(np.count_nonzero(keep & mask))
-        np.logical_and(keep, ~mask, out=keep)
-
-    # beams without return: as no numbers, as zeros, at one place, at the sensor's largest range
     finite = np.isfinite(xyz)
-    drop(~finite.any(axis=1), "without return, as they are not finite")
     known = np.where(finite, xyz, 0)
     range_m = np.linalg.norm(known.astype(np.float64), axis=1)
-    drop(finite.all(axis=1) & (range_m < _AT_SENSOR_M), "without return, as they are at the sensor")
-    drop(_at_one_place(xyz, keep), "without return, as they are at one and the same place")
-    plane = np.zeros(len(xyz), bool)
-    plane[keep] = _far_plane(range_m[keep])[0]
-    drop(plane, "without return, as they are at one range far beyond all others")
-    # coordinates that are none
     odd = ~finite.all(axis=1) | (np.abs(known) > _FARTHEST_M).any(axis=1)
-    if np.count_nonzero(odd & keep) > _BROKEN * len(xyz):
-        first = int(np.flatnonzero(odd & keep)[0])
-        raise InputError(
-            f"{path}: {np.count_nonzero(odd & keep):,} of {len(xyz):,} points have a coordinate"
+    # beams without return: as no numbers, as zeros, at one place, at the sensor's largest range
+    drops, row = DropCounter(), np.arange(len(xyz))
+    row = row[drops.keep(finite.any(axis=1), "without return, as they are not finite")]
+    seen = ~finite[row].all(axis=1) | (range_m[row] >= _AT_SENSOR_M)
+    row = row[drops.keep(seen, "without return, as they are at the sensor")]
+    apart = ~_at_one_place(xyz[row].astype(np.float64))
+    row = row[drops.keep(apart, "without return, as they are at one and the same place")]
+    near = ~_far_plane(range_m[row])[0]
+    row = row[drops.keep(near, "without return, as they are at one range far beyond all others")]
+    # coordinates that are none
+    if np.count_nonzero(odd[row]) > _BROKEN * len(xyz):
+        first = int(row[odd[row]][0])
+        raise FileFormatError(
+            f"{path}: {np.count_nonzero(odd[row]):,} of {len(xyz):,} points have a coordinate"
             f" that is none of a scan (number {first + 1:,}:"
             f" {' '.join(f'{n:.3g}' for n in xyz[first])} m); its numbers are probably not stored"
             " as the format says"
         )
-    drop(odd, "with a coordinate that is none")
-    if not keep.any():
+    row = row[drops.keep(~odd[row], "with a coordinate that is none")]
+    if not len(row):
         raise NoPointsError(f"{path}: none of its {len(xyz):,} points is a return")
-    dropped = {why: count for why, count in counts.items() if count}
+    dropped = {why: count for why, count in drops.dropped.items() if count}
     notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
     divisor, lines = divisor_to_metres(
-        range_m[keep], Reading("scan"), f"{path}: range", "--depth-scale", scale, SCANS
+        range_m[row], Reading("scan"), f"{path}: range", "--depth-scale", scale, SCANS
     )
-    points = np.ascontiguousarray(xyz[keep], np.float32) / np.float32(divisor)
+    points = np.ascontiguousarray(xyz[row], np.float32) / np.float32(divisor)
     return points, dropped, [*notes, *lines]
 
 
-def _at_one_place(xyz: NDArray[np.floating], keep: Mask) -> Mask:
-    """(N,) true for points at a place that more of the points to keep share than beams can."""
-    result, rows = np.zeros(len(xyz), bool), np.asarray(xyz[keep], np.float64)
-    if len(rows) >= _FEW:
-        mixed = rows @ (1.0, np.pi, np.e**2)  # one number for each place
-        keys, counts = np.unique(mixed, return_counts=True)
-        if counts.max() >= max(_LEAST_SAME, _SAME * len(rows)):
-            result[keep] = mixed == keys[counts.argmax()]
-    return result
+def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
+    """(N,) true for points at a place that more of them share than beams can."""
+    if len(xyz) < _FEW:
+        return np.zeros(len(xyz), bool)
+    mixed = xyz @ (1.0, np.pi, np.e**2)  # one number for each place
+    keys, counts = np.unique(mixed, return_counts=True)
+    is_shared: bool = counts.max() >= max(_LEAST_SAME, _SAME * len(xyz))
+    return np.asarray((mixed == keys[counts.argmax()]) & is_shared)
 
 
 def _far_plane(values: NDArray[np.float64]) -> tuple[Mask, float, float]:

@@ -41,7 +41,7 @@ from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import METRES, SparsePoints
-from pnpdepth_cli.sensors.pixels import Points, as_depth_image
+from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.settings import Settings
 
@@ -95,7 +95,7 @@ def read_frame(
     )
     # Points that wrong poses moved say nothing of the image.
     contradicted = any(each.contradicts_images for each in neighbours)
-    stated = sparse.calibrated or files.one_view or options.registration == "off"
+    stated = sparse.camera is not None or files.one_view or options.registration == "off"
     one_view = contradicted or stated
     # What a record and a person should know.
     found["sparse"] = sparse.record, [*sparse.notes]

@@ -28,8 +28,9 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.pixels import Points, describe_dropped
 from pnpdepth_cli.sensors.projection import (
+    Points,
+    describe_dropped,
     edge_agreement,
     edge_ranks,
     near_jumps,
@@ -112,7 +113,6 @@ def read_scan_points(
         notes.append(f"sparse: dropped {lost}")
     return SparseDepth(
         points=points,
-        calibrated=True,
         camera=replace(camera, source=f"calibration of {path.name}"),
         record=FileRecord(
             path=str(path),

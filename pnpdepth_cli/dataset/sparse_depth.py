@@ -33,8 +33,15 @@ from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS, SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.pixels import DropCounter, Points, describe_dropped, pixel_index
-from pnpdepth_cli.sensors.projection import behind_foreground, hidden_among, occluded_in_map
+from pnpdepth_cli.sensors.projection import (
+    DropCounter,
+    Points,
+    behind_foreground,
+    describe_dropped,
+    hidden_among,
+    occluded_in_map,
+    pixel_index,
+)
 
 _SIZES_IN_RANGE = 8.0
 """A 16-bit file in model units holds depths up to at least so many times the model's extent."""
@@ -57,10 +64,8 @@ class SparseDepth:
     reading: Reading
     """How the file was read; its scale is integers per unit, None if the file holds none."""
     unit: str = METRES
-    calibrated: bool = False
-    """Whether a calibration, or the pose in a model, says where the image shows the points."""
     camera: Camera | None = None
-    """The camera of the whole image, where it came with the points."""
+    """The camera of the whole image, by which a calibration or a model projects the points."""
     pose: NDArray[np.float64] | None = None
     """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
 
@@ -230,7 +235,6 @@ def read_colmap_points(
         notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(
         points=points.resized(*size),
-        calibrated=True,
         camera=replace(camera.resized(*size), source=f"COLMAP model {path}"),
         pose=np.column_stack([pose.rotation, pose.translation * (unit_scale or 1.0)]),
         unit=unit,

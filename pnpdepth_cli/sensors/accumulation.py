@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.sensors.lens import rays_of, unproject
-from pnpdepth_cli.sensors.pixels import Floats, Mask, Points
-from pnpdepth_cli.sensors.projection import points_in_image
+from pnpdepth_cli.sensors.projection import Mask, Points, points_in_image
 
 # Differences of log depth to a measured point that agree and that contradict. The first was chosen
 # on frames 2 and 4 of a KITTI drive, the second and `_CLOSE` on its frames 0, 2, 4 and 6.

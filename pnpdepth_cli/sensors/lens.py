@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Floats
 
-Floats = NDArray[np.float64]
 Coefficients = tuple[float, ...]
 
 _WIDEST_PLANE, _WIDEST_ANGLE = 10.0, 1.569

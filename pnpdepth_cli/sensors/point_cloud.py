@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, rays_of_image
-from pnpdepth_cli.sensors.pixels import Floats, Mask, pixel_index
+from pnpdepth_cli.sensors.projection import Mask, pixel_index
 
 _EDGE = 0.05
 """Jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps floors

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
+from pnpdepth_cli.camera import Camera, Floats
+from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.lens import pixels_of
-from pnpdepth_cli.sensors.pixels import DropCounter, Floats, Points, pixel_index
+from pnpdepth_cli.sensors.projection import DropCounter, Points, pixel_index
 
 Pixels = NDArray[np.intp]
 """(N,) row-major indices of pixels."""
@@ -104,17 +104,24 @@ LIDARS = {
 """The scanners that can be named, as `choices.SENSORS` lists them."""
 
 
-def ideal_lidar(beams: int, top_deg: float, bottom_deg: float) -> Lidar:
-    """Returns a scanner without noise and limit of range, with a VLP-16's azimuth step.
+def lidar_of(
+    name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
+) -> Lidar:
+    """Returns the scanner of a name, or one without noise, with a VLP-16's azimuth step.
 
     Args:
+        name: One of `LIDARS`.
         beams: Number of beams, evenly spaced in elevation.
-        top_deg: Elevation of the uppermost beam.
-        bottom_deg: Elevation of the lowest beam, below the uppermost.
+        vertical_fov: Elevations of the uppermost and the lowest beam, degrees.
 
     Raises:
-        UsageError: There is no such scanner.
+        UsageError: There is no such scanner, or neither or both are given.
     """
+    if name is not None and beams is None and vertical_fov is None:
+        return LIDARS[name]
+    if name is not None or beams is None or vertical_fov is None:
+        raise UsageError("give --sensor, or --beams and --vertical-fov")
+    top_deg, bottom_deg = vertical_fov
     if not -90 <= bottom_deg <= top_deg <= 90 or (top_deg == bottom_deg and beams > 1):
         raise UsageError(f"there is no field of view from {top_deg:g}° down to {bottom_deg:g}°")
     elevations = evenly_spaced(top_deg, (top_deg - bottom_deg) / max(beams - 1, 1), beams)

@@ -23,7 +23,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import read_json
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.sensors.pixels import Points
+from pnpdepth_cli.sensors.projection import Points
 from tests.bags import HEIGHT, IMAGES, POINTS, RECTIFIED_PX, WIDTH, depth_m, write_bag
 from tests.commands.frames import frame_on_disk
 from tests.data_sets import read_frames, touch

@@ -13,7 +13,6 @@ from PIL import Image
 
 from pnpdepth_cli.commands.make_sparse import (
     Written,
-    lidar_of,
     project_scan,
     sample_depth,
     simulate_scan,
@@ -127,8 +126,8 @@ def test_fewer_features_than_requested_are_reported(frame: ScanOnDisk) -> None:
 
 
 def test_a_simulated_sensor_of_ones_own_measures_the_truth(frame: ScanOnDisk) -> None:
-    sensor = lidar_of(None, beams=21, vertical_fov=(20, -20))
-    record = recorded(simulate_scan(frame.gt, frame.calib, frame.folder / "out.csv", sensor))
+    fan = {"beams": 21, "vertical_fov": (20, -20)}
+    record = recorded(simulate_scan(frame.gt, frame.calib, frame.folder / "out.csv", **fan))
     got = read_sparse(frame.folder / "out.csv", size=(60, 100))[0]
     np.testing.assert_allclose(got.depth, 4 + 0.02 * got.xy[:, 0], atol=0.02)
     assert (record["sensor"]["name"], record["sensor"]["max_range"]) == ("21 beams", None)

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from pnpdepth_cli.commands import statistics
 from pnpdepth_cli.commands.statistics import Clusters, block_length, find_clusters
-from pnpdepth_cli.dataset.frame_files import groups_by_name
+from pnpdepth_cli.dataset.frame_files import groups_of
 
 
 def clusters_of(ids: object) -> Clusters:
@@ -112,7 +112,7 @@ NAMES = [
 
 def test_the_group_of_a_frame_is_its_name_before_the_frame_number() -> None:
     for names, groups in NAMES:
-        assert groups_by_name(names) == groups
+        assert groups_of(names, [None] * len(names)) == groups
 
 
 def autoregression(correlation: float, frames: int, seed: int = 0) -> np.ndarray:

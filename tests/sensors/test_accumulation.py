@@ -20,7 +20,7 @@ from pnpdepth_cli.sensors.accumulation import (
     surface_of,
 )
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.pixels import Points
+from pnpdepth_cli.sensors.projection import Points
 
 SIZE = (120, 160)
 CAMERA = Camera(intrinsics=np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))

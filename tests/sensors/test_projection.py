@@ -18,8 +18,9 @@ from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.pixels import Points, as_depth_image
 from pnpdepth_cli.sensors.projection import (
+    Points,
+    as_depth_image,
     edge_agreement,
     edge_ranks,
     hidden_points,

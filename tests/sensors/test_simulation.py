@@ -12,8 +12,8 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
-from pnpdepth_cli.sensors.pixels import Points
-from pnpdepth_cli.sensors.simulation import LIDARS, ideal_lidar, sample_points, simulate_lidar
+from pnpdepth_cli.sensors.projection import Points
+from pnpdepth_cli.sensors.simulation import LIDARS, lidar_of, sample_points, simulate_lidar
 
 
 @pytest.mark.parametrize(
@@ -40,21 +40,21 @@ def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_sam
 
 
 def test_a_lidar_of_ones_own_measures_known_depth_along_evenly_spaced_beams() -> None:
-    assert ideal_lidar(5, 15, -25).elevations_deg == (15, 5, -5, -15, -25)
-    assert ideal_lidar(1, 3, 3).elevations_deg == (3,)
-    assert len(ideal_lidar(5, 15, -25).directions(np.random.default_rng(0))) == 5 * 1800
+    assert lidar_of(None, 5, (15, -25)).elevations_deg == (15, 5, -5, -15, -25)
+    assert lidar_of(None, 1, (3, 3)).elevations_deg == (3,)
+    assert len(lidar_of(None, 5, (15, -25)).directions(np.random.default_rng(0))) == 5 * 1800
     for beams, top, bottom in ((5, -25, 15), (5, 3, 3), (5, np.nan, 0), (2, 91, 0)):
         with pytest.raises(UsageError):
-            ideal_lidar(beams, top, bottom)
+            lidar_of(None, beams, (top, bottom))
     camera = Camera(intrinsics=np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]))
     depth = np.random.default_rng(0).uniform(2, 50, (240, 320)).astype(np.float32)
     depth[:, :160] = 0
-    got = simulate_lidar(depth, camera, ideal_lidar(15, 14, -14), seed=0)  # without noise
+    got = simulate_lidar(depth, camera, lidar_of(None, 15, (14, -14)), seed=0)  # without noise
     column, row = np.floor(got.xy + 0.5).astype(int).T
     np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
     assert len(got.depth) > 1000
     with pytest.raises(NoPointsError, match="15 beams"):
-        simulate_lidar(0 * depth, camera, ideal_lidar(15, 14, -14), seed=0)
+        simulate_lidar(0 * depth, camera, lidar_of(None, 15, (14, -14)), seed=0)
 
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)

@@ -29,7 +29,7 @@ from pnpdepth_cli.measures import OF_SIGMA
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors.lens import rays_of_image
-from pnpdepth_cli.sensors.pixels import pixel_index
+from pnpdepth_cli.sensors.projection import pixel_index
 from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.stages import AFTER, GT
 

@@ -22,7 +22,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
-from pnpdepth_cli.sensors.pixels import as_depth_image
+from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from tests.core.test_metrics import brute
 from tests.data_sets import SELECTED, image, touch
