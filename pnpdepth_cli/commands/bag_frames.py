@@ -35,7 +35,7 @@ from pnpdepth_cli.io.bags import (
     open_bag,
 )
 from pnpdepth_cli.io.bags.messages import (
-    camera_info_topic,
+    Stamped,
     camera_of_bag,
     camera_trajectory,
     cloud_points,
@@ -204,14 +204,13 @@ def _write_pairs(
 def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: Say) -> str:
     """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera."""
     # The camera, from camera_info.
-    topic = camera_info_topic(bag, sensors.images)
-    of_bag = None if topic is None else camera_of_bag(bag, topic)
     topics = sensors.images, sensors.points
     camera, points = (frame_of(next(bag.messages([each]))[2]) for each in topics)
-    if of_bag is None:
+    if (of_bag := camera_of_bag(bag, sensors.images)) is None:
         say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
         return camera
-    calibration, source, camera = of_bag[0], str(topic), of_bag[1] or camera
+    calibration, camera = of_bag[0], of_bag[1] or camera
+    source = calibration.camera.source
     # The pose of the scanner, from static transforms.
     if (scanner := static_pose(bag, camera, points)) is not None:
         source += f", and /tf_static from {camera} to {points}"
@@ -306,11 +305,9 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     """
     # Topics of images hold colours or depth, which the first message tells.
     topics = bag.topics(IMAGES)
-    found = {name: next(bag.messages([name]), None) for name in topics}
-    first = {name: message[2] for name, message in found.items() if message is not None}
-    counts = {name: topics[name] for name in first}
-    depths = {name: count for name, count in counts.items() if is_depth(first[name], name)}
-    colours = {name: count for name, count in counts.items() if name not in depths}
+    first = {n: each[2] for n in topics for each in itertools.islice(bag.messages([n]), 1)}
+    depths = {name: topics[name] for name, message in first.items() if is_depth(message, name)}
+    colours = {name: topics[name] for name in first if name not in depths}
     # Points are clouds, unless depth images are named or alone.
     images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
@@ -323,20 +320,18 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     points = choose_topic(bag, wanted, usable, "depth images")
     same = Sensors(images=images, points=points, is_depth=True)
     # They may be of a camera of their own.
-    infos = camera_info_topic(bag, images), camera_info_topic(bag, points)
-    found_cameras = (None if info is None else camera_of_bag(bag, info) for info in infos)
-    of_images, of_depth = (None if each is None else each[0].camera for each in found_cameras)
-    if of_depth is None or infos[0] == infos[1]:
-        if points not in registered and of_depth is None:
+    found = camera_of_bag(bag, images), camera_of_bag(bag, points)
+    of_images, of_depth = (None if each is None else each[0].camera for each in found)
+    if of_depth is None:
+        if points not in registered:
             say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
         return same
-    one_camera = (
-        points in registered
-        and of_images is not None
-        and of_images.size == of_depth.size
-        and np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
-    )
-    return same if one_camera else replace(same, depth_camera=of_depth)
+    if of_images is not None:
+        close = np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
+        alike = points in registered and of_images.size == of_depth.size and close
+        if alike or of_images.source == of_depth.source:
+            return same
+    return replace(same, depth_camera=of_depth)
 
 
 def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32], dict[str, int]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,10 +156,5 @@ def _camera(
                 " --calib"
             )
         return of_record, [f"camera: {of_record.source} (from the record)"]
-    image = request.image or frame.image
-    of_exif = camera_of_exif(image, size) if isinstance(image, Path) else None
-    if of_exif is None:
-        raise UsageError(
-            f"neither a record nor EXIF gives the camera of {frame.depth}; give --calib"
-        )
-    return of_exif
+    lacking = f"{frame.depth} has no camera in a record"
+    return camera_of_exif(request.image or frame.image, size, lacking)

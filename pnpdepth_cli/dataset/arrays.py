@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
-from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
@@ -196,10 +196,17 @@ def check_size(
     return []
 
 
-def camera_of_exif(image: Path, size: tuple[int, int]) -> tuple[Camera, list[str]] | None:
-    """Returns the camera of EXIF, without distortion, and a line for a person; None for none."""
-    if (focal := read_focal_length(image, size)) is None:
-        return None
+def camera_of_exif(
+    image: ImageSource | None, size: tuple[int, int], lacking: str
+) -> tuple[Camera, list[str]]:
+    """Returns the camera of EXIF, without distortion, and a line for a person.
+
+    Raises:
+        UsageError: There is none. It begins with what is `lacking` elsewhere.
+    """
+    focal = read_focal_length(image, size) if isinstance(image, Path) else None
+    if focal is None:
+        raise UsageError(f"{lacking} nor a focal length in EXIF; give --calib")
     (focal_px, source), (height, width) = focal, size
     intrinsics = np.array(
         [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]

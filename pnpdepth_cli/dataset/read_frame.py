@@ -256,12 +256,8 @@ def _camera_of(
     if known is None and scan.calib is not None:
         known, notes = camera_of_file(scan.calib, scan.camera, size, image)
     if known is None and is_needed:
-        if image is None or (of_exif := camera_of_exif(image, size)) is None:
-            raise UsageError(
-                f"--html-3d needs the camera, and {image or files.sparse} has neither a calibration"
-                " nor a focal length in EXIF; give --calib"
-            )
-        known, notes = of_exif
+        lacking = f"--html-3d needs the camera, and {image or files.sparse} has no calibration"
+        known, notes = camera_of_exif(image, size, lacking)
     return None if known is None else files.part.camera_in_crop(known, size), notes
 
 

@@ -94,22 +94,17 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
             xyz = unproject(camera, other.xy, other.depth)
             refined = refine_motion(surface, xyz, motion, camera)
             moved.append(xyz @ refined[:, :3].T + refined[:, 3])
-        result = _add(result, np.concatenate(moved), surface, camera, apart)
+        # Those join that agree with measured points, where none is known so far.
+        xyz, xy = points_in_image(np.concatenate(moved), camera, points.size)
+        agrees = _agrees(xy, xyz[:, 2], surface)
+        xy, depth = xy[agrees], xyz[agrees, 2]
+        free = cKDTree(result.xy).query(xy)[0] >= apart
+        result = replace(
+            result,
+            xy=np.concatenate([result.xy, xy[free].astype(np.float32)]),
+            depth=np.concatenate([result.depth, depth[free].astype(np.float32)]),
+        )
     return result
-
-
-def _add(known: Points, xyz: Floats, surface: Surface, camera: Camera, apart: int) -> Points:
-    """The points known so far, joined by those of `xyz` (M, 3) that agree with measured ones."""
-    xyz, xy = points_in_image(xyz, camera, known.size)
-    depth = xyz[:, 2]
-    agrees = _agrees(xy, depth, surface)
-    xy, depth = xy[agrees], depth[agrees]
-    free = cKDTree(known.xy).query(xy)[0] >= apart
-    return replace(
-        known,
-        xy=np.concatenate([known.xy, xy[free].astype(np.float32)]),
-        depth=np.concatenate([known.depth, depth[free].astype(np.float32)]),
-    )
 
 
 def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
@@ -143,10 +138,15 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
 
     Points are in the other camera's coordinates. The motion leads from there to the surface's.
     """
-    given = motion
+    given, reach = motion, _REACH * _spacing_px(surface.points)
     for _ in range(_STEPS):
         # Pairs of a moved point and a plane, and how far apart they are.
-        moved, index = _pairs(surface, xyz @ motion[:, :3].T + motion[:, 3], camera)
+        moved = xyz @ motion[:, :3].T + motion[:, 3]
+        moved, xy = points_in_image(moved, camera, surface.points.size)
+        distance, index = surface.tree.query(xy, distance_upper_bound=reach)
+        near = np.isfinite(distance)
+        near[near] &= surface.flat[index[near]]
+        moved, index = moved[near], index[near]
         if len(index) < _MIN_PLANES:
             return given
         normal, depth = surface.normal[index], surface.xyz[index, 2]
@@ -160,16 +160,6 @@ def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera)
         motion = Rotation.from_rotvec(step[:3]).as_matrix() @ motion
         motion[:, 3] += step[3:]
     return motion
-
-
-def _pairs(surface: Surface, moved: Floats, camera: Camera) -> tuple[Floats, NDArray[np.intp]]:
-    """The points in the image with a plane beside them, and the index of that plane."""
-    moved, xy = points_in_image(moved, camera, surface.points.size)
-    reach = _REACH * _spacing_px(surface.points)
-    distance, index = surface.tree.query(xy, distance_upper_bound=reach)
-    near = np.isfinite(distance)
-    near[near] &= surface.flat[index[near]]
-    return moved[near], index[near]
 
 
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:

@@ -204,9 +204,10 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
     return next(iter(topics)) if len(topics) == 1 else None
 
 
-def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
-    """Returns the camera of the first message of a camera_info topic, and its frame_id."""
-    for _, _, message in bag.messages([topic]):
+def camera_of_bag(bag: Bag, image_topic: str) -> tuple[Calibration, str] | None:
+    """Returns the camera of images by its first camera_info, and its frame_id; None without one."""
+    topic = camera_info_topic(bag, image_topic)
+    for _, _, message in bag.messages([] if topic is None else [topic]):
         values = {
             name: np.asarray(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
             for name in "kdrp"
@@ -218,7 +219,7 @@ def camera_of_bag(bag: Bag, topic: str) -> tuple[Calibration, str] | None:
         model = str(message.distortion_model) if values["d"].size else "none"
         content |= {"distortion_model": model, "width": message.width, "height": message.height}
         calibration = camera_in_yaml(bag.path, content, None)
-        camera = replace(calibration.camera, source=topic)
+        camera = replace(calibration.camera, source=str(topic))
         return replace(calibration, camera=camera), frame_of(message)
     return None
 
