@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
-from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError
+from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
@@ -60,10 +60,8 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
     if rgb.shape[:2] != size and isinstance(source, Path):
         rgb = read_rgb(source, upright=False).values
     if rgb.shape[:2] != size:
-        raise InputError(
-            f"{source} is {rgb.shape[1]}×{rgb.shape[0]} but its depth {size[1]}×{size[0]}; give the"
-            " image of this depth with --image"
-        )
+        way_out = "; give the image of this depth with --image"
+        raise unequal_sizes(str(source), rgb.shape, "its depth", size, way_out)
     return rgb
 
 
@@ -97,10 +95,7 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
     for path in masks:
         mask = read_levels(path) > 0
         if mask.shape != depth.shape:
-            raise InputError(
-                f"mask {path} is {mask.shape[1]}×{mask.shape[0]} but the ground truth is"
-                f" {depth.shape[1]}×{depth.shape[0]}"
-            )
+            raise unequal_sizes(f"mask {path}", mask.shape, "the ground truth", depth.shape)
         depth = np.where(mask, depth, np.float32(0))
     return depth
 
@@ -175,17 +170,14 @@ def check_size(
     Raises:
         InputError: They cannot belong together.
     """
-    name = f"{image} is" if image else "the image is"
+    name = str(image or "the image")
     if camera.size is not None and camera.size != size:
-        height, width = camera.size
-        raise InputError(
-            f"{name} {size[1]}×{size[0]} but {path} is for images of {width}×{height}; give the"
-            " image at that size"
-        )
+        way_out = "; give the image at that size"
+        raise unequal_sizes(name, size, f"the image of {path}", camera.size, way_out)
     x, y = camera.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
-        raise InputError(
-            f"{name} {size[1]}×{size[0]}, which does not contain the principal point"
+        raise SizeError(
+            f"{name} is {size[1]}×{size[0]}, which does not contain the principal point"
             f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
         )
     if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:

@@ -34,7 +34,7 @@ from pnpdepth_cli.dataset.sparse_depth import (
     read_colmap_points,
     read_map_points,
 )
-from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
@@ -144,9 +144,7 @@ def _read_pixels(
         found["gt"] = record, lines
         own = truth.values.shape
         if size is not None and size != own:
-            raise InputError(
-                f"ground truth {files.gt} is {own[1]}×{own[0]} but the image is {size[1]}×{size[0]}"
-            )
+            raise unequal_sizes(f"ground truth {files.gt}", own, "the image", size)
         if not (truth.values > 0).any():
             raise InputError(f"ground truth {files.gt} has no pixel with known depth")
     return rgb, truth, found

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Floats
-from pnpdepth_cli.errors import NoPointsError, SizeError, UsageError
+from pnpdepth_cli.errors import NoPointsError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.projection import DropCounter, Points, pixel_index
@@ -190,9 +190,7 @@ def sample_points(
     """
     size = (depth.shape[0], depth.shape[1])
     if image is not None and image.shape[:2] != size:
-        raise InputError(
-            f"the image is {image.shape[1]}×{image.shape[0]} but the depth is {size[1]}×{size[0]}"
-        )
+        raise unequal_sizes("the image", image.shape, "the depth", size)
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
         raise NoPointsError("the depth map has no pixel with known depth to sample from")

@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, 
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
-from pnpdepth_cli.errors import InputError, PnpDepthError
+from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
 from pnpdepth_cli.io.formats import DepthFile, Reading
@@ -179,7 +179,7 @@ def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Dept
     values = file.values
     if values.shape != size and not request.resize:
         advice = "; --resize scales predictions if both show the same view"
-        raise _different(f"prediction {path}", values.shape, size, advice)
+        raise unequal_sizes(f"prediction {path}", values.shape, "the ground truth", size, advice)
     if values.shape != size:
         known = (values > 0).astype(np.float32)
         total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
@@ -218,7 +218,8 @@ def _given_points(
             if points.size != size:
                 xy = frame.part.in_crop(xy, points.size)
                 if frame.part.apply(np.zeros(points.size, bool)).shape != size:
-                    raise _different(f"sparse depth {frame.sparse}", points.size, size)
+                    what = f"sparse depth {frame.sparse}"
+                    raise unequal_sizes(what, points.size, "the ground truth", size)
         else:
             raise InputError(
                 f"frame {frame.name} has no sparse depth file to exclude: neither the record beside"
@@ -248,11 +249,6 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     top, bottom, left, right = _CROPS[crop]
     rows, columns = (top * height, bottom * height), (left * width, right * width)
     return slice(*map(int, rows)), slice(*map(int, columns))
-
-
-def _different(what: str, shape: Size, size: Size, advice: str = "") -> InputError:
-    other = f"the ground truth is {size[1]}×{size[0]}"
-    return InputError(f"{what} is {shape[1]}×{shape[0]} but {other}{advice}")
 
 
 def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:
