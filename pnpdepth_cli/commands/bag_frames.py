@@ -65,7 +65,7 @@ _LONGEST_GAP_S = 0.5
 """Longest time between two poses that one is interpolated from."""
 
 _DELAYS = 20
-"""Number of messages of each topic whose delay is measured."""
+"""Number of messages of each topic whose delay is measured, from the first."""
 
 _SLOWEST_S = 1.0
 """A larger difference of delays is that of two clocks."""
@@ -371,20 +371,17 @@ def clock_offset(bag: Bag, sensors: Sensors, say: Say) -> float:
     One clock times the log of both topics. So their delays from stamp to log differ by the offset,
     and by how long each message took, which is less than a second.
     """
-    topics = sensors.images, sensors.points
-    delays: dict[str, list[float]] = {topic: [] for topic in topics}
-    for topic, logged_ns, message in bag.messages(topics):
-        delays[topic].append(1e-9 * logged_ns - seconds_of(message, logged_ns))
-        if min(map(len, delays.values())) >= _DELAYS or len(delays[topic]) >= 10 * _DELAYS:
-            break
-    if not all(delays.values()):
+    delays = list[list[float]]()
+    for topic in (sensors.images, sensors.points):
+        first = itertools.islice(bag.messages([topic]), _DELAYS)
+        delays.append([1e-9 * ns - seconds_of(message, ns) for _, ns, message in first])
+    if not all(delays):
         return 0.0
-    of_images, of_points = (float(np.median(delays[topic])) for topic in topics)
-    offset = round(of_points - of_images, 6)
+    offset = round(float(np.median(delays[1]) - np.median(delays[0])), 6)
     if abs(offset) <= _SLOWEST_S:
         return 0.0
     say(
-        f"warning: by the times of the log, {topics[0]} and {topics[1]} have two clocks;"
+        f"warning: by the times of the log, {sensors.images} and {sensors.points} have two clocks;"
         f" {offset:+.3f} s are added to the times of points (--clock-offset gives another number)"
     )
     return offset

@@ -156,10 +156,8 @@ class ScanOptions:
             if holds_scan(sparse):
                 return True
         if self.extrinsics is not None or (self.calib is None and self.camera is not None):
-            raise UsageError(
-                f"{sparse} is no scan, so --extrinsics and --camera do not apply; a scan needs"
-                " --calib"
-            )
+            why = "so --extrinsics and --camera do not apply; a scan needs --calib"
+            raise UsageError(f"{sparse} is no scan, {why}")
         return False
 
     def over(self, files: FrameFiles) -> ScanOptions:
@@ -207,9 +205,7 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
-            raise UsageError(
-                f"--unit-scale must be above 0 metres per unit, got {self.unit_scale:g}"
-            )
+            raise UsageError(f"--unit-scale must be above 0, got {self.unit_scale:g}")
 
 
 Unmatched = tuple[Path, str]

@@ -225,9 +225,7 @@ def _read_sparse(
         if size is None or image is None:
             raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
         if replace(options.scan, keep_occluded=False) != ScanOptions():
-            raise UsageError(
-                f"{path} is a COLMAP model, so the options of a LiDAR scan do not apply"
-            )
+            raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
         sparse = read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif is_scan:
         sparse = read_scan_points(path, scan, size, image, scale=scale)

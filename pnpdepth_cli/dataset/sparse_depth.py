@@ -105,9 +105,8 @@ class SparseDepth:
         moved = SparsePoints(xy=xy, depth=whole.depth, size=(size[0], size[1]))
         points = moved.cropped(0, 0, *moved.size)
         if not len(points):
-            raise NoPointsError(
-                f"{self.record.path}: none of its {len(whole)} points lies in the image"
-            )
+            fact = f"none of its {len(whole)} points lies in the image"
+            raise NoPointsError(f"{self.record.path}: {fact}")
         return replace(self, points=points)
 
 

@@ -161,10 +161,8 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     points = points[ahead]
     points, xy = drops.keep_seen(points, pixels_of(camera, points), size)
     if not len(xy):
-        raise NoPointsError(
-            f"no beam of {sensor.name} gives a point in the image ({drops}); check depth and"
-            " intrinsics"
-        )
+        fact = f"no beam of {sensor.name} gives a point in the image ({drops})"
+        raise NoPointsError(f"{fact}; check depth and intrinsics")
     return drops.points(points, xy, size)
 
 
