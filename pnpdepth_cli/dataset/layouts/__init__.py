@@ -28,10 +28,6 @@ def _prefix_with_place(mark: str) -> Callable[[Path, Path, str], str]:
     return lambda root, place, stem: stem if place == root else f"{place.name}{mark}{stem}"
 
 
-def _below(root: Path, place: Path, stem: str) -> str:
-    return (place.relative_to(root) / stem).as_posix()
-
-
 def _of_void(place: Path) -> Callable[[FrameFiles], FrameFiles | None]:
     """Keeps the frames of the test split, or all where no split is listed."""
     split = place.parent.parent / "test_image.txt"
@@ -74,7 +70,6 @@ TABLE: dict[str, Layout] = {
         {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
         below="|*/|*/*/|*/*/*/|*/*/*/*/",
         marks=("*_depth_mask.npy", "*_depth.npy"),
-        name=_below,
     ),
     "eth3d": row(
         {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
@@ -90,12 +85,10 @@ TABLE: dict[str, Layout] = {
             "mask of transparent things": "mask_transp/*.png?",
         },
         marks=("mask_invalid", "mask_transp"),
-        name=_below,
         shared=FrameFiles(gt_scale=65535 / 50),
     ),
     "image-depth": row(
         {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"},
-        name=_below,
         calib="calib.txt",
     ),
     "kitti-object": row(
@@ -111,7 +104,6 @@ TABLE: dict[str, Layout] = {
             "gt": "gt/**.DEPTH?",
             "calib": "calib/**.CALIB?",
         },
-        name=_below,
         calib="calib.txt",
     ),
     "scannet": row(
@@ -131,7 +123,6 @@ TABLE: dict[str, Layout] = {
         },
         below="|*/|data/*/|*/data/*/",
         marks=("sparse_depth", "ground_truth"),
-        name=_below,
         calib="K.txt",
         more=_of_void,
         shared=FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True),

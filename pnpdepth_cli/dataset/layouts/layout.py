@@ -123,10 +123,14 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
         )
 
 
+def _path_below(root: Path, place: Path, stem: str) -> str:
+    return (place.relative_to(root) / stem).as_posix()
+
+
 def row(
     parts: Mapping[str, str],
     *,
-    name: Callable[[Path, Path, str], str] = lambda root, place, stem: stem,
+    name: Callable[[Path, Path, str], str] = _path_below,
     below: str = "",
     marks: tuple[str, ...] = (),
     calib: str = "",
@@ -138,7 +142,8 @@ def row(
     Args:
         parts: Folder, or folders with | between them of which the first that exists counts, and
             pattern (see `Part`) by field of `FrameFiles`. Every frame has the first part.
-        name: Function of root, place and stem that gives the name of a frame.
+        name: Function of root, place and stem that gives the name of a frame; by default it is
+            the path of its files below the root.
         below: Patterns of where the places are, below the root, with | between them.
         marks: Patterns of what else a place has. The first, or else the last needed part's folder,
             finds a place.
