@@ -21,7 +21,7 @@ refused.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -66,17 +66,6 @@ Keypoints = tuple[Floats, NDArray[np.float32]]
 """(K, 2) pixel coordinates and (K, 128) descriptors of SIFT."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Surface:
-    """N points of a scan with the planes through their neighbours."""
-
-    points: Points
-    xyz: Floats  # (N, 3) metres in the camera's coordinates
-    normal: Floats  # (N, 3) unit vectors
-    flat: Mask  # (N,) where the neighbours lie on a plane
-    tree: cKDTree  # of the pixel coordinates
-
-
 def _spacing_px(points: Points) -> float:
     """Side of the square that each point has in the mean, in pixels."""
     return float(np.sqrt(points.size[0] * points.size[1] / len(points)))
@@ -87,16 +76,16 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
 
     The neighbours are by the number of frames, at least 1, that are between them and this one.
     """
-    surface, result = surface_of(points, camera), points
+    result = points
     for apart, scans in sorted(neighbours.items()):
         moved = []
         for other, motion in scans:
             xyz = unproject(camera, other.xy, other.depth)
-            refined = refine_motion(surface, xyz, motion, camera)
+            refined = refine_motion(points, xyz, motion, camera)
             moved.append(xyz @ refined[:, :3].T + refined[:, 3])
         # Those join that agree with measured points, where none is known so far.
         xyz, xy = points_in_image(np.concatenate(moved), camera, points.size)
-        agrees = _agrees(xy, xyz[:, 2], surface)
+        agrees = _agrees(xy, xyz[:, 2], points)
         xy, depth = xy[agrees], xyz[agrees, 2]
         free = cKDTree(result.xy).query(xy)[0] >= apart
         result = replace(
@@ -107,10 +96,9 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
     return result
 
 
-def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
+def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
     """(M,) true where a moved point agrees with the measured points around it."""
-    measured = surface.points
-    _, near = surface.tree.query(xy, k=min(_CONTRADICTING, len(measured)))
+    _, near = cKDTree(measured.xy).query(xy, k=min(_CONTRADICTING, len(measured)))
     near = near.reshape(len(xy), -1)
     apart = np.abs(np.log(depth[:, None] / measured.depth[near]))
     alike = apart[:, :_COMPARED] <= _TOLERANCE
@@ -120,37 +108,41 @@ def _agrees(xy: Floats, depth: Floats, surface: Surface) -> Mask:
     return agrees
 
 
-def surface_of(points: Points, camera: Camera) -> Surface:
-    """Returns the points with a plane through the neighbours of each."""
-    tree = cKDTree(points.xy)
+def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
+    """Unit normals (N, 3) of the planes through the neighbours of each point, and which are flat.
+
+    The points are `xyz` (N, 3) in the camera's coordinates; the tree is of their pixels.
+    """
     _, near = tree.query(points.xy, k=min(_NEIGHBOURS, len(points)))
     near = near.reshape(len(points), -1)
-    xyz = unproject(camera, points.xy, points.depth)
     around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
     flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
-    return Surface(points=points, xyz=xyz, normal=axes[:, :, 0], flat=flat, tree=tree)
+    return axes[:, :, 0], flat
 
 
-def refine_motion(surface: Surface, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
-    """Returns the motion (3, 4) that puts points (M, 3) on a surface; the given one if that fails.
+def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
+    """Returns the motion (3, 4) that puts points on measured surfaces; the given one if that fails.
 
-    Points are in the other camera's coordinates. The motion leads from there to the surface's.
+    The points (M, 3) are in the other camera's coordinates. The motion leads from there to the
+    camera that measured the surfaces.
     """
-    given, reach = motion, _REACH * _spacing_px(surface.points)
+    given, reach = motion, _REACH * _spacing_px(measured)
+    tree, surface = cKDTree(measured.xy), unproject(camera, measured.xy, measured.depth)
+    normals, flat = _planes(measured, surface, tree)
     for _ in range(_STEPS):
         # Pairs of a moved point and a plane, and how far apart they are.
         moved = xyz @ motion[:, :3].T + motion[:, 3]
-        moved, xy = points_in_image(moved, camera, surface.points.size)
-        distance, index = surface.tree.query(xy, distance_upper_bound=reach)
+        moved, xy = points_in_image(moved, camera, measured.size)
+        distance, index = tree.query(xy, distance_upper_bound=reach)
         near = np.isfinite(distance)
-        near[near] &= surface.flat[index[near]]
+        near[near] &= flat[index[near]]
         moved, index = moved[near], index[near]
         if len(index) < _MIN_PLANES:
             return given
-        normal, depth = surface.normal[index], surface.xyz[index, 2]
-        distance = np.einsum("ij,ij->i", moved - surface.xyz[index], normal) / depth
+        normal, depth = normals[index], surface[index, 2]
+        distance = np.einsum("ij,ij->i", moved - surface[index], normal) / depth
         # A step of weighted least squares towards the planes.
         typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
         weight = (1 + (distance / (2 * typical)) ** 2) ** -2

@@ -17,7 +17,6 @@ from pnpdepth_cli.sensors.accumulation import (
     keypoints_of,
     motion_of_images,
     refine_motion,
-    surface_of,
 )
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import Points
@@ -90,7 +89,7 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
 def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
     own, ahead = room(box_x=-1.0, seed=0), room((0, 0, 0.5), -1.0, seed=1)
     xyz = unproject(CAMERA, ahead.xy, ahead.depth)
-    motion = refine_motion(surface_of(own, CAMERA), xyz, from_ahead(0.6), CAMERA)
+    motion = refine_motion(own, xyz, from_ahead(0.6), CAMERA)
     np.testing.assert_allclose(motion[:, :3], np.eye(3), atol=2e-3)
     assert abs(motion[2, 3] - 0.5) < 0.01
 
