@@ -39,19 +39,11 @@ class InputError(PnpDepthError):
     exit_code = 3
 
 
-class FileFormatError(InputError):
-    """A file is not of the expected format."""
-
-
-class SizeError(InputError):
-    """Image, sparse depth and ground truth differ in size."""
-
-
 def unequal_sizes(
     what: str, own: tuple[int, ...], other: str, size: tuple[int, ...], way_out: str = ""
-) -> SizeError:
+) -> InputError:
     """Returns the error of two things whose sizes (H, W) should be equal."""
-    return SizeError(f"{what} is {own[1]}×{own[0]} but {other} is {size[1]}×{size[0]}{way_out}")
+    return InputError(f"{what} is {own[1]}×{own[0]} but {other} is {size[1]}×{size[0]}{way_out}")
 
 
 class NoPointsError(InputError):

@@ -35,7 +35,6 @@ from pnpdepth_cli.io.bags import (
     open_bag,
 )
 from pnpdepth_cli.io.bags.messages import (
-    Stamped,
     camera_of_bag,
     camera_trajectory,
     cloud_points,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
-from pnpdepth_cli.errors import FileFormatError, SizeError, UsageError, unequal_sizes
+from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
@@ -176,7 +176,7 @@ def check_size(
         raise unequal_sizes(name, size, f"the image of {path}", camera.size, way_out)
     x, y = camera.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
-        raise SizeError(
+        raise InputError(
             f"{name} is {size[1]}×{size[0]}, which does not contain the principal point"
             f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
         )

@@ -214,7 +214,7 @@ Unmatched = tuple[Path, str]
 
 
 def check_path(path: Path) -> None:
-    """Raises FileFormatError for a path that no file can have: an index file may hold any text."""
+    """Raises InputError for a path that no file can have: an index file may hold any text."""
     if not _can_be_named(str(path)):
         raise InputError(f"{str(path)!r}: no file can have this name; correct the list")
 

@@ -83,7 +83,7 @@ def scan_returns(
     # coordinates that are none
     if np.count_nonzero(odd[row]) > _BROKEN * len(xyz):
         first = int(row[odd[row]][0])
-        raise FileFormatError(
+        raise InputError(
             f"{path}: {np.count_nonzero(odd[row]):,} of {len(xyz):,} points have a coordinate"
             f" that is none of a scan (number {first + 1:,}:"
             f" {' '.join(f'{n:.3g}' for n in xyz[first])} m); its numbers are probably not stored"

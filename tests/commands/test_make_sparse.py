@@ -79,7 +79,7 @@ def test_an_image_of_another_camera_is_an_error_or_gets_a_warning(frame: ScanOnD
     record = projected(frame, image=wide)
     assert any(note.startswith("warning: the principal point") for note in record["notes"])
     frame.calib.write_text(frame.calib.read_text() + "size: [64, 48]\n")
-    refused(frame, SizeError, "is 64×48", image=wide, output="b.csv")
+    refused(frame, InputError, "is 64×48", image=wide, output="b.csv")
 
 
 def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:

@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, 
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import plausible_map
-from pnpdepth_cli.errors import InputError, PnpDepthError, SizeError, unequal_sizes
+from pnpdepth_cli.errors import InputError, PnpDepthError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
 from pnpdepth_cli.io.formats import DepthFile, Reading
