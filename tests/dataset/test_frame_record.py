@@ -100,10 +100,8 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
     [
         [],
         {"status": "unknown"},
-        {"points": {"farthest": 4.5}},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
         {"inputs": {"sparse": {"path": "s.png", "sampled": {"kind": "none", "count": 1}}}},
-        {"inputs": {"sparse": {"path": "s.png", "unit_scale": "x"}}},
     ],
 )
 def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
