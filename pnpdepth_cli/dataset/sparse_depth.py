@@ -32,7 +32,7 @@ from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS, SparsePoints
 from pnpdepth_cli.protocols import FramePart
-from pnpdepth_cli.sensors.lens import pixels_of, unproject
+from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
     DropCounter,
     Points,
@@ -276,7 +276,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
             " model is damaged, or its poses are inverted"
         )
     seen = seen[front]
-    seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), camera.size)
+    seen, xy = drops.keep_seen(seen, camera, camera.size)
     # Without tracks, nothing else tells which points the camera sees.
     notes = list[str]()
     if untracked:

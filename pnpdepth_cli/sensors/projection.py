@@ -82,12 +82,11 @@ class DropCounter:
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
         return mask
 
-    def keep_seen(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Keeps the points in an image (H, W) that are the nearest of their pixel; returns them.
-
-        `xyz` are in the camera's coordinates. `xy` are pixels, NaN where the lens does not show
-        them.
-        """
+    def keep_seen(
+        self, xyz: Floats, camera: Camera, size: tuple[int, int]
+    ) -> tuple[Floats, Floats]:
+        """Keeps the points that are the nearest of their pixel; returns them, and their pixels."""
+        xy = pixels_of(camera, xyz)
         inside = self.keep(in_frame(xy, size), "outside the image")
         xyz, xy = xyz[inside], xy[inside]
         pixel = pixel_index(xy, size)
@@ -135,7 +134,7 @@ def project_velodyne(
     drops = DropCounter()
     seen = scanner.apply(xyz)
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
-    seen, xy = drops.keep_seen(seen, pixels_of(camera, seen), size)
+    seen, xy = drops.keep_seen(seen, camera, size)
     if not keep_occluded:
         focal_px = float(camera.intrinsics[0, 0])
         origin = np.asarray(camera.intrinsics @ scanner.translation)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.errors import NoPointsError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import SamplePattern
-from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.projection import DropCounter, Points, pixel_index
 
 Pixels = NDArray[np.intp]
@@ -147,7 +146,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     beams = beams[beams[:, 2] > 1e-9]
     drops = DropCounter()
     # a beam from the camera's centre stays in one pixel
-    beams, xy = drops.keep_seen(beams, pixels_of(camera, beams), size)
+    beams, xy = drops.keep_seen(beams, camera, size)
     z = np.asarray(depth, np.float64).ravel()[pixel_index(xy, size)]
     met = drops.keep(z > 0, "meets nothing that the camera sees")
     distance, beams = z[met] / beams[met, 2], beams[met]
@@ -159,7 +158,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     points = beams * distance[:, None]
     ahead = drops.keep(distance > 0, "noise put it behind the camera")
     points = points[ahead]
-    points, xy = drops.keep_seen(points, pixels_of(camera, points), size)
+    points, xy = drops.keep_seen(points, camera, size)
     if not len(xy):
         fact = f"no beam of {sensor.name} gives a point in the image ({drops})"
         raise NoPointsError(f"{fact}; check depth and intrinsics")
