@@ -86,7 +86,7 @@ class Frame:
         return None if self.rgb is None else np.ascontiguousarray(self.rgb.permute(1, 2, 0))
 
     @functools.cached_property
-    def _registration_of_points(self) -> Register:
+    def _registration_of_points(self) -> ImageRegistration | None:
         """The registration that the points tell; kept, because most frames need it twice."""
         assert self.image is not None
         return estimate_registration([evidence(self.image, self.points)])
@@ -97,7 +97,7 @@ class Frame:
         if image is None or how is None:
             return self
         how = self._registration_of_points if how == "auto" else how
-        if how is None or isinstance(how, str):
+        if how is None:
             return replace(self, register=None)
         return replace(self, rgb=tensor_of(how.apply_to(image)), register=None, registration=how)
 

@@ -46,15 +46,9 @@ FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scene
 
 
 def with_input_range(network: Network, name: str | None) -> Network:
-    """Returns the network with the input range of this name; None leaves its own.
-
-    Raises:
-        UsageError: There is no such range.
-    """
+    """Returns the network with the input range of this name; None leaves its own."""
     if name is None:
         return network
-    if name not in NORMALISATIONS:
-        raise UsageError(f"normalise {name!r} is none of {list(NORMALISATIONS)}")
     definition = replace(network.definition, normalisation=NORMALISATIONS[name])
     return replace(network, definition=definition)
 
@@ -163,10 +157,7 @@ def resolve_member(
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
-    candidates = {
-        name: replace(network, definition=replace(network.definition, normalisation=how))
-        for name, how in NORMALISATIONS.items()
-    }
+    candidates = {name: with_input_range(network, name) for name in NORMALISATIONS}
     errors = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
     chosen, rival = choose_input_range(errors)
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
