@@ -15,7 +15,6 @@ from rich.text import Text
 from pnpdepth_cli.cli.terminal import printable, say
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.tables import (
-    Cell,
     Table,
     count_of,
     mean_weights_text,
@@ -72,9 +71,8 @@ def print_table(table: Table, *, err: bool = False) -> None:
     shown.add_column(first, overflow="fold", no_wrap=True)
     for heading in others:
         shown.add_column(heading, overflow="fold", justify="right")
-    for row in table.texts:
-        styles = (_COLOURS[each.style] if isinstance(each, Cell) else "" for each in row)
-        shown.add_row(*map(Text, map(printable, row), styles))
+    for row in table.cells:
+        shown.add_row(*(Text(printable(text), _COLOURS[style]) for text, style in row))
     console.print(shown)
 
 

@@ -33,6 +33,8 @@ from pnpdepth_cli.stages import (
 )
 
 Style = Literal["", "bold", "dim", "good", "bad"]
+Cell = tuple[str, Style]
+"""A text and its style: LaTeX shows "bold", the terminal all."""
 Errors = Mapping[str, Mapping[str, Scores]]
 """Scores by basis, then by stage, as `FrameRecord.errors` has them."""
 
@@ -59,18 +61,6 @@ _NAMED = 5  # of a long list
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
-class Cell(str):
-    """A text with a style: LaTeX shows "bold", the terminal all."""
-
-    style: Style
-
-    def __new__(cls, text: str, style: Style = "") -> Cell:
-        """Returns the text with the style."""
-        cell = super().__new__(cls, text)
-        cell.style = style
-        return cell
-
-
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """Rows of cells; the first column is left-aligned, the others, of numbers, right-aligned."""
@@ -79,7 +69,7 @@ class Table:
     columns: Sequence[Measure | str]
     """A measure, or the heading of any other column."""
     rows: Sequence[Sequence[object]]
-    """Texts, numbers, and None."""
+    """Texts, numbers, None, and cells of `Cell`."""
 
     @property
     def headings(self) -> list[str]:
@@ -87,21 +77,23 @@ class Table:
         return [c.heading if isinstance(c, Measure) else c for c in self.columns]
 
     @property
-    def texts(self) -> list[list[str]]:
+    def cells(self) -> list[list[Cell]]:
         """The cells as they are shown."""
-        return [list(map(_text, row)) for row in self.rows]
+        return [list(map(_cell, row)) for row in self.rows]
 
     def csv(self) -> str:
         """Returns the cells as they are, None as nothing, below the keys of the measures."""
         buffer = io.StringIO()
         keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
-        csv.writer(buffer, lineterminator="\n").writerows([keys, *self.rows])
+        rows = [[each[0] if isinstance(each, tuple) else each for each in row] for row in self.rows]
+        csv.writer(buffer, lineterminator="\n").writerows([keys, *rows])
         return buffer.getvalue()
 
     def latex(self) -> str:
         """Returns a tabular with rules of the package booktabs; its title is a comment above."""
         header, *rows = (
-            " & ".join(map(_in_latex, line)) + r" \\" for line in (self.headings, *self.texts)
+            " & ".join(_in_latex(*cell) for cell in line) + r" \\"
+            for line in ([(heading, "") for heading in self.headings], *self.cells)
         )
         lines = (
             f"% {' '.join(self.title.split())}",
@@ -111,15 +103,17 @@ class Table:
         return "\n".join(lines)
 
 
-def _text(cell: object) -> str:
-    if isinstance(cell, str):
-        return cell
-    return "" if cell is None else f"{cell:,}"
+def _cell(value: object) -> Cell:
+    if isinstance(value, tuple):
+        return value
+    if isinstance(value, str):
+        return value, ""
+    return "" if value is None else f"{value:,}", ""
 
 
-def _in_latex(cell: str) -> str:
-    text = _THOUSANDS.sub("", cell).translate(_LATEX)
-    return rf"\textbf{{{text}}}" if getattr(cell, "style", "") == "bold" else text
+def _in_latex(text: str, style: Style) -> str:
+    text = _THOUSANDS.sub("", text).translate(_LATEX)
+    return rf"\textbf{{{text}}}" if style == "bold" else text
 
 
 def count_of(number: float, noun: str) -> str:
@@ -201,8 +195,8 @@ def _table(
         own = stages[stage]
         style: Style = "bold" if stage == last else ""
         texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
-        against = Cell("") if stage == LINEAR else change(linear, own.get("mae"))
-        rows.append([*(Cell(text, style) for text in (titles[stage], *texts)), against])
+        against = "" if stage == LINEAR else change(linear, own.get("mae"))
+        rows.append([*((text, style) for text in (titles[stage], *texts)), against])
     return Table(
         title=f"{about}: errors {BASES[basis]}{remark}, {count}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],
@@ -249,6 +243,6 @@ def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
 def change(before: float | None, after: float | None) -> Cell:
     """Returns how much an error rose or fell in per cent, as a good or a bad cell."""
     if not before or after is None or math.isnan(before - after):
-        return Cell("–", "dim")
+        return "–", "dim"
     rise = after / before - 1
-    return Cell(f"{rise:+.1%}", "good" if rise < 0 else "bad" if rise > 0 else "dim")
+    return f"{rise:+.1%}", "good" if rise < 0 else "bad" if rise > 0 else "dim"

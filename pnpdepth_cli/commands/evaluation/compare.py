@@ -16,7 +16,7 @@ from pnpdepth_cli.commands import statistics
 from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.statistics import Clusters, find_clusters
-from pnpdepth_cli.commands.tables import Cell, Style, Table, count_of, some_names
+from pnpdepth_cli.commands.tables import Style, Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import groups_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, UsageError
@@ -285,7 +285,7 @@ def _read_run(text: str) -> Run:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
-    rows: list[list[str]] = []
+    rows: list[list[object]] = []
     for measure in comparison.measures:
         for run in comparison.runs:
             row = [measure.heading, run.name, measure.text(run.mean[measure.key])]
@@ -299,7 +299,7 @@ def comparison_table(comparison: Comparison) -> Table:
             if found.p_adjusted < ALPHA:
                 style = "good" if found.percent > 0 else "bad"
             p = "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}"
-            rows.append([*row, Cell(texts[0], style), *texts[1:], p])
+            rows.append([*row, (texts[0], style), *texts[1:], p])
     return Table(
         title=(
             f"{count_of(len(comparison.frames), 'shared frame')}; gains in per cent of the error of"
@@ -317,7 +317,7 @@ def methods_table(comparison: Comparison) -> Table:
     Stars mark where a run differs from the first significantly.
     """
     runs = comparison.runs
-    rows: list[list[str]] = [[run.name] for run in runs]
+    rows: list[list[object]] = [[run.name] for run in runs]
     for measure in comparison.measures:
         means = [run.mean[measure.key] for run in runs]
         pick = max if measure.better == "higher" else min
@@ -326,7 +326,7 @@ def methods_table(comparison: Comparison) -> Table:
             p = run.gains[measure.key].p_adjusted if run.gains else math.nan
             text, is_known = measure.text(mean), mean is not None and measure.sign != 0
             stars = "*" * sum(p < limit for limit in _STARS)
-            row.append(Cell(text + stars, "bold" if is_known and text == best else ""))
+            row.append((text + stars, "bold" if is_known and text == best else ""))
     return Table(
         title=(
             f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold; *, **, ***:"

@@ -22,7 +22,6 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import write_json
 from tests.commands.evaluation.test_evaluate import frame, scored
-from tests.commands.test_tables import styled
 
 
 def saved(folder: Path, *frames: dict[str, Scores], groups: str = "", **summary: object) -> str:
@@ -93,12 +92,12 @@ def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values(
     methods, gains = methods_table(comparison), comparison_table(comparison)
     a, b, c = (f"{factor * errors.mean():.4f}" for factor in factors.values())
     # all got better, or worse: two of 2^12 swaps, times four tests
-    assert styled(methods) == [
+    assert methods.cells == [
         [("a", ""), (a, ""), ("100.00%", "bold")],
         [("b", ""), (f"{b}**", "bold"), ("100.00%", "bold")],
         [("c", ""), (f"{c}**", ""), ("100.00%", "bold")],
     ]
-    shown = [row[3] for row in styled(gains)]
+    shown = [row[3] for row in gains.cells]
     assert shown[:3] == [("–", ""), ("+50.00", "good"), ("-100.00", "bad")]
     assert shown[3:] == [("–", ""), ("+0.00", "dim"), ("+0.00", "dim")]
     assert gains.rows[1][4:] == ["+50.00", "+50.00", "0.0020"]
