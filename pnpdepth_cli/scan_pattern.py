@@ -5,8 +5,6 @@ The points of a rotating LiDAR are close together along a scan line and farther 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix
@@ -21,19 +19,11 @@ _ACROSS_OVER_ALONG = 1.5  # at least: spacing across over spacing along scan lin
 _ALONG, _ACROSS = 3.0, 0.35  # spacings to the next point of a line, at most
 
 
-class ScanPattern(NamedTuple):
-    """Spacing of points on scan lines."""
-
-    along_px: float
-    """Median distance to the next point along a row."""
-    across_px: float
-    """Median distance to the next point along a column."""
-
-
-def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern | None:
+def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | None:
     """Returns the spacing of (N, 2) pixel coordinates in an image (H, W); None without scan lines.
 
-    With scan lines, points are much denser along rows than along columns.
+    It is the median distance in pixels to the next point along a row, and along a column. With scan
+    lines, points are much denser along rows.
     """
     pixels = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
@@ -41,7 +31,7 @@ def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> ScanPattern | None:
         return None
     along, across = _median_gap(x, y), _median_gap(y, x)
     is_scan = _ACROSS_OVER_ALONG * along <= across < np.inf
-    return ScanPattern(along, across) if is_scan else None
+    return (along, across) if is_scan else None
 
 
 def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:
@@ -50,10 +40,10 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     Each point is linked with the next one to the right in nearly the same row; a line that is
     interrupted, as by the sky, is several.
     """
-    if (pattern := scan_pattern(xy, size)) is None:
+    if (spacing := scan_pattern(xy, size)) is None:
         return None
-    xy = np.asarray(xy, np.float64)
-    reach = np.array([_ALONG * pattern.along_px, max(1.0, _ACROSS * pattern.across_px)])
+    xy, (along_px, across_px) = np.asarray(xy, np.float64), spacing
+    reach = np.array([_ALONG * along_px, max(1.0, _ACROSS * across_px)])
     first, second = cKDTree(xy / reach).query_pairs(1.0, p=np.inf, output_type="ndarray").T
     left = np.where(xy[first, 0] <= xy[second, 0], first, second)
     right = first + second - left

@@ -262,10 +262,8 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
         return 1, 1
     spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
     step = min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
-    pattern = scan_pattern(points.xy, points.size)
-    if pattern is None:
-        return step, step
-    return min(_MAX_STEP, max(step, int(pattern.across_px / _NODES_BETWEEN_LINES))), step
+    _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
+    return min(_MAX_STEP, max(step, int(across_px / _NODES_BETWEEN_LINES))), step
 
 
 def _predict_grid(field: ResidualField) -> Tensor:

@@ -272,14 +272,14 @@ def occluded_in_map(points: Points) -> Mask | None:
     """
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
-    pattern = scan_pattern(points.xy, points.size)
+    _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
     low, high = _LINE_SPACING_PX
-    if pattern is None or not low <= pattern.across_px <= high:
+    if not low <= across_px <= high:
         return None
     if interleaved(as_depth_image(points)).sum() < _INTERLEAVED * len(points):
         return None
     xy, depth = points.xy.astype(np.float64), points.depth.astype(np.float64)
-    focal_px = _MARGIN_IN_LINES * pattern.across_px / np.radians(_MARGIN_DEG)
+    focal_px = _MARGIN_IN_LINES * across_px / np.radians(_MARGIN_DEG)
     # no parallax is known; the margin stands for it
     return hidden_points(xy, depth, points.size, focal_px=focal_px, scanner=np.zeros(3))
 
