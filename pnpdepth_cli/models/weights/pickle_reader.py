@@ -47,8 +47,8 @@ _OPCODES = (
 )
 """Opcodes of protocols 2 to 5; no others are done, as some take the memory that a size claims."""
 
-LoadStorage = Callable[[tuple[object, ...]], Tensor]
-"""Function that returns the flat tensor for ("storage", type, key, location, elements, ...)."""
+LoadStorage = Callable[[str, str, int, Sequence[object]], Tensor]
+"""Function that returns a flat tensor from its type, key and elements, and what follows these."""
 
 
 CONTENT_ERRORS: tuple[type[Exception], ...] = (
@@ -124,11 +124,12 @@ class _Unpickler(pickle._Unpickler):
 
     def persistent_load(self, pid: object) -> object:
         """The storage, or the class without its source text, that the id stands for."""
-        if isinstance(pid, tuple) and len(pid) >= 4:
-            if pid[0] == "module":
-                return pid[1]
-            if pid[0] == "storage" and self._load_storage is not None:
-                return self._load_storage(pid)
+        match pid:
+            case ("module", module, _, _, *_):
+                return module
+            case ("storage", StandIn(path), str() | int() as key, _, int(count), *more):
+                if self._load_storage is not None:
+                    return self._load_storage(path.rpartition(".")[2], str(key), count, more)
         raise InputError("its pickle refers to something outside it")
 
     def load_empty_set(self) -> None:

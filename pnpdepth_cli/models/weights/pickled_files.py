@@ -12,7 +12,7 @@ import functools
 import io
 import itertools
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from pnpdepth_cli.models.weights.pickle_reader import (
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100  # of modules inside each other
 _MAX_MODULES = 100_000
-_RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _MAX_DICTS = 3  # inside each other
 _MAX_ENTRIES = 10_000
 _DTYPES: dict[str, torch.dtype] = {
@@ -66,13 +65,10 @@ def read_torch_file(path: Path) -> tuple[object, list[str]]:
 
 def _with_state(value: object) -> object:
     """The state dict of a whole pickled module, as the module itself would have given it."""
-    module = _module_state(value)
-    return value if module is None else dict(_walk(module, "", itertools.count()))
-
-
-def _module_state(value: object) -> Mapping[str, object] | None:
-    state = value.state if isinstance(value, StandIn) else None
-    return state if isinstance(state, Mapping) and "_parameters" in state else None
+    match value:
+        case StandIn(state=dict(module)) if "_parameters" in module:
+            return dict(_walk(module, "", itertools.count()))
+    return value
 
 
 def _walk(
@@ -81,17 +77,16 @@ def _walk(
     endless = next(visited) > _MAX_MODULES or prefix.count(".") > _MAX_DEPTH
     if endless or len(prefix) > MAX_NAME:
         raise InputError("its modules contain each other without end")
-    fleeting = module.get("_non_persistent_buffers_set")
-    # Not a set, in which other elements may take for ever to hash.
-    left_out = [n for n in fleeting if isinstance(n, str)] if isinstance(fleeting, list) else []
+    fleeting = module.get("_non_persistent_buffers_set")  # a list, as sets are read
     for kind in ("_parameters", "_buffers", "_modules"):
         entries = module.get(kind)
         for name, value in entries.items() if isinstance(entries, Mapping) else ():
-            inside = _module_state(value)
-            if kind == "_modules" and inside is not None:
-                yield from _walk(inside, f"{prefix}{name}.", visited)
-            elif kind != "_modules" and isinstance(value, Tensor) and name not in left_out:
-                yield f"{prefix}{name}", value
+            match value:
+                case StandIn(state=dict(inside)) if kind == "_modules" and "_parameters" in inside:
+                    yield from _walk(inside, f"{prefix}{name}.", visited)
+                case Tensor() if kind != "_modules":
+                    if not isinstance(fleeting, list) or name not in fleeting:
+                        yield f"{prefix}{name}", value
 
 
 def _read_archive(path: Path) -> tuple[object, list[str]]:
@@ -166,24 +161,21 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
 
 
 def _load_storage(
-    storages: dict[str, Tensor], read: Callable[[str, int], bytearray], pid: tuple[object, ...]
+    storages: dict[str, Tensor],
+    read: Callable[[str, int], bytearray],
+    kind: str,
+    key: str,
+    count: int,
+    more: Sequence[object],
 ) -> Tensor:
-    """The storage for ("storage", type, key, location, elements, view) as a flat tensor.
-
-    It is made once, of what `read` returns for its key and the bytes that it should have.
-    """
-    kind, key = pid[1].path.rpartition(".")[2] if isinstance(pid[1], StandIn) else "", pid[2]
+    """The storage, made once of what `read` returns for its key and bytes; or a view of it."""
     if kind not in _DTYPES:
-        raise InputError(f"a storage of type {kind[:40] or '?'}")
-    count = pid[4]
-    if not isinstance(key, str | int) or not isinstance(count, int):
-        raise InputError("a storage without a key or a size")
-    key, dtype = str(key), _DTYPES[kind]
+        raise InputError(f"a storage of type {kind[:40]}")
+    dtype = _DTYPES[kind]
     if key not in storages:
         data = read(key, count * dtype.itemsize)
         storages[key] = torch.frombuffer(data, dtype=dtype) if data else torch.empty(0, dtype=dtype)
-    view = pid[5] if len(pid) > 5 else None
-    _, start, count = view if isinstance(view, tuple) else (None, 0, count)
+    _, start, count = more[0] if more and isinstance(more[0], tuple) else (None, 0, count)
     if min(start, count) < 0 or start + count > len(storages[key]):
         raise InputError(f"storage {key[:20]} is shorter than its {count} elements")
     if storages[key].dtype != dtype:
@@ -204,22 +196,18 @@ def read_numpy_file(path: Path) -> dict[str, Tensor]:
             raise InputError(f"it holds one array of shape {shape}, not named arrays")
         array, _ = read_pickle(content)
         left = len(content)
-    objects = _state_of_array(array)[4]
-    if not (isinstance(objects, list) and len(objects) == 1 and isinstance(objects[0], Mapping)):
-        raise InputError("it holds no dict of arrays")
+    match array:
+        case StandIn(state=(_, _, _, _, [dict(arrays)])):
+            entries = _entries(arrays)
+        case _:
+            raise InputError("it holds no dict of arrays")
     tensors: dict[str, Tensor] = {}
-    for name, value in _entries(objects[0]):
+    for name, value in entries:
         tensors[name] = _unpickle(value, name, left)
         left -= tensors[name].nbytes
         count = len(tensors)
         check_claim(f"it has {count:,} arrays", count, _MAX_ENTRIES)
     return tensors
-
-
-def _state_of_array(value: object) -> tuple[Any, ...]:
-    """(version, shape, type, order, data) of a pickled numpy array; nothing for anything else."""
-    state = value.state if isinstance(value, StandIn) and value.path in _RECONSTRUCT else None
-    return state if isinstance(state, tuple) and len(state) == 5 else (None,) * 5
 
 
 def _entries(
@@ -237,22 +225,21 @@ def _entries(
 
 def _unpickle(value: object, name: str, most: int) -> Tensor:
     """The tensor of a pickled array of at most so many bytes."""
-    _, shape, dtype, fortran, data = _state_of_array(value)
-    if not isinstance(shape, tuple):
-        kind = value.path if isinstance(value, StandIn) else type(value).__name__
-        raise InputError(f"{name} is a {kind}, not an array")
-    shape, code, order = tuple(map(int, shape)), dtype.arguments[0], dtype.state[1]
-    data = data.encode("latin-1") if isinstance(data, str) else data  # as Python 2 has it
-    if not isinstance(data, bytes):
-        raise InputError(f"{name} holds objects, not numbers")
+    match value:
+        case StandIn(
+            state=(_, tuple(shape), StandIn(_, (str(code), *_), (_, str(order), *_)), fortran, data)
+        ) if isinstance(data, bytes | str):
+            number = np.dtype(f"{order[:1]}{code[:8]}")
+            data = data.encode("latin-1") if isinstance(data, str) else data  # of Python 2
+        case _:
+            kind = value.path if isinstance(value, StandIn) else type(value).__name__
+            raise InputError(f"{name} is a {kind}, not an array of numbers")
     check_claim(f"{name} has {len(data):,} bytes", len(data), most)
+    shape = tuple(map(int, shape))
     if any(side < 0 for side in shape):
         raise InputError(f"{name} has a shape of {shape}")
-    if not isinstance(code, str) or not isinstance(order, str):
-        raise InputError("an array without a type")
-    number = np.dtype(f"{order[:1]}{code[:8]}")
+    if number.kind not in "fiub":
+        raise InputError(f"{name} is an array of {number.str}, not of numbers")
     array = np.frombuffer(data, number) if data else np.empty(0, number)
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"{name} is an array of {array.dtype.str}, not of numbers")
     array = array.reshape(shape, order="F" if fortran else "C")
     return torch.from_numpy(array.astype(number.newbyteorder("="), order="C"))
