@@ -107,7 +107,7 @@ def suggest_layers(
     with torch.enable_grad(), wrap_user_errors("the gradient of the network"):
         gradients = torch.autograd.grad(prediction.sum(), [*useful.values()], allow_unused=True)
     areas = {
-        name: _area(useful[name])
+        name: useful[name].shape[2:].numel()
         for name, gradient in zip(useful, gradients, strict=True)
         if gradient is not None and bool(gradient.any())
     }
@@ -116,13 +116,8 @@ def suggest_layers(
     for name, area in dropwhile(lambda named: named[1] > coarsest, areas.items()):
         if area >= max(last_of, default=0):
             last_of[area] = name
-    finest = _area(prediction)
+    finest = prediction.shape[2:].numel()
     return tuple(n for area, n in last_of.items() if area < finest or len(last_of) == 1)
-
-
-def _area(output: Tensor) -> int:
-    """Rows times columns of a map (1, c, h, w)."""
-    return output[0, 0].numel()
 
 
 def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:

@@ -240,7 +240,12 @@ def load_network(
         check_claim(claim, pixels, most, error=ModelError, way_out="allow more pixels")
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []
-    notes += _load_weights(module, definition, checkpoint)
+    if definition.complete and checkpoint is not None:
+        raise UsageError(
+            f"network {definition.name!r} comes with its weights; leave out the checkpoint"
+        )
+    if not definition.complete:
+        notes += _load_weights(module, definition, path)
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(torch_device):
         module.to(torch_device)
@@ -256,21 +261,14 @@ def load_network(
     return _with_suggested_layers(network)
 
 
-def _load_weights(
-    module: nn.Module, definition: ModelDefinition, checkpoint: Path | None
-) -> list[str]:
-    """Loads the weights named, or those of the definition; returns notes. Never random weights."""
-    name, path = definition.name, checkpoint or definition.checkpoint
-    if definition.complete:
-        if checkpoint is not None:
-            raise UsageError(f"network {name!r} comes with its weights; leave out the checkpoint")
-        return []
+def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | None) -> list[str]:
+    """Loads the weights; returns notes. Never random weights."""
+    if path is None and module.state_dict():
+        raise ModelError(
+            f"network {definition.name!r} comes without weights; name a checkpoint, or, where its"
+            " build loads them itself, say complete=True in a definition"
+        )
     if path is None:
-        if module.state_dict():
-            raise ModelError(
-                f"network {name!r} comes without weights; name a checkpoint, or, where"
-                " its build loads them itself, say complete=True in a definition"
-            )
         return []
     if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
         raise ModelError(

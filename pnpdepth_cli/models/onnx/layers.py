@@ -33,19 +33,16 @@ def _sides(pads: Pads) -> list[int]:
     return [n for pair in reversed(pads) for n in pair]
 
 
-def _pads(
-    node: Node, size: Sequence[int], kernel: Sequence[int], stride: Sequence[int],
-    dilation: Sequence[int],
-) -> Pads:  # fmt: skip
-    """(begin, end) per spatial axis; the window is kernel × dilation."""
-    rank, auto = len(size), node.get("auto_pad", "NOTSET")
-    if auto == "NOTSET":
-        flat = node.get("pads", [0] * (2 * rank))
-        return list(zip(flat[:rank], flat[rank:], strict=True))
-    if auto == "VALID":
-        return [(0, 0)] * rank
-    sizes = zip(size, kernel, stride, dilation, strict=True)
-    return _halves(node, [(math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n for n, k, s, d in sizes])
+def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> tuple[list[int], list[int], Pads]:
+    """Stride, dilation and pads (begin, end) of each spatial axis."""
+    rank, auto = x.ndim - 2, node.get("auto_pad", "NOTSET")
+    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
+    if auto in ("NOTSET", "VALID"):
+        flat = node.get("pads", [0] * (2 * rank)) if auto == "NOTSET" else [0] * (2 * rank)
+        return stride, dilation, list(zip(flat[:rank], flat[rank:], strict=True))
+    sizes = zip(x.shape[2:], kernel, stride, dilation, strict=True)
+    totals = [(math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n for n, k, s, d in sizes]
+    return stride, dilation, _halves(node, totals)
 
 
 def _halves(node: Node, totals: Sequence[int]) -> Pads:
@@ -59,41 +56,36 @@ def conv(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
     if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
         raise ModelError("double precision")
-    rank = x.ndim - 2
-    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
-    pads = _pads(node, x.shape[2:], weight.shape[2:], stride, dilation)
-    even = all(begin == end for begin, end in pads)
-    if not even:
-        x = F.pad(x, _sides(pads))
-    padding = [begin for begin, _ in pads] if even else [0] * rank
+    stride, dilation, pads = _window(node, x, weight.shape[2:])
+    padding, none = [begin for begin, _ in pads], [0] * len(pads)
+    if any(begin != end for begin, end in pads):
+        x, padding = F.pad(x, _sides(pads)), none
     group = node.get("group", 1)
-    return torch.convolution(x, weight, bias, stride, padding, dilation, False, [0] * rank, group)
+    return torch.convolution(x, weight, bias, stride, padding, dilation, False, none, group)
 
 
 @operator("ConvTranspose")
 def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
     x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
-    rank = x.ndim - 2
-    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
-    extra, group = node.get("output_padding", [0] * rank), node.get("group", 1)
-    y = torch.convolution(x, weight, bias, stride, [0] * rank, dilation, True, extra, group)
+    stride, dilation, pads = _window(node, x, weight.shape[2:])
+    none, group = [0] * len(pads), node.get("group", 1)
+    extra = node.get("output_padding", none)
+    y = torch.convolution(x, weight, bias, stride, none, dilation, True, extra, group)
     # The result without its pads, which may be stated by its shape.
     sizes, wanted = y.shape[2:], node.get("output_shape")
     if wanted is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
         wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
-    if wanted is None:
-        pads = _pads(node, x.shape[2:], sizes, stride, dilation)
-    else:
-        pads = _halves(node, [n - w for n, w in zip(sizes, wanted[-rank:], strict=True)])
+    if wanted is not None:
+        spatial = wanted[-len(sizes) :]
+        pads = _halves(node, [n - w for n, w in zip(sizes, spatial, strict=True)])
     kept = [slice(begin, n - end) for n, (begin, end) in zip(sizes, pads, strict=True)]
     return y[(slice(None), slice(None), *kept)]
 
 
 def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
     """Arguments of torch's pooling, and the pads that it cannot have, in the order of F.pad."""
-    kernel, ones = node.get("kernel_shape"), [1] * (x.ndim - 2)
-    stride, dilation = node.get("strides", ones), node.get("dilations", ones)
-    pads, ceil = _pads(node, x.shape[2:], kernel, stride, dilation), bool(node.get("ceil_mode", 0))
+    kernel, ceil = node.get("kernel_shape"), bool(node.get("ceil_mode", 0))
+    stride, _, pads = _window(node, x, kernel)
     called = {"kernel_size": kernel, "stride": stride, "ceil_mode": ceil}
     if all(begin == end <= k // 2 for (begin, end), k in zip(pads, kernel, strict=True)):
         return called | {"padding": [begin for begin, _ in pads]}, []
