@@ -153,10 +153,8 @@ class _Runner(fx.Interpreter):
         args, kwargs = self.fetch_args_kwargs_from_env(node)
         result = getattr(self, node.op)(node.target, args, kwargs)
         if self._most < math.inf and _elements([*self.env.values(), result]) > self._most:
-            raise ModelError(
-                f"operation {node.name!r}: more than {self._most:,} elements at a time, far more"
-                " than image and weights have"
-            )
+            fact = f"more than {self._most:,} elements at a time, far more than image and weights"
+            raise ModelError(f"operation {node.name!r}: {fact}")
         return result
 
 

@@ -121,10 +121,8 @@ def hf_definition(folder: Path) -> ModelDefinition:
     config = _read(folder / "config.json", dict[str, object])
     kind = config.get("model_type")
     if not isinstance(kind, str) or kind not in _FAMILIES:
-        raise ModelError(
-            f"{folder}: networks of type {str(kind)[:60]!r} are not known; known:"
-            f" {', '.join(_FAMILIES)}"
-        )
+        known = ", ".join(_FAMILIES)
+        raise ModelError(f"{folder}: network type {str(kind)[:60]!r} is not one of {known}")
     _check_settings(config, folder / "config.json")
     # What its numbers are, and how images are prepared.
     output_kind, output_scale, of = _FAMILIES[kind]
@@ -137,10 +135,8 @@ def hf_definition(folder: Path) -> ModelDefinition:
         raise ModelError(f"{file}: it says no size")
     weights = folder / "model.safetensors"
     if not weights.is_file():
-        raise ModelError(
-            f"{folder} has no {weights.name}; have transformers load the network and write it by"
-            " save_pretrained"
-        )
+        way_out = "have transformers load the network and write it by save_pretrained"
+        raise ModelError(f"{folder} has no {weights.name}; {way_out}")
     # The definition, whose network is built when it is needed.
     return ModelDefinition(
         name=folder.resolve().name,
@@ -180,10 +176,8 @@ def _check_settings(config: Mapping[str, object], file: Path) -> None:
 def _read(file: Path, kind: type[_Kind]) -> _Kind:
     """The settings in a JSON file of the folder."""
     if not file.is_file():
-        raise ModelError(
-            f"{file.parent} is not a Hugging Face folder: {file.name} is missing; take it from the"
-            " network's page"
-        )
+        fact = f"is not a Hugging Face folder: {file.name} is missing"
+        raise ModelError(f"{file.parent} {fact}; take it from the network's page")
     check_network_file(file, "the settings", _MOST_JSON_BYTES)
     with wrap_content_errors(str(file), msgspec.ValidationError):
         return msgspec.convert(json.loads(file.read_bytes()), kind)
@@ -195,10 +189,8 @@ def _build(folder: Path) -> nn.Module:
     try:
         import transformers
     except ImportError as error:
-        raise ModelError(
-            f"{folder} is a Hugging Face folder, which needs the package {error.name!r}:"
-            " pip install 'pnpdepth[hf]'"
-        ) from None
+        way_out = "pip install 'pnpdepth[hf]'"
+        raise ModelError(f"reading {folder} needs {error.name}: {way_out}") from None
     # transformers says nothing of its own.
     logging: Any = transformers.utils.logging
     logging.set_verbosity_error()
@@ -218,10 +210,8 @@ def _build(folder: Path) -> nn.Module:
     # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:
-        raise ModelError(
-            f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
-            f" ({', '.join(sorted(missing)[:4])})"
-        )
+        fact = f"leave {len(missing)} of the network's out or of another shape"
+        raise ModelError(f"{folder}: its weights {fact} ({', '.join(sorted(missing)[:4])})")
     network: nn.Module = module.float()
     return network
 

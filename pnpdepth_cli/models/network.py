@@ -96,22 +96,18 @@ class Network:
             ModelError: The definition's `arguments` raises or does not return a tuple.
             UsageError: The network takes intrinsics, and they are unknown.
         """
-        takes_points = "sparse" in self.definition.input_kind
-        sparse = points.scatter().to(self.device) if takes_points else None
+        definition, name = self.definition, f"network {self.definition.name!r}"
+        sparse = points.scatter().to(self.device) if "sparse" in definition.input_kind else None
         camera = None
-        if self.definition.takes_intrinsics:
+        if definition.takes_intrinsics:
             if intrinsics is None:
-                raise UsageError(
-                    f"network {self.definition.name!r} takes the camera's intrinsics; give a camera"
-                )
+                raise UsageError(f"{name} takes the camera's intrinsics; give a camera")
             camera = intrinsics.to(self.device)
-        with wrap_user_errors(f"arguments of network {self.definition.name!r}"):
-            arguments = self.definition.call_arguments(image, sparse, camera)
+        with wrap_user_errors(f"arguments of {name}"):
+            arguments = definition.call_arguments(image, sparse, camera)
         if not isinstance(arguments, tuple):
-            raise ModelError(
-                f"arguments of network {self.definition.name!r} gives a"
-                f" {type(arguments).__name__}, where a tuple is expected"
-            )
+            kind = type(arguments).__name__
+            raise ModelError(f"arguments of {name} gives a {kind}, where a tuple is expected")
         return arguments if prior is None else (*arguments, prior)
 
     def synthetic_arguments(self, frame: FrameMap, rgb: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -157,25 +153,21 @@ class Network:
                 does not choose from.
         """
         # The definition's `output` picks the depth, or it is the only tensor.
-        name = self.definition.name
+        name = f"network {self.definition.name!r}"
         if self.definition.output is not None:
-            with wrap_user_errors(f"output of network {name!r}"):
+            with wrap_user_errors(f"output of {name}"):
                 output = self.definition.output(output)
         tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
         if len(tensors) != 1:
             paths = ", ".join(".".join(path) for path, _ in tensors)
-            raise ModelError(
-                f"network {name!r} gives a {type(output).__name__} with {len(tensors)} tensors in"
-                f" it ({paths}); `output` of its definition must pick the depth"
-            )
+            fact = f"gives a {type(output).__name__} with {len(tensors)} tensors in it ({paths})"
+            raise ModelError(f"{name} {fact}; `output` of its definition must pick the depth")
         # One map, with or without axes of batch and channel.
         tensor = tensors[0][1].float()
         shape = tuple(tensor.shape)
         if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
-            raise ModelError(
-                f"network {name!r} gives a tensor of shape {shape}, where one depth map (1, 1, h,"
-                " w) is expected; pick it by the definition's output"
-            )
+            fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
+            raise ModelError(f"{name} {fact}; pick it by the definition's output")
         tensor = tensor.reshape(1, 1, *shape[-2:])
         # Where it is not finite, it is NaN, and no gradient comes from there.
         known = tensor.isfinite()
@@ -224,26 +216,23 @@ def load_network(
     """
     torch_device = find_device(device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
+    name = f"network {definition.name!r}"
     # `build` may import modules beside the model file.
     beside = importing_beside(spec) if isinstance(spec, str) else nullcontext()
-    with wrap_user_errors(f"build of network {definition.name!r}"), beside:
+    with wrap_user_errors(f"build of {name}"), beside:
         # A module is called as well, but it is made already.
         module = None if isinstance(definition.build, nn.Module) else definition.build()
     if not isinstance(module, nn.Module):
-        raise ModelError(
-            f"build of network {definition.name!r} gives no torch module; a class or a function"
-            " that makes one is expected, as in lambda: net"
-        )
+        wanted = "a class or a function that makes one is expected, as in lambda: net"
+        raise ModelError(f"build of {name} gives no torch module; {wanted}")
     if isinstance(size := definition.size, Fixed):
-        claim = f"network {definition.name!r} takes images of {size.width}×{size.height} pixels"
+        claim = f"{name} takes images of {size.width}×{size.height} pixels"
         pixels, most = size.height * size.width, max_pixels()
         check_claim(claim, pixels, most, error=ModelError, way_out="allow more pixels")
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []
     if definition.complete and checkpoint is not None:
-        raise UsageError(
-            f"network {definition.name!r} comes with its weights; leave out the checkpoint"
-        )
+        raise UsageError(f"{name} comes with its weights; leave out the checkpoint")
     if not definition.complete:
         notes += _load_weights(module, definition, path)
     module.eval().requires_grad_(False)
@@ -280,13 +269,9 @@ def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | N
 
 def _with_suggested_layers(network: Network) -> Network:
     """The network with layers to cut at, for a definition that lists none."""
-    size = network.definition.size
-    if isinstance(size, Fixed):
-        sides = size.height, size.width
-    else:
-        sides = (-(-_SUGGESTION_SIDE // size.of) * size.of,) * 2
+    frame = FrameMap.fit(network.definition.size, _SUGGESTION_SIDE, _SUGGESTION_SIDE)
     with out_of_memory_is_a_device_error(network.device):
-        arguments = network.synthetic_arguments(FrameMap.fit(size, *sides))
+        arguments = network.synthetic_arguments(frame)
         layers = suggest_layers(network.module, arguments, network.raw_of)
     if not layers:
         return network

@@ -90,10 +90,8 @@ def _read(file: Path) -> ModelProto:
         import onnxruntime  # noqa: F401
         from google.protobuf.message import DecodeError
     except ImportError as error:
-        raise ModelError(
-            f"{file} is an ONNX file, which needs the package {error.name!r}:"
-            " pip install 'pnpdepth[onnx]'"
-        ) from None
+        way_out = "pip install 'pnpdepth[onnx]'"
+        raise ModelError(f"reading {file} needs {error.name}: {way_out}") from None
     more = (DecodeError, onnx.checker.ValidationError)
     with wrap_content_errors(f"ONNX file {file} cannot be read", *more):
         model = onnx.load(str(file), load_external_data=False)
@@ -107,9 +105,7 @@ def _check_covered(model: ModelProto) -> None:
     if not model.graph.node:
         raise InputError("it holds no graph")
     if model.functions:
-        raise InputError(
-            "it has functions of its own; onnx.inliner.inline_local_functions writes them out"
-        )
+        raise InputError("it has functions, which onnx.inliner.inline_local_functions writes out")
     for node in model.graph.node:
         words = (node.name, node.op_type, node.domain, *node.input, *node.output)
         if not all(isinstance(word, str) for word in words):
@@ -150,11 +146,9 @@ def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
     if wanted is not None and wanted in outputs:
         return wanted
     listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
-    first = next(iter(outputs), "OUTPUT")
     fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
-    raise ModelError(
-        f"ONNX file {file} has {fact}; name the depth as {file}:{first}; it has {listed}"
-    )
+    way_out = f"name the depth as {file}:{next(iter(outputs), 'OUTPUT')}"
+    raise ModelError(f"ONNX file {file} has {fact}; {way_out}; it has {listed}")
 
 
 def _prune(model: ModelProto, output: str) -> bool:
@@ -210,10 +204,8 @@ def _compare(
         expected = torch.from_numpy(session.run(None, feed)[0]).float()
     deviation = _deviation(actual, expected)
     if not deviation <= MISMATCH:
-        raise ModelError(
-            f"ONNX file {file}: its reading by torch differs from onnxruntime's by"
-            f" {deviation:.2g} of the output's range"
-        )
+        fact = f"differs from onnxruntime's by {deviation:.2g} of the output's range"
+        raise ModelError(f"ONNX file {file}: its reading by torch {fact}")
     return f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
 
 
