@@ -28,8 +28,7 @@ from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError, wrap_u
 from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.fuse import FEW_POINTS
 from pnpdepth_cli.frames.open_network import PreparedFrame, encoding_once, prepare
-from pnpdepth_cli.models.aligned import AlignedDepth
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.network import AlignedDepth, Network
 from pnpdepth_cli.points import SparsePoints
 
 STEPS = 100

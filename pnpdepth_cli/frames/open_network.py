@@ -25,9 +25,8 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.frames.frame import Frame, Prediction
-from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.network import AlignedDepth, Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 

@@ -13,10 +13,15 @@ from safetensors.torch import save_file
 from torch import nn
 
 from pnpdepth_cli.errors import DeviceError, ModelError
-from pnpdepth_cli.models.aligned import AlignedDepth
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.network import FARTHEST_DEPTH, Network, find_device, load_network
+from pnpdepth_cli.models.network import (
+    FARTHEST_DEPTH,
+    AlignedDepth,
+    Network,
+    find_device,
+    load_network,
+)
 from pnpdepth_cli.points import SparsePoints
 
 

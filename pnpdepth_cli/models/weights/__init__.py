@@ -96,7 +96,7 @@ def _read_folder(folder: Path, notes: list[str]) -> dict[str, Tensor]:
 def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[str, Tensor]:
     """The state dict in what a torch file holds: the one that the key names, or a usual one."""
     if not isinstance(content, Mapping):
-        kind = _short(content.path) if isinstance(content, StandIn) else type(content).__name__
+        kind = _some([content.path]) if isinstance(content, StandIn) else type(content).__name__
         raise ModelError(f"checkpoint {path} holds a {kind}, not named tensors")
     if not key and content and _only_tensors(content):
         return dict(content)
@@ -124,13 +124,10 @@ def _only_tensors(mapping: Mapping[Any, object]) -> bool:
 
 
 def _some(names: list[str]) -> str:
-    """The first few of the names, and how many more there are."""
+    """The first few of the names, shortened, and how many more there are."""
+    shown = [n if len(n) <= _MAX_WORD else f"{n[:_MAX_WORD]}…" for n in names[:_SHOWN_NAMES]]
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-    return f"{', '.join(map(_short, names[:_SHOWN_NAMES]))}{more}"
-
-
-def _short(word: str) -> str:
-    return word if len(word) <= _MAX_WORD else f"{word[:_MAX_WORD]}…"
+    return f"{', '.join(shown)}{more}"
 
 
 def _without_prefixes(
@@ -177,24 +174,7 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
             state = definition.read_checkpoint(stored)
         if not isinstance(state, Mapping) or not _only_tensors(state):
             raise ModelError(f"read_checkpoint of {definition.name!r} gives no named tensors")
-    _check_fit(own, state, f"checkpoint {path} does not fit network {definition.name!r}")
-    # A sum shows a value that is not finite, without a copy of the tensor.
-    broken = [
-        name
-        for name, _ in network.named_parameters()
-        if name in state and not state[name].sum(dtype=torch.float64).isfinite()
-    ]
-    if broken:
-        raise ModelError(
-            f"checkpoint {path}: {len(broken)} of its weights are NaN or infinite"
-            f" ({_some(broken)}); was its training broken off?"
-        )
-    network.load_state_dict(state, strict=False)
-    return notes
-
-
-def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: str) -> None:
-    """ModelError, which begins with `misfit`, unless the state has the network's tensors."""
+    # Whether they are the network's.
     both = [name for name in own if name in state]
     problems = {
         "missing": [n for n in own if n not in state and not n.endswith(_COUNTER)],
@@ -205,7 +185,18 @@ def _check_fit(own: Mapping[str, Tensor], state: Mapping[str, Tensor], misfit: s
             for n in both
             if state[n].shape != own[n].shape
         ],
+        "NaN or infinite, as of a training that broke off": [
+            n for n, _ in network.named_parameters() if n in state and not _is_finite(state[n])
+        ],
     }
-    listed = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
-    if listed:
-        raise ModelError(f"{misfit}: {'; '.join(listed)}")
+    misfits = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
+    if misfits:
+        fact = f"does not fit network {definition.name!r}"
+        raise ModelError(f"checkpoint {path} {fact}: {'; '.join(misfits)}")
+    network.load_state_dict(state, strict=False)
+    return notes
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    """Whether no value of real numbers is NaN or infinite: a sum shows it, without a copy."""
+    return tensor.is_complex() or bool(tensor.sum(dtype=torch.float64).isfinite())
