@@ -79,10 +79,8 @@ class _Processing(msgspec.Struct, frozen=True):
         # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
         unit = self.rescale_factor * 255 if self.do_rescale else 255.0
         asked = self.image_mean is not None if self.do_normalize is None else self.do_normalize
-        if not asked:
-            return Normalisation(std=(1 / unit, 1 / unit, 1 / unit))
-        m0, m1, m2 = self.image_mean or (0.5, 0.5, 0.5)
-        s0, s1, s2 = self.image_std or (0.5, 0.5, 0.5)
+        m0, m1, m2 = (self.image_mean or (0.5, 0.5, 0.5)) if asked else (0.0, 0.0, 0.0)
+        s0, s1, s2 = (self.image_std or (0.5, 0.5, 0.5)) if asked else (1.0, 1.0, 1.0)
         return Normalisation(
             mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
         )
@@ -90,9 +88,7 @@ class _Processing(msgspec.Struct, frozen=True):
 
 def _pixels(side: float | None) -> int:
     """A number of pixels; 1 if there is none."""
-    if side is None:
-        return 1
-    return round(1 / side) if isinstance(side, float) else side
+    return round(1 / side) if isinstance(side, float) else side or 1
 
 
 _FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
@@ -227,8 +223,5 @@ def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
         if left < 0:
             raise ModelError(f"{folder}: config.json describes a larger network than its weights")
 
-    handle = register_module_parameter_registration_hook(count)
-    try:
+    with register_module_parameter_registration_hook(count):
         yield
-    finally:
-        handle.remove()

@@ -288,10 +288,11 @@ def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
         if node.get(name, only) != only:
             raise ModelError(f"{name} {node.get(name)!r}")
     devices = [value.device for value in inputs if value is not None and not value.is_cpu]
-    moved: list[Any] = []
-    for index, value in enumerate(inputs):
-        device = "cpu" if index in HOST_INPUTS[node.op] or not devices else devices[0]
-        moved.append(value if value is None else value.to(device))
+    device, host = devices[0] if devices else "cpu", HOST_INPUTS[node.op]
+    moved: list[Any] = [
+        None if value is None else value.to("cpu" if index in host else device)
+        for index, value in enumerate(inputs)
+    ]
     return OPERATORS[node.op](node, moved)
 
 
