@@ -51,13 +51,12 @@ def with_adapted_weights(
             why = _learn_once(own, lessons, weights, listener)
         except (InputError, DivergedError) as error:
             why = str(error)
-        records = own
-        if why:
-            listener.say(f"adapt: {named}the network's own weights are used: {why}")
-        else:
-            listener.say(f"adapt: {named}{len(indices):,} frames are refined with {weights}")
-            refine = request.refine.with_fields(checkpoint=weights)
+        records, said = own, f"the network's own weights are used: {why}"
+        if why is None:
+            said = f"{len(indices):,} frames are refined with {weights}"
+            refine = replace(request.refine, checkpoint=weights)
             records = Records(replace(request, refine=refine))
+        listener.say(f"adapt: {named}{said}")
         result |= dict.fromkeys([frames[index].name for index in indices], records)
     return result
 
@@ -92,15 +91,14 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
             raise KeyboardInterrupt
 
     # The network learns from the frames, if they are enough.
-    first = read_requested(lessons[0])
+    asked, first = lessons[0], read_requested(lessons[0])
     if why := too_little(len(lessons), first):
         return why
-    choice = lessons[0]
-    network = load_network(choice.model, choice.checkpoint, choice.device)
+    network = load_network(asked.model, asked.checkpoint, asked.device)
     network = resolve_definition(network, first.registered())
     frames = ((each.files.name, read_requested(each)) for each in lessons)
     try:
-        learnt = learn(network, frames, seed=lessons[0].method.seed, on_step=check)
+        learnt = learn(network, frames, seed=asked.method.seed, on_step=check)
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
@@ -109,10 +107,8 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
         return str(learnt)
     listener.say(f"adapt: {learnt}")
     # All its tensors are written, those that learnt among them.
-    with weights_in_place(network, learnt.weights):
-        state = network.module.state_dict()
-        copies = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
     make_folder(path.parent)
-    with atomic_path(path) as file:
-        save_file(copies, file)
+    with weights_in_place(network, learnt.weights), atomic_path(path) as file:
+        state = network.module.state_dict().items()
+        save_file({name: value.cpu().clone().contiguous() for name, value in state}, file)
     return None

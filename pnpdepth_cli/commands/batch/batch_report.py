@@ -55,10 +55,7 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
 
 
 def write_batch_report(
-    request: BatchRequest,
-    folder: Path,
-    summary: BatchSummary,
-    records: Sequence[FrameRecord],
+    request: BatchRequest, folder: Path, summary: BatchSummary, records: Sequence[FrameRecord]
 ) -> None:
     """Writes the page, and links the images of all frames.
 

@@ -100,8 +100,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             " draws so many points from the ground truth"
         )
     _check_names(frames, request.refine)
-    # Poses and neighbours, of all frames.
-    frames, poses = _with_poses(request, frames)
+    # What is read of each; poses and neighbours, of all frames.
+    frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
@@ -165,12 +165,13 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
     result = [*frames]
     for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
-            near = range(max(0, number - reach), min(len(sequence), number + reach + 1))
-            neighbours = (
-                _neighbour(frames[index], frames[sequence[other]], abs(other - number), source)
-                for other in near
-                if other != number
-            )
+            first = max(0, number - reach)
+            near = enumerate(sequence[first : number + reach + 1], first - number)
+            neighbours = [
+                _neighbour(frames[index], frames[other], abs(ahead), source)
+                for ahead, other in near
+                if ahead
+            ]
             result[index] = replace(frames[index], neighbours=tuple(neighbours))
     return result
 
@@ -182,36 +183,33 @@ def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) ->
             f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
             f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
         )
-    if frame.pose is not None and other.pose is not None:
-        pose, other_pose = np.array(frame.pose), np.array(other.pose)
-        other_pose[:, 3] -= pose[:, 3]
-        motion = as_pose(pose[:, :3].T @ other_pose)
-        return Neighbour(files=other, motion=motion, poses=source, apart=apart)
-    if other.image is None:
-        raise UsageError(
-            f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
-        )
-    return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
+    if frame.pose is None or other.pose is None:
+        if other.image is None:
+            raise UsageError(
+                f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
+            )
+        return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
+    pose, other_pose = np.array(frame.pose), np.array(other.pose)
+    other_pose[:, 3] -= pose[:, 3]
+    motion = as_pose(pose[:, :3].T @ other_pose)
+    return Neighbour(files=other, motion=motion, poses=source, apart=apart)
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
-    """Returns how a frame is refined; options of the user go before what the data set states."""
-    files = _files_to_read(request, frame)
-    return replace(request.refine, files=files, reading=request.reading)
+    """Returns how a frame of `find_frames` is refined."""
+    return replace(request.refine, files=frame, reading=request.reading)
 
 
-def _files_to_read(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
-    """The files that are read for a frame, those of its neighbours among them."""
-    neighbours = [replace(n, files=_files_to_read(request, n.files)) for n in frame.neighbours]
-    files = replace(frame, neighbours=tuple(neighbours))
+def _as_requested(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
+    """The frame; options of the user go before what the data set states."""
     if request.protocol is not None:
-        files = replace(files, part=find_protocol(request.protocol).part or files.part)
+        frame = replace(frame, part=find_protocol(request.protocol).part or frame.part)
     if request.reading.sample is None:
-        return files
+        return frame
     # points are sampled from the ground truth, else from the projected scan
     scan = frame.sparse
     is_scan = scan is not None and scan.suffix.lower() in SCAN_ONLY_SUFFIXES
-    return replace(files, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
+    return replace(frame, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
 
 
 def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -20,40 +21,26 @@ import numpy as np
 
 from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import (
-    CSV,
-    JSON,
-    BatchFrames,
-    input_files,
-    request_of,
-)
+from pnpdepth_cli.commands.batch.find_frames import CSV, JSON, BatchFrames, input_files, request_of
 from pnpdepth_cli.commands.refinement.refine_request import GROUPS, Outputs, RefineRequest
 from pnpdepth_cli.commands.statistics import find_clusters
 from pnpdepth_cli.commands.tables import Table, stage_titles, write_text
 from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_of
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
-from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import LOCKS, make_folder
-from pnpdepth_cli.io.file_bytes import (
-    fingerprint,
-    is_unchanged,
-    plain,
-    read_bytes,
-    write_json,
-)
+from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, plain, read_bytes, write_json
 from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
 from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.stages import AFTER, BASES, GT
 
-_IMAGES = frozenset({"preview", "improvement"})
+_IMAGES = ("preview", "improvement")
 """Kinds of outputs for a person, which may be deleted."""
-_NO_SETTINGS = frozenset(
-    {
-        *("name", "group", "image", "sparse", "sparse_mask", "gt", "masks", "calib", "extrinsics"),
-        *("pose", "neighbours", "model", "more_models", "checkpoint", "output", "overwrite"),
-        "view_3d",
-    }
+_NO_SETTINGS = (
+    *("name", "group", "image", "sparse", "sparse_mask", "gt", "masks", "calib", "extrinsics"),
+    *("pose", "neighbours", "model", "more_models", "checkpoint", "output", "overwrite"),
+    "view_3d",
 )
 """Fields that say where something lies, whose content is compared instead, or that add a file."""
 _MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
@@ -129,9 +116,13 @@ class Records:
         inputs = {part: fingerprint(path) for part, path in input_files(request)}
         return BatchState(settings=self._digest(request), inputs=inputs)
 
-    def fail(self, request: RefineRequest, message: str) -> FrameRecord:
+    def fail(self, request: RefineRequest, error: Exception | None) -> FrameRecord:
         """Writes a record that says why a frame failed, and returns it."""
-        files = request.files
+        files, message = request.files, str(error)
+        if error is not None and not isinstance(error, PnpDepthError):
+            line = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(line.filename).name}, line {line.lineno}"
+            message = f"a bug of pnpdepth: {type(error).__name__}: {error} ({where})"
         record = FrameRecord(
             name=files.name,
             group=files.group,

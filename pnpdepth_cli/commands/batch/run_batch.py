@@ -38,7 +38,7 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
             full disk.
     """
     # Which frames are refined, and how.
-    refine = request.refine.with_fields(view_3d=request.html_3d)
+    refine = replace(request.refine, view_3d=request.html_3d)
     request = replace(request, refine=refine)
     found, own = find_frames(request), Records(request)
     if request.html is not None:
@@ -57,8 +57,8 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         of_frame = dict.fromkeys([frame.name for frame in found.frames], own)
         if request.adapt:
             of_frame = with_adapted_weights(own, found.frames, listener)
-        told = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
-        reasons = [*told]
+        asked = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
+        reasons = [*asked]
         to_do = [frame for frame, why in zip(found.chosen, reasons, strict=True) if why]
         listener.say(_plan(reasons))
         if to_do:

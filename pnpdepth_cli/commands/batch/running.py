@@ -13,7 +13,6 @@ import itertools
 import logging
 import os
 import socket
-import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -31,14 +30,7 @@ from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requ
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
-from pnpdepth_cli.errors import (
-    DeviceError,
-    InputError,
-    ModelError,
-    PnpDepthError,
-    StorageError,
-    UsageError,
-)
+from pnpdepth_cli.errors import DeviceError, InputError, ModelError, StorageError, UsageError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.file_bytes import one_line
@@ -195,23 +187,13 @@ def _refine_frames(
                 raise
             except Exception as failure:
                 error = failure
-        return records.fail(request, _message(error))
+        return records.fail(request, error)
 
     with (
         closing(in_order(read, frames, THREADS)) as reading,
         closing(in_order(write, refine(reading), THREADS)) as done,
     ):
         yield from done
-
-
-def _message(error: Exception | None) -> str:
-    if error is None or isinstance(error, PnpDepthError):
-        return str(error)
-    line = traceback.extract_tb(error.__traceback__)[-1]
-    return (
-        f"a bug of pnpdepth: {type(error).__name__}: {error} ({Path(line.filename).name}, line"
-        f" {line.lineno})"
-    )
 
 
 @dataclass(kw_only=True)
@@ -294,7 +276,7 @@ def _refine_on_workers(
                 listener.say(f"warning: a worker died ({reason})")
                 worker, tries = start(), tries + (len(part) == 1)
                 waiting.extend(([frame], tries) for frame in part if tries < _TRIES)
-                why = f"its worker died {tries} times: {reason}"
+                why = DeviceError(f"its worker died {tries} times: {reason}")
                 request = request_of(records.request, part[0])
                 done = [records.fail(request, why)] if tries == _TRIES else []
             idle.append(worker)

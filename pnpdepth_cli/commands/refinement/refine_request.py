@@ -88,16 +88,11 @@ class RefineRequest:
     def with_fields(self, **values: Any) -> RefineRequest:
         """Returns a copy with other values of these fields, its own or of any group."""
         changes = {}
-        for each in fields(self):
-            own = getattr(self, each.name)
-            if each.name in GROUPS:
-                names = values.keys() & {field.name for field in fields(own)}
-                changes[each.name] = replace(own, **{name: values.pop(name) for name in names})
-            elif each.name in values:
-                changes[each.name] = values.pop(each.name)
-        if values:
-            raise TypeError(f"a RefineRequest has no fields {', '.join(sorted(values))}")
-        return replace(self, **changes)
+        for group in GROUPS:
+            own = getattr(self, group)
+            names = values.keys() & {each.name for each in fields(own)}
+            changes[group] = replace(own, **{name: values.pop(name) for name in names})
+        return replace(self, **changes, **values)
 
     def outputs_in(self, folder: Path, name: str, *, with_gt: bool) -> Outputs:
         """Returns the files of a result in a folder; slashes in the name are subfolders."""
