@@ -156,7 +156,7 @@ class BatchRequest:
             return reading
         protocol = find_protocol(self.protocol)
         reading = replace(reading, foreground=protocol.foreground)
-        if reading.sample is not None or protocol.sample is None:
-            return reading
-        sample = parse_sample(protocol.sample)
-        return replace(reading, sample=sample, sample_seed=protocol.seed)
+        if reading.sample is None and protocol.sample is not None:
+            sample = parse_sample(protocol.sample)
+            reading = replace(reading, sample=sample, sample_seed=protocol.seed)
+        return reading
