@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.tables import bases_of, mean_weights_text, means_tabl
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io import report
-from pnpdepth_cli.measures import MEASURES, Measure
+from pnpdepth_cli.measures import MEASURES, Measure, choose_measures
 from pnpdepth_cli.stages import AFTER, BASES, BEFORE, GT, USED, VALIDATION
 
 _LABELS = {
@@ -30,7 +30,7 @@ _LABELS = {
     "gt": "Ground truth",
 }
 """Titles of the panels of a figure, by the view of the page."""
-_CHANGE = "_change"
+_CHANGE = "change"
 _SETTINGS = (
     *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
     "seed",
@@ -116,10 +116,7 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
 
 
 def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, object]:
-    """Links the images of the record's frame; returns the page's entry of them.
-
-    There are none of a result whose images were deleted.
-    """
+    """Links the images of a frame, unless they were deleted; returns the page's entry of them."""
     files = {kind: request.output / path for kind, path in record.outputs.items()}
     key, views, figures = report.image_key(record.name), dict[str, object](), record.figures
     there = all(kind in files and files[kind].exists() for kind in figures)
@@ -144,16 +141,13 @@ def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str
 def _columns(basis: str, unit: str) -> list[Measure]:
     """Errors before and after on a basis; with changes unless it is the points used."""
     columns = []
-    for measure in MEASURES:
-        if measure.key == "mae" or (measure.key == "rmse" and basis != VALIDATION):
-            key, title = measure.key, measure.title
-            if basis != USED:
-                change = replace(measure, key=f"{key}{_CHANGE}", title=f"{title} change", unit="")
-                columns.append(replace(change, percent=True, decimals=1))
-            columns += [
-                replace(measure, key=f"{key}_{stage}", title=f"{title} {stage}", unit=unit)
-                for stage in (BEFORE, AFTER)
-            ]
+    for m in choose_measures(MEASURES, ("mae",) if basis == VALIDATION else ("rmse", "mae")):
+        change, *stages = (
+            replace(m, key=f"{m.key}_{part}", title=f"{m.title} {part}", unit=unit)
+            for part in (_CHANGE, BEFORE, AFTER)
+        )
+        change = replace(change, unit="", percent=True, decimals=1)
+        columns += stages if basis == USED else [change, *stages]
     return columns
 
 
@@ -162,7 +156,7 @@ def _values(stages: dict[str, Scores]) -> dict[str, float | None]:
     for key in ("rmse", "mae"):
         before, after = (stages[stage].get(key) for stage in (BEFORE, AFTER))
         change = after / before - 1 if before and after is not None else None
-        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}{_CHANGE}": change}
+        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_{_CHANGE}": change}
     return values
 
 
