@@ -25,10 +25,6 @@ HEIGHT, WIDTH = 24, 32
 CAMERA = Camera(intrinsics=np.array([[30.0, 0, 15.5], [0, 28.0, 11.0], [0, 0, 1]]))
 
 
-def whole(depth: np.ndarray) -> PointCloud:
-    return joined(cloud_from_depth(depth, CAMERA))
-
-
 def joined(clouds: Iterable[PointCloud]) -> PointCloud:
     xyz, normals, rgb = zip(*clouds, strict=True)
     colours = None if rgb[0] is None else np.concatenate(rgb)
@@ -41,7 +37,8 @@ def test_a_plane_has_its_normal_everywhere_and_no_edge(a: float, b: float, dista
     normal = np.array([a, b, 1.0]) / np.linalg.norm([a, b, 1.0])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     rays = np.stack([(columns - 15.5) / 30, (rows - 11) / 28, np.ones((HEIGHT, WIDTH))], -1)
-    cloud = whole((distance / (rays @ normal)).astype(np.float32))
+    depth = (distance / (rays @ normal)).astype(np.float32)
+    cloud = joined(cloud_from_depth(depth, CAMERA))
     assert len(cloud.xyz) == HEIGHT * WIDTH
     assert cloud.xyz @ normal == pytest.approx(np.full(len(cloud.xyz), distance), rel=1e-4)
     assert cloud.normals @ -normal == pytest.approx(np.ones(len(cloud.xyz)), abs=1e-3)
@@ -53,13 +50,13 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
     expected = np.zeros_like(depth, bool)
     expected[:, 19:21] = True
     assert (depth_edges(depth) == expected).all()
-    assert len(whole(depth).xyz) == HEIGHT * (WIDTH - 2)
+    assert len(joined(cloud_from_depth(depth, CAMERA)).xyz) == HEIGHT * (WIDTH - 2)
 
 
 def test_unknown_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
     depth = np.full((HEIGHT, WIDTH), 3, np.float32)
     depth[8, 4], depth[5, 6] = 0, np.inf
-    cloud = whole(depth)
+    cloud = joined(cloud_from_depth(depth, CAMERA))
     assert len(cloud.xyz) == HEIGHT * WIDTH - 2
     assert (cloud.xyz[:, 2] == 3).all()
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])

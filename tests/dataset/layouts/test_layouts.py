@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import request_of
-from pnpdepth_cli.commands.refinement.refine_image import read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.colmap_models import write_text_model
@@ -201,12 +198,9 @@ def test_associations_pair_images_and_depth(line: str, tmp_path: Path) -> None:
     assert frame.pose == at_x(7)
 
 
-def inputs_of(frame: FrameFiles, root: Path) -> Frame:
-    """The frame as a batch reads it; points are sampled where it has none."""
-    pattern = None if frame.sparse is not None else parse_sample("20")
-    refine = RefineRequest().with_fields(sample=pattern)
-    request = BatchRequest(source=root, output=root / "out", refine=refine)
-    return read_requested(request_of(request, frame))
+def inputs_of(files: FrameFiles) -> Frame:
+    """The frame of these files; points are sampled where it has none."""
+    return read_frame(files, ReadOptions(sample=SamplePattern(count=20)))
 
 
 @pytest.mark.parametrize(
@@ -231,13 +225,13 @@ def test_a_file_of_a_data_set_that_means_nothing_is_named(
     make(tmp_path)
     (tmp_path / file).write_text(f"{text}\n")
     with pytest.raises(InputError, match=named):
-        inputs_of(read_frames(tmp_path)[0], tmp_path)
+        inputs_of(read_frames(tmp_path)[0])
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) -> None:
     BENCHMARKS[name][0](tmp_path)
-    inputs = inputs_of(read_frames(tmp_path)[0], tmp_path)
+    inputs = inputs_of(read_frames(tmp_path)[0])
     known = inputs.gt > 0
     np.testing.assert_allclose(inputs.gt[known], 2, rtol=1e-3)
     np.testing.assert_allclose(inputs.points.depth, 2, rtol=1e-3)
@@ -265,7 +259,7 @@ def test_a_model_elsewhere_is_sparse_depth_of_its_images(
     write_text_model(tmp_path / model, names=(photo.removeprefix("images/"),))
     (frame,) = read_frames(tmp_path)
     assert (frame.image, frame.sparse) == (tmp_path / photo, tmp_path / model)
-    assert len(inputs_of(frame, tmp_path).points) > 0
+    assert len(inputs_of(frame).points) > 0
 
 
 def test_ground_truth_is_moved_and_never_interpolated(tmp_path: Path) -> None:
@@ -286,7 +280,7 @@ def test_a_manifest_names_masks_and_ground_truth_of_another_size(tmp_path: Path)
     codes(tmp_path / "gt.png", 512)
     mask(tmp_path / "mask.png")
     (tmp_path / "list.csv").write_text("image,gt,mask,gt_size_ok\na.png,gt.png,mask.png,true\n")
-    inputs = inputs_of(read_frames(tmp_path / "list.csv")[0], tmp_path)
+    inputs = inputs_of(read_frames(tmp_path / "list.csv")[0])
     assert int((inputs.gt > 0).sum()) == HEIGHT * WIDTH // 2
     np.save(tmp_path / "mask.npy", np.arange(25).reshape(5, 5, 1) % 2)
     kept = apply_masks(np.ones((5, 5), np.float32), (tmp_path / "mask.npy",))
@@ -329,7 +323,7 @@ def test_a_phones_recording_is_a_frame(
     make: Callable[[Path], None], confident: float, tmp_path: Path
 ) -> None:
     make(tmp_path)
-    frame = read_frame(read_frames(tmp_path)[2], ReadOptions())
+    frame = inputs_of(read_frames(tmp_path)[2])
     assert len(frame.points) == confident * HEIGHT * WIDTH / 4
     np.testing.assert_allclose(frame.points.depth, 2)
     assert frame.image.shape[:2] == frame.points.size == (HEIGHT, WIDTH)
@@ -341,11 +335,11 @@ def test_each_frame_of_a_video_belongs_to_the_depth_of_its_number(tmp_path: Path
     stray_scanner(tmp_path, 12)
     frames = read_frames(tmp_path)
     for number in (11, 2, 3, 0):
-        level = read_frame(frames[number], ReadOptions()).image.mean()
+        level = inputs_of(frames[number]).image.mean()
         np.testing.assert_allclose(level, (20 + 15 * number) / 255, atol=0.02)
     # as pairs, whose depth maps are smaller than the images, and so in millimetres
     (tmp_path / "depth").rename(tmp_path / "sparse")
     (tmp_path / "rgb.mp4").rename(tmp_path / "rgb.mov")
-    frame = read_frame(read_frames(tmp_path, "pairs")[1], ReadOptions())
+    frame = inputs_of(read_frames(tmp_path, "pairs")[1])
     np.testing.assert_allclose(frame.points.depth, 2)
     assert frame.sources["sparse"].assumed
