@@ -108,8 +108,6 @@ PHOTO = f"2011_09_26/{DRIVE}/image_0{{}}/data/0000000005.png"
                 "sparse": [f"velodyne_raw/{SELECTED.format('velodyne_raw')}.png"],
                 "gt": [f"groundtruth_depth/{SELECTED.format('groundtruth_depth')}.png"],
                 "calib": [f"intrinsics/{SELECTED.format('image')}.txt"],
-                "sparse_scale": [256],
-                "gt_scale": [256],
             },
         ),
         (
