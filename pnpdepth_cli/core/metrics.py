@@ -47,10 +47,6 @@ def score(
         ground_truth: Ground truth depth of the same shape, likewise.
         measures: Measures, of which those that are formulas of pixels are computed.
     """
-    if predicted.shape != ground_truth.shape:
-        raise ValueError(
-            f"prediction is {tuple(predicted.shape)}, ground truth {tuple(ground_truth.shape)}"
-        )
     known = ground_truth.isfinite() & (ground_truth > 0)
     scored = known & predicted.isfinite() & (predicted > 0)
     p, g = predicted[scored].double(), ground_truth[scored].double()

@@ -241,7 +241,7 @@ def side_effects() -> nn.Module:
 
 
 class Updating(nn.Module):
-    """Buffers that every forward changes, in place and by assignment."""
+    """Buffers and a parameter that every forward changes, in place and by assignment."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -251,6 +251,8 @@ class Updating(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         self.passes += 1
+        with torch.no_grad():
+            self.cut.weight.clamp_(min=0)
         y = self.enter(x)
         self.average = 0.5 * self.average + 0.5 * y.mean((2, 3), keepdim=True)
         return self.head(self.cut(y * self.passes) + self.average).abs() + 1

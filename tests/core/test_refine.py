@@ -43,10 +43,14 @@ CUTS = {
 
 
 def refined(
-    network: nn.Module, layer: str, settings: ClosedSettings, points: SparsePoints = POINTS
+    network: nn.Module,
+    layer: str,
+    settings: ClosedSettings,
+    points: SparsePoints = POINTS,
+    depth_of: Callable[[Any], Tensor] = lambda output: output,
 ) -> Refinement:
     with Split(network, layer) as split:
-        return refine(split, (image(),), points, settings, depth_of=lambda output: output)
+        return refine(split, (image(),), points, settings, depth_of=depth_of)
 
 
 @pytest.mark.parametrize(
@@ -162,3 +166,41 @@ def test_a_layer_without_a_gradient_back_to_it_is_refused_on_one_line(
         refined(network, "cut", ClosedSettings())
     assert error.value.exit_code == 4
     assert "\n" not in str(error.value)
+
+
+def in_low_precision(dtype: torch.dtype) -> nn.Module:
+    """Two convolutions with a tanh between, in `dtype` from end to end."""
+    torch.manual_seed(0)
+    parts = {"encode": conv(3, 4), "decode": conv(4, 1)}
+    run = Net(lambda net, x: 2 + net.decode(torch.tanh(net.encode(x.to(dtype)))), **parts)
+    return run.to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_z_is_handed_out_in_float32_and_the_rear_of_it_is_the_network_bit_for_bit(
+    dtype: torch.dtype,
+) -> None:
+    network = in_low_precision(dtype)
+    with torch.no_grad(), Split(network, "encode") as split:
+        z = split.front(image())
+        output = split.rear(z)
+        assert (z.dtype, output.dtype) == (torch.float32, dtype)
+        assert torch.equal(output, network(image()))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "per_unit", "settings"),
+    [
+        # A step of 2^-12 is nothing to a bfloat16 near 1; many of them together are not.
+        (torch.bfloat16, 1.0, ClosedSettings(iterations=200, lr=2.0**-10)),
+        # A tenth of a micrometre per unit: ∂L/∂output is below the smallest float16.
+        (torch.float16, 1e-7, ClosedSettings(iterations=1, lr=1.0)),
+    ],
+)
+def test_in_low_precision_small_steps_add_up_and_small_gradients_move_z(
+    dtype: torch.dtype, per_unit: float, settings: ClosedSettings
+) -> None:
+    network = in_low_precision(dtype)
+    result = refined(network, "encode", settings, depth_of=lambda out: per_unit * out.float())
+    assert not torch.equal(result.before, result.after)
+    assert dtype == torch.float16 or result.losses[-1] < 0.9 * result.losses[0]

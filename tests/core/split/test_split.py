@@ -20,7 +20,6 @@ from tests.core.networks import (
     Counting,
     Net,
     UNet,
-    Updating,
     build,
     conv,
     image,
@@ -301,23 +300,6 @@ def failing(inner: nn.Module, n: int, kind: type[BaseException]) -> nn.Module:
         return y
 
     return Net(run, counted=counted)
-
-
-def test_a_parameter_that_the_forward_overwrites_is_put_back() -> None:
-    class Clamping(Updating):
-        def forward(self, x: Tensor) -> Tensor:
-            with torch.no_grad():
-                self.head.weight.clamp_(min=0)
-            return super().forward(x)
-
-    torch.manual_seed(0)
-    network = Clamping()
-    before = network.head.weight.detach().clone()
-    with Split(network, "cut") as split, torch.no_grad():
-        z = split.front(image())
-        assert torch.equal(split.rear(z), split.rear(z))
-        assert not torch.equal(network.head.weight, before)
-    assert torch.equal(network.head.weight, before)
 
 
 def test_the_networks_own_hooks_run_in_every_pass() -> None:
