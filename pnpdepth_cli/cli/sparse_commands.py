@@ -81,9 +81,7 @@ def sample(**values: Any) -> None:
 @click.command(short_help="Simulate a LiDAR in a scene with dense depth.")
 @click.argument("depth", type=options.FILE)
 @click.option(
-    "--sensor",
-    type=click.Choice(SENSORS),
-    help="LiDAR by its data sheet, or as the paper has it.",
+    "--sensor", type=click.Choice(SENSORS), help="LiDAR by its data sheet, or as the paper has it."
 )
 @click.option(
     "--beams",

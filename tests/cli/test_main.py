@@ -169,12 +169,7 @@ def depth(path: Path) -> None:
         ("d.exr", "OpenEXR.File", depth, read_depth),
         ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
         ("d.npz", "zipfile.ZipFile", depth, read_depth),
-        (
-            "d.mcap",
-            "rosbags.rosbag2.Reader.open",
-            write_bag,
-            read_bag,
-        ),
+        ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, read_bag),
         ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
         ("w.pt", "zipfile.ZipFile", partial(torch.save, {"w": torch.ones(2)}), read_checkpoint),
     ],
