@@ -51,7 +51,9 @@ def gradient(height: int, width: int) -> NDArray[np.uint8]:
     return np.stack([255 * x / width, 255 * y / height, 128 + 0 * x], -1).astype(np.uint8)
 
 
-def thinned(depth: NDArray[np.floating], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def thinned(
+    depth: NDArray[np.floating], count: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
     """The depth at so many pixels, 0 elsewhere."""
     sparse, known = np.zeros(depth.size, np.float32), rng.permutation(depth.size)[:count]
     sparse[known] = depth.ravel()[known]
