@@ -188,7 +188,7 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
     return Camera(intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source)
 
 
-def _pose(numbers: Sequence[float]) -> Extrinsics:
+def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
     """The pose of qw qx qy qz tx ty tz."""
     values = np.array(numbers, np.float64)
     if not np.isfinite(values).all() or not 1e-6 < np.linalg.norm(values[:4]) < 1e6:
@@ -209,10 +209,6 @@ def _count(stream: io.BytesIO) -> int:
     return int(_records(stream, _COUNT).item())
 
 
-Registered = tuple[str, int, Extrinsics, Integers]
-"""Name, number of the camera, pose and points of an image; -1 is no point."""
-
-
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     stream = io.BytesIO(read_bytes(path))
     for _ in range(_count(stream)):
@@ -222,7 +218,8 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield number, _camera(path, name, width, height, parameters)
 
 
-def _binary_images(path: Path) -> Iterator[Registered]:
+def _binary_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]]:
+    """Yields name, number of the camera, pose and points of each image; -1 is no point."""
     data = read_bytes(path)
     stream = io.BytesIO(data)
     for _ in range(_count(stream)):
@@ -249,7 +246,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield int(number), _camera(path, name, int(width), int(height), parameters)
 
 
-def _text_images(path: Path) -> Iterator[Registered]:
+def _text_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]]:
     """Each image has two lines, of which the second may be empty."""
     whole = read_bytes(path).decode("utf-8", "replace").removesuffix("\n").split("\n")
     lines = (line for line in whole if not line.startswith("#"))
@@ -260,8 +257,7 @@ def _text_images(path: Path) -> Iterator[Registered]:
         keypoints = next(lines, "cut short").split()  # these two words are no keypoints
         if len(pose) != 7 or len(keypoints) % 3:
             raise ValueError("a pose has 7 numbers, and each keypoint 3")
-        seen = np.array([int(word) for word in keypoints[2::3]], np.int64)
-        yield name, int(camera), _pose([float(word) for word in pose]), seen
+        yield name, int(camera), _pose(pose), np.array(keypoints[2::3], np.int64)
 
 
 def _text_points(path: Path) -> NDArray[np.void]:
@@ -270,8 +266,7 @@ def _text_points(path: Path) -> NDArray[np.void]:
         words = text.split()
         if len(words) < 8 or len(words) % 2:
             raise ValueError("a point has 8 numbers, and each observation 2")
-        x, y, z, error = (float(words[i]) for i in (1, 2, 3, 7))
-        points.append((int(words[0]), (x, y, z), (0, 0, 0), error, len(words) // 2 - 4))
+        points.append((words[0], tuple(words[1:4]), 0, words[7], len(words) // 2 - 4))
     return np.array(points, POINT)
 
 

@@ -27,6 +27,16 @@ PAGE = "index.html"
 IMAGES = "images"
 VIEWER = "viewer.js"
 _MADE_OF = "report.json"
+_TEMPLATES = jinja2.Environment(
+    autoescape=True,
+    loader=jinja2.PackageLoader("pnpdepth_cli.io"),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    finalize=lambda value: visible(value) if type(value) is str else value,
+)
+"""Templates whose values are escaped: names of frames and files are untrusted text."""
+_TEMPLATES.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -100,7 +110,7 @@ def write_report(
         images.mkdir()
         write_json(temporary / _MADE_OF, made_of)
         # The page, frame by frame.
-        parts = _environment().get_template("report.html").generate(
+        parts = _TEMPLATES.get_template("report.html").generate(
             page, data=plain(data), frames=map(plain, frames(images)), style=Markup(style),
             script=Markup(script), policy=_policy(style, script, viewer=viewer),
             version=__version__,
@@ -131,33 +141,14 @@ def save_view_3d(source: Path, target: Path) -> float:
     return max(0.1, round(target.stat().st_size / 1e6, 1))
 
 
-def _environment() -> jinja2.Environment:
-    """Templates whose values are escaped: names of frames and files are untrusted text."""
-    environment = jinja2.Environment(
-        autoescape=True,
-        loader=jinja2.PackageLoader("pnpdepth_cli.io"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=lambda value: visible(value) if type(value) is str else value,
-    )
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return environment
-
-
 def _source(name: str) -> str:
     return files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _policy(style: str, script: str, *, viewer: bool) -> Markup:
-    """A policy that allows no request beyond the page's folder, and no script but its own.
-
-    A report with 3D views may also run the scripts beside it.
-    """
-    of_style, of_script = (
-        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        for text in (style, script)
-    )
+    """Lets no request leave the folder, and runs its own script; for a viewer, those beside it."""
+    digests = (hashlib.sha256(text.encode()).digest() for text in (style, script))
+    of_style, of_script = (base64.b64encode(each).decode() for each in digests)
     return Markup(
         f"default-src 'none'; img-src 'self' file: data:; style-src 'sha256-{of_style}';"
         f" script-src 'sha256-{of_script}'{' file:' if viewer else ''}"

@@ -119,10 +119,7 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], float]:
-    """(H, W, 3) in 0..1, decoded by OpenCV because Pillow cuts colours to 8 bits; and white.
-
-    That is 255 where no number is larger: other such images would be black.
-    """
+    """(H, W, 3) in 0..1, by OpenCV as Pillow cuts colours to 8 bits; and the number of white."""
     import cv2
 
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -130,7 +127,7 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
     rgb = pixels[:, :, ::-1]
-    white = 255 if 1 < rgb.max() <= 255 else 65535
+    white = 255 if 1 < rgb.max() <= 255 else 65535  # else such images would be black
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
 
@@ -150,17 +147,12 @@ def _from_linear_light(path: Path, data: bytes) -> RgbImage:
     note = "EXR linear light, converted with the sRGB curve"
     if outside > 0:
         note += f"; {100 * outside:.2g} % of pixels lay outside 0..1 and were clipped"
-    return RgbImage(values=srgb_from_linear(linear.clip(0, 1, out=linear)), note=note)
-
-
-def srgb_from_linear(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns linear light in 0..1 of any shape, sRGB-encoded (IEC 61966-2-1)."""
-    encoded = np.empty(linear.shape, np.float32)
-    for row, light in zip(encoded, linear.astype(np.float64), strict=True):
-        # In float32 white would come out just below 1.
+    # The curve of IEC 61966-2-1, row by row: in float32 white would come out just below 1.
+    for row in linear.clip(0, 1, out=linear):
+        light = row.astype(np.float64)
         curve = 1.055 * np.power(light, 1 / 2.4) - 0.055
         row[:] = np.where(light <= 0.0031308, 12.92 * light, curve)
-    return encoded
+    return RgbImage(values=linear, note=note)
 
 
 def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:

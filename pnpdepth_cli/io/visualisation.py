@@ -166,10 +166,7 @@ def _save_depth_figure(
 def _save_figure(
     path: Path, panels: list[Panel], bar: Pixels, labels: Sequence[str], noun: str, columns: int = 1
 ) -> FigureRecord:
-    """Writes a PNG of panels of one size, `columns` to a row, beside a bar of colours (N, 3).
-
-    Bar and labels begin at the lower end; the noun is above.
-    """
+    """Writes panels of one size, `columns` to a row; a bar (N, 3) and labels from the lower end."""
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = panels[0][2].shape[:2]

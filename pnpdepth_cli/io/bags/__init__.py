@@ -16,7 +16,7 @@ import importlib
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -199,11 +199,9 @@ def _check_bag(path: Path) -> None:
 
 
 def _check_database(path: Path) -> None:
-    connection = sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)
-    try:
+    uri = f"{path.absolute().as_uri()}?immutable=1"
+    with closing(sqlite3.connect(uri, uri=True)) as connection:
         computed = connection.execute(_COMPUTED).fetchone()
-    finally:
-        connection.close()
     if computed is not None:
         name = one_line(computed[0])[:40]
         raise InputError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
