@@ -11,20 +11,32 @@ import re
 import shutil
 import sys
 import tempfile
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.numpy import save_file
+from torch import nn
 
 pytestmark = pytest.mark.slow
 for package in ("onnx", "onnxruntime", "resource", "rosbags"):
     pytest.importorskip(package)
 
-from pnpdepth_cli.cli.main import main  # noqa: E402
-from tests.fuzz.valid_files import write_files  # noqa: E402
-from tests.models.weights.files import little  # noqa: E402
+# ruff: noqa: E402
+from pnpdepth_cli.cli.main import main
+from pnpdepth_cli.io.depth import write_depth
+from tests.bags import write_bag
+from tests.colmap_models import write_binary_model, write_text_model
+from tests.io.test_calibration import FOUR, KALIBR, KITTI, POSES, ROS, opencv_file
+from tests.io.test_scans import FILES
+from tests.models.onnx.onnx_files import write_network
+from tests.models.weights.files import little
+from tests.models.weights.test_tensor_bundle import written
 
 INPUTS = int(os.environ.get("PNPDEPTH_FUZZ_INPUTS", "400"))
 SEED = int(os.environ.get("PNPDEPTH_FUZZ_SEED", "0"))
@@ -34,6 +46,117 @@ WORDS = ("", "nan", "inf", "-1", "0", "1e308", "9" * 30, "../..", "=1+1", "☃",
 FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect")
 CHANGES = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.remove": 1, "os.mkdir": 1}
 """Audit events that change files, and how many paths each has."""
+HEIGHT, WIDTH = 24, 32
+OUT = "-o out.png --overwrite"
+LISTING = "-o batch --limit 1 --shard 2/2"
+"""Of a batch that lists its frames and refines none."""
+ANY_WEIGHTS = """
+import torch
+from torch import nn
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+
+definition = ModelDefinition(
+    name="any-weights", input_kind="rgb", size=Multiple(1),
+    build=lambda: nn.Conv2d(3, 1, 1, bias=False),
+    read_checkpoint=lambda stored: {"weight": torch.ones(1, 3, 1, 1)},
+)
+"""
+"""A network that every checkpoint fits."""
+
+
+def write_files() -> dict[str, str]:
+    """Writes into the working folder; returns the arguments of `pnpdepth` by the file they read."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 9, (HEIGHT, WIDTH)).astype(np.float32)
+    pixels = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    cv2.imwrite("rgb.png", pixels)
+    cv2.imwrite("wide.png", np.zeros((480, 640, 3), np.uint8))  # of the calibrations
+    return {
+        **_pixels(depth, pixels),
+        **_scans(rng),
+        **_cameras(),
+        **_networks(rng),
+        **_data_sets(depth),
+    }
+
+
+def _pixels(depth: np.ndarray, pixels: np.ndarray) -> dict[str, str]:
+    commands = {}
+    for suffix in ("png", "exr", "npy", "npz", "pfm", "tif"):
+        write_depth(Path(f"depth.{suffix}"), depth)
+        commands[f"depth.{suffix}"] = f"sample depth.{suffix} --count 20 {OUT}"
+    for suffix in ("png", "jpg", "webp", "tif"):
+        cv2.imwrite(f"image.{suffix}", pixels)
+        features = f"sample depth.npy --count features:5 {OUT}"
+        commands[f"image.{suffix}"] = f"{features} --image image.{suffix}"
+    return commands
+
+
+def _scans(rng: np.random.Generator) -> dict[str, str]:
+    points = rng.uniform((5, -3, -2), (30, 3, 2), (200, 3)).astype(np.float32)
+    Path("calib.txt").write_text("K: 30 0 16 0 30 12 0 0 1\nR: 0 -1 0 0 0 -1 1 0 0\nt: 0 0 0\n")
+    commands = {}
+    for name, content in FILES.items():
+        Path(name).write_bytes(content(points))
+        commands[name] = f"project {name} --calib calib.txt --image rgb.png {OUT}"
+    for name in ("drive.bag", "drive.mcap"):
+        commands[write_bag(Path(name), frames=2).name] = f"frames {name} -o frames"
+    for path in write_bag(Path("ros2"), frames=2).iterdir():
+        commands[path.as_posix()] = "frames ros2 -o frames"
+    return commands
+
+
+def _cameras() -> dict[str, str]:
+    calibrations = {
+        "kitti.txt": KITTI,
+        "ros.yaml": ROS.format(model="equidistant", data=FOUR),
+        "kalibr.yaml": KALIBR,
+        "opencv.yml": opencv_file(FOUR),
+    }
+    texts = calibrations | {f"pose{n}.yaml": text for n, text in enumerate(POSES.values())}
+    commands = {}
+    for name, text in texts.items():
+        Path(name).write_text(text)
+        calib, pose = (name, "pose0.yaml") if name in calibrations else ("ros.yaml", name)
+        scan = f"project kitti.bin --image wide.png {OUT}"
+        commands[name] = f"{scan} --calib {calib} --extrinsics {pose}"
+    return commands
+
+
+def _networks(rng: np.random.Generator) -> dict[str, str]:
+    tensors = {"a.weight": rng.normal(size=(4, 3)).astype(np.float32), "a.bias": np.zeros(4)}
+    state = {name: torch.from_numpy(value) for name, value in tensors.items()}
+    save_file(tensors, "net.safetensors")
+    torch.save({"state_dict": state, "epoch": 3}, "net.pt")
+    torch.save(state, "old.pth", _use_new_zipfile_serialization=False)
+    np.save("net.npy", np.array(tensors, dtype=object), allow_pickle=True)
+    Path("any_weights.py").write_text(ANY_WEIGHTS)
+    weights = ("net.safetensors", "net.pt", "old.pth", "net.npy", written(Path()).name)
+    commands = {name: f"models check any_weights.py --checkpoint {name}" for name in weights}
+    write_network(Path("net.onnx"), shape=(1, 3, HEIGHT, WIDTH))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.export.export(nn.Conv2d(3, 1, 1), (torch.rand(1, 3, HEIGHT, WIDTH),))
+        torch.export.save(program, "net.pt2")
+    return commands | {name: f"models check {name}" for name in ("net.onnx", "net.pt2")}
+
+
+def _data_sets(depth: np.ndarray) -> dict[str, str]:
+    """What a batch reads before its first frame."""
+    write_depth(Path("sparse.png"), depth)
+    Path("frames.csv").write_text("image,sparse,gt,name\nrgb.png,sparse.png,depth.npy,a\n")
+    write_text_model(Path("photos/sparse/0"))
+    write_binary_model(Path("binary/sparse/0"))
+    images = ("photos/images/a.png", "photos/images/b.png", "photos/images/c.png")
+    images += ("binary/images/dir/1.png", "binary/images/dir/2.png")
+    for name in images:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_bytes(Path("rgb.png").read_bytes())
+    models = [path for root in ("photos", "binary") for path in Path(root, "sparse/0").iterdir()]
+    return {
+        "frames.csv": f"batch frames.csv {LISTING}",
+        **{path.as_posix(): f"batch {path.parts[0]} {LISTING}" for path in models},
+    }
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:

@@ -225,9 +225,8 @@ NO_POSES = [
 def test_what_is_missing_or_wrong_is_named_in_one_line(
     tmp_path: Path, read: Callable[[Path], object], text: str
 ) -> None:
-    with pytest.raises(InputError, match=r"calib\.txt") as error:
+    with pytest.raises(InputError, match=r"^.*calib\.txt.*$"):
         read(write(tmp_path, text))
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("form", POSES)

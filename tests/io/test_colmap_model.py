@@ -57,9 +57,8 @@ def test_a_binary_file_that_is_cut_short_or_whose_counts_lie_is_one_line(
     lies = [whole[:at] + struct.pack("<Q", 2**40) + whole[at + 8 :] for at in counts]
     for content in [*lies, *(whole[:end] for end in range(1, len(whole)))]:
         file.write_bytes(content)
-        with pytest.raises(InputError, match=str(file)) as caught:
+        with pytest.raises(InputError, match=f"^.*{file}.*$"):
             read_model(tmp_path)
-        assert "\n" not in str(caught.value)
 
 
 IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"

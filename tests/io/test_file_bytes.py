@@ -41,9 +41,8 @@ def test_json_is_read_back_plain_and_in_order_and_what_it_cannot_hold_leaves_the
 )
 def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "r.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"r\.json") as no:
+    with pytest.raises(InputError, match=r"^.*r\.json.*$"):
         read_json(tmp_path / "r.json")
-    assert "\n" not in str(no.value)
 
 
 @pytest.mark.parametrize(

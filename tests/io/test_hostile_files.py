@@ -139,9 +139,8 @@ def test_what_claims_much_or_lies_is_refused_with_little_memory_and_in_silence(
     path = tmp_path / name
     path.write_bytes(HOSTILE[name])
     for read in (read_depth, read_rgb) if path.suffix in (".png", ".tif") else (read_depth,):
-        with little(), pytest.raises(InputError, match=re.escape(str(path))) as caught:
+        with little(), pytest.raises(InputError, match=f"^.*{re.escape(str(path))}.*$"):
             read(path)
-        assert "\n" not in str(caught.value)
     said = capfd.readouterr()
     assert said.out == ""
     assert said.err == "" or path.suffix == ".exr"  # OpenEXR complains on its own

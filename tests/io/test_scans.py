@@ -123,9 +123,8 @@ def lies() -> Iterator[tuple[str, bytes]]:
 )
 def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=r"^.*$"):
         read_scan(tmp_path / name)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("channels", [0, 3])
