@@ -35,7 +35,7 @@ from pnpdepth_cli.io.poses import check_pose, numbers_in, pose_of_matrix
 CAMERA = 2
 """KITTI's left colour camera, whose images the benchmarks have."""
 
-_PERSPECTIVE, _FROM_CAMERA_0 = "perspective.txt", "calib_cam_to_velo.txt"  # of KITTI-360
+_360_FILES = ("perspective.txt", "calib_cam_to_velo.txt")
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
@@ -123,7 +123,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         UsageError: There is no such camera.
     """
     # Files that name their kind, by their own names or by words in them.
-    if path.is_dir() or path.name in (_PERSPECTIVE, *_RAW_FILES):
+    if path.is_dir() or path.name in (_360_FILES[0], *_RAW_FILES):
         return _kitti_folder(path if path.is_dir() else path.parent, camera)
     is_json = path.suffix.lower() == ".json"  # of any length: Record3D's has all poses
     text = "" if is_json else read_text(path)
@@ -135,8 +135,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         fields = _Fields(path, read_json(path))
         if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
             size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
-            by_rows = fields.matrix("K").T.ravel().tolist()
-            fields = _Fields(path, {"K": by_rows, "size": size})
+            fields = _Fields(path, {"K": fields.matrix("K").T, "size": size})
     elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
         fields = _named_values(path, text)
     else:
@@ -232,21 +231,19 @@ def _kitti(
 
 def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
     """KITTI's raw data or KITTI-360; without the file of the scanner, the camera alone."""
-    is_360 = (folder / _PERSPECTIVE).is_file()
-    cameras = folder / (_PERSPECTIVE if is_360 else _RAW_FILES[0])
+    is_360 = (folder / _360_FILES[0]).is_file()
+    cameras, scanner = (folder / name for name in (_360_FILES if is_360 else _RAW_FILES))
     if not cameras.is_file():
         raise InputError(f"{folder} has no {cameras.name}; give KITTI's raw folder, or one file")
     # The pose of the scanner; KITTI-360's file maps camera 0 to the scanner.
-    scanner = folder / (_FROM_CAMERA_0 if is_360 else _RAW_FILES[1])
     pose = None
     if scanner.is_file() and is_360:
         pose = pose_of_matrix(scanner, "the matrix", numbers_in(read_text(scanner)) or []).inverse()
     elif scanner.is_file():
         pose = _named_values(scanner, read_text(scanner)).pose("T")
     fields = _named_values(cameras, read_text(cameras))
-    if is_360:
-        return _kitti(fields, camera or 0, "KITTI-360", pose)
-    return _kitti(fields, camera, "KITTI raw", pose)
+    number, kind = (camera or 0, "KITTI-360") if is_360 else (camera, "KITTI raw")
+    return _kitti(fields, number, kind, pose)
 
 
 def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:

@@ -11,28 +11,14 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
+from pnpdepth_cli.io import formats
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_rows
-from pnpdepth_cli.io.formats import (
-    KITTI_SCALE,
-    LARGEST_CODE,
-    SATURATED_CODE,
-    SCALE_KEY,
-    DepthFile,
-    DepthFormat,
-    Reading,
-    array_files,
-    check_scale,
-    format_of_content,
-    format_of_suffix,
-    images,
-    kind_of,
-    no_depth,
-)
+from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, array_files, images
 from pnpdepth_cli.points import SparsePoints
 
 TABLE = {
-    name.lower(): DepthFormat(
+    name.lower(): formats.DepthFormat(
         name=name, suffixes=suffixes, magic=magic, read=read, write=write, integer=name == "PNG"
     )
     for name, suffixes, magic, read, write in (
@@ -79,7 +65,7 @@ def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
         InputError: The file is missing, damaged, beyond the budget, or not a depth image.
         UsageError: The scale is not above 0.
     """
-    check_scale(scale)
+    formats.check_scale(scale)
     return depth_from_stored(path, load_stored(path), scale)
 
 
@@ -90,11 +76,11 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
         InputError: The file is missing, damaged, beyond the budget, or not a depth file.
     """
     data = read_bytes(path)
-    depth_format = format_of_content(data)
+    depth_format = formats.format_of_content(data)
     if depth_format is None:
-        kind = kind_of(data)
+        kind = formats.kind_of(data)
         if kind is not None:
-            raise no_depth(path, f"an 8-bit {kind}")
+            raise formats.no_depth(path, f"an 8-bit {kind}")
         raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)
     if stored.values.dtype.kind == "b" and not is_mask:
@@ -128,10 +114,10 @@ def depth_from_stored(
     source = f"{stored.reading.source} ÷ {divisor:.12g}"
     if scale is None and own is not None:
         source += " (from the file)"
-    saturated = (values == SATURATED_CODE) & (values.dtype == np.uint16)
+    saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
     if saturated.any():
         count = int(saturated.sum())
-        source += f", {count:,} pixels of value {SATURATED_CODE} taken as unknown"
+        source += f", {count:,} pixels of value {formats.SATURATED_CODE} taken as unknown"
         values = np.where(saturated, 0, values)
     metres = values.astype(np.float64) / divisor
     reading = Reading(source, divisor, assumed=scale is None and own is None)
@@ -156,7 +142,7 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
             16 bits or so small that it would become 0.
         InputError: The depth is not (H, W).
     """
-    depth_format = format_of_suffix(path.suffix)
+    depth_format = formats.format_of_suffix(path.suffix)
     if depth_format is None:
         raise OutputError(f"{path}: the suffix for depth is one of {', '.join(DEPTH_SUFFIXES)}")
     if depth.ndim != 2 or 0 in depth.shape:
@@ -165,15 +151,15 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
     text = dict[str, str]()
     if depth_format.integer:
         values = _codes(path, known_metres(depth), scale)
-        text[SCALE_KEY] = repr(float(scale)).removesuffix(".0")
+        text[formats.SCALE_KEY] = repr(float(scale)).removesuffix(".0")
     with atomic_path(path) as temporary:
         depth_format.write(temporary, values, text)
 
 
 def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:
-    check_scale(scale)
+    formats.check_scale(scale)
     codes = np.rint(metres.astype(np.float64) * scale)
-    if codes.max() > LARGEST_CODE:
+    if codes.max() > formats.LARGEST_CODE:
         fact = f"the largest depth, {metres.max():.6g} m, does not fit"
     elif (lost := (metres > 0) & (codes == 0)).any():
         fact = f"{int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be unknown"
@@ -200,7 +186,7 @@ def read_sparse(
         NoPointsError: No depth is known.
         InputError: The file is a list, and no size was given.
     """
-    check_scale(scale)
+    formats.check_scale(scale)
     stored, header = _load_list(path)
     shape, of_array = stored.values.shape, f"point list, {stored.reading.source}"
     if header is not None:
@@ -221,7 +207,7 @@ def read_sparse(
 def _load_list(path: Path) -> tuple[DepthFile, list[str] | None]:
     """What the file stores, rows of a text, too; and the words of a text's header, maybe none."""
     data = read_bytes(path)
-    if path.suffix.lower() not in _TEXT_SUFFIXES or kind_of(data) is not None:
+    if path.suffix.lower() not in _TEXT_SUFFIXES or formats.kind_of(data) is not None:
         return load_stored(path), None
     rows, header = read_rows(path, data)
     return DepthFile(values=rows, reading=Reading("text"), is_image=False), header
@@ -325,10 +311,9 @@ def scale_warning(what: str, ratio: float, kinds: Mapping[str, Reading | None]) 
         InputError: If the scale of one of them was assumed.
     """
     quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
-    near = [q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE]
-    if not near:
+    near = (q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE)
+    if (factor := next(near, None)) is None:
         return None
-    factor = near[0]
     sides = zip(kinds.items(), (factor, 1 / factor), strict=True)
     integer = [(option, kind, by) for (option, kind), by in sides if kind and kind.scale]
     unstated = [side for side in integer if "(from the file)" not in side[1].source]

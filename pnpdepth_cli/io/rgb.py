@@ -15,15 +15,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, read_bytes, size_of_regular_file
-from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.images import (
-    IMAGE_ERRORS,
-    check_exif,
-    open_image,
-    orientation_of,
-    raw_mode,
-    read_exr_channels,
-)
+from pnpdepth_cli.io.formats import images, kind_of
 
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _PLAUSIBLE = (0.2, 50.0)
@@ -64,12 +56,12 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
         raise InputError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     note, white = None, 255.0
-    with open_image(path, data, kind) as image:
+    with images.open_image(path, data, kind) as image:
         if kind == "TIFF" and image.mode in ("I", "F"):
             raise InputError(f"{path} is no image; save it with 8 or 16 bits, none below 0")
-        wide = ";16" in raw_mode(image)
+        wide = ";16" in images.raw_mode(image)
         image.load()  # which applies the orientation of a TIFF
-        orientation = orientation_of(image)
+        orientation = images.orientation_of(image)
         if wide:
             values, white = _decode_16_bit(path, data, kind)
             if white == 255:
@@ -111,7 +103,7 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         with Image.open(path) as image:
             width, height = image.size
-            upright = (width, height) if orientation_of(image) >= 5 else (height, width)
+            upright = (width, height) if images.orientation_of(image) >= 5 else (height, width)
             return upright, (height, width)
     except (OSError, Image.DecompressionBombError):  # an EXR, say
         height, width, _ = read_rgb(path).values.shape
@@ -161,7 +153,7 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
     Raises:
         InputError: It is damaged, beyond the budget, or holds no single image.
     """
-    channels = read_exr_channels(path, data)
+    channels = images.read_exr_channels(path, data)
     reds = [name for name in channels if name.rpartition(".")[2] == "R"]
     layer = reds[0][:-1] if len(reds) == 1 else ""
     names = [layer + letter for letter in "RGB"]
@@ -187,9 +179,9 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | 
 
     try:
         with Image.open(path) as image:
-            check_exif(image)
+            images.check_exif(image)
             film_mm = float(image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm, 0))
-    except (*IMAGE_ERRORS, TypeError):  # damaged EXIF gives no focal length
+    except (*images.IMAGE_ERRORS, TypeError):  # damaged EXIF gives no focal length
         return None
     pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(*size)
     if not _PLAUSIBLE[0] <= pixels / max(size) <= _PLAUSIBLE[1]:

@@ -251,9 +251,8 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
     """Returns the named topics of poses, else those of odometry, else of poses."""
-    kinds = tuple(bag.topics(ODOMETRY)), tuple(bag.topics(POSES))
-    named = tuple(name for name in wanted if any(name in names for names in kinds))
-    return named or next((names for names in kinds if names), ())
+    odometry, poses = tuple(bag.topics(ODOMETRY)), tuple(bag.topics(POSES))
+    return tuple(name for name in wanted if name in odometry + poses) or odometry or poses
 
 
 def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:

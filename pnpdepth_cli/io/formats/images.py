@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged
-from pnpdepth_cli.io.formats import (
-    SCALE_KEY,
-    DepthFile,
-    Reading,
-    check_scale,
-    no_depth,
-)
+from pnpdepth_cli.io.formats import SCALE_KEY, DepthFile, Reading, check_scale, no_depth
 
 if TYPE_CHECKING:
     import OpenEXR
@@ -209,13 +203,9 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
             redirect_stdout(io.StringIO()),
             OpenEXR.File(str(path), separate_channels=True) as file,
         ):
-            channels = [each for part in file.parts for each in part.channels.items()]
-            decoded = {name: np.asarray(channel.pixels) for name, channel in channels}
+            return {name: np.asarray(each.pixels) for name, each in file.channels().items()}
     except (RuntimeError, ValueError, LookupError, OSError) as error:  # as the binding has it
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
-    if not decoded:
-        raise damaged(path, "EXR", "cannot be decoded")
-    return decoded
 
 
 def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
@@ -250,9 +240,8 @@ def read_exr(path: Path, data: bytes) -> DepthFile:
     names = [name for name in channels if name != "A"] or list(channels)
     named = [name for name in names if not _DEPTH_NAMES.isdisjoint(name.lower().split("."))]
     if sorted(names) == ["B", "G", "R"]:
-        named = ["R"] * all(
-            np.array_equal(channels["R"], channels[c], equal_nan=True) for c in "GB"
-        )
+        is_grey = all(np.array_equal(channels["R"], channels[c], equal_nan=True) for c in "GB")
+        named = ["R"] if is_grey else []
     if len(names) > 1 and len(named) != 1:
         listing = ", ".join(channels)
         raise InputError(f"{path} has several channels ({listing}); export the depth alone")
