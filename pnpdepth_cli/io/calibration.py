@@ -200,9 +200,7 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
     return {name: (plain, pose) for name, pose in {**poses, "P": SAME_PLACE}.items()}
 
 
-def _kitti(
-    fields: _Fields, camera: int | None, kind: str, scanner: Extrinsics | None
-) -> Calibration:
+def _kitti(fields: _Fields, camera: int | None, kind: str, lidar: Extrinsics | None) -> Calibration:
     """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
     # The number of the camera.
     number, path = CAMERA if camera is None else camera, fields.path
@@ -224,7 +222,7 @@ def _kitti(
     source = f"{kind} calibration, camera {number}"
     return Calibration(
         camera=Camera(intrinsics=intrinsics, size=size, source=source),
-        scanner=None if scanner is None else pose @ scanner,
+        scanner=None if lidar is None else pose @ lidar,
         rectification=pose,
     )
 

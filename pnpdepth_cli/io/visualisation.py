@@ -101,12 +101,10 @@ def _dim(grey: Array) -> Pixels:
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
-def _paint_signed(
-    strength: NDArray[np.floating], light: NDArray[np.floating], colors: str
-) -> Pixels:
+def _paint_signed(values: NDArray[np.floating], light: NDArray[np.floating], colors: str) -> Pixels:
     """(..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
     above, below = np.array(_SIGNED[colors], np.float32)
-    signed = strength[..., None].astype(np.float32)
+    signed = values[..., None].astype(np.float32)
     amount = np.clip(np.abs(signed), 0, 1)
     base = 255 * light[..., None].astype(np.float32)
     hue = np.where(signed > 0, above, below)

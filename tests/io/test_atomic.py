@@ -34,9 +34,7 @@ def no_room_on_disk() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("error", [None, InputError("the frame was bad"), KeyboardInterrupt()])
-def test_a_file_is_replaced_whole_or_not_at_all(
-    tmp_path: Path, error: BaseException | None
-) -> None:
+def test_a_file_is_replaced_whole_or_not(tmp_path: Path, error: BaseException | None) -> None:
     target = tmp_path / f"{'n' * 251}.png"  # the longest name that a file can have
     target.write_bytes(b"old")
     with pytest.raises(type(error)) if error else nullcontext(), atomic_path(target) as temporary:
@@ -82,9 +80,7 @@ def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suff
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_folder_is_replaced_whole_or_not_at_all_and_leftovers_of_kills_go(
-    tmp_path: Path, fails: bool
-) -> None:
+def test_a_folder_is_replaced_whole_or_not_and_leftovers_go(tmp_path: Path, fails: bool) -> None:
     folder = tmp_path / "report"
     for name in ("before", "../.0123456789ab/deep", "../.mine"):
         (folder / name).mkdir(parents=True)

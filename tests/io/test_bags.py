@@ -126,9 +126,7 @@ COMPUTED = [
 
 
 @pytest.mark.parametrize("hostile", METADATA + COMPUTED)
-def test_a_bag_with_odd_metadata_or_a_database_that_computes_is_refused(
-    hostile: str, tmp_path: Path
-) -> None:
+def test_odd_metadata_and_databases_that_compute_are_refused(hostile: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "ros2")
     (file,) = bag.glob("*.db3")
     if hostile in METADATA:

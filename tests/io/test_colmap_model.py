@@ -17,9 +17,7 @@ PARTS = ("cameras", "images", "points3D")
 COLUMNS = ["number", "xyz", "error", "track"]
 
 
-def test_a_binary_model_is_read_as_written_and_found_in_the_folders_above_it(
-    tmp_path: Path,
-) -> None:
+def test_a_binary_model_is_read_as_written_and_found_in_folders_above_it(tmp_path: Path) -> None:
     folder = tmp_path / "sparse" / "0"
     write_binary_model(folder)
     for above in (tmp_path, folder.parent, folder):
@@ -47,9 +45,7 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_binary_file_that_is_cut_short_or_whose_counts_lie_is_one_line(
-    part: str, tmp_path: Path
-) -> None:
+def test_a_binary_file_cut_short_or_whose_counts_lie_is_one_line(part: str, tmp_path: Path) -> None:
     write_binary_model(tmp_path)
     file = tmp_path / f"{part}.bin"
     whole = file.read_bytes()

@@ -301,9 +301,7 @@ def test_points_are_known_pixels_row_by_row_or_a_list_however_it_is_written(
 @pytest.mark.parametrize(
     ("header", "of_scan"), [("x,y,z", True), ("x y z intensity", True), ("x,y,depth", False)]
 )
-def test_a_header_says_whether_rows_are_of_a_scan(
-    tmp_path: Path, header: str, of_scan: bool
-) -> None:
+def test_a_header_says_if_rows_are_of_a_scan(tmp_path: Path, header: str, of_scan: bool) -> None:
     (tmp_path / "rows.csv").write_text(f"{header}\n" + "5 6 7\n" * 20)
     assert holds_scan(tmp_path / "rows.csv") is of_scan
 

@@ -85,9 +85,7 @@ TURNED = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
         ("opengl", "0 1 0 1 1 0 0 2 0 0 -1 3", "OpenGL"),  # its y and z axes are the negative ones
     ],
 )
-def test_poses_of_every_kind_are_the_same_camera(
-    tmp_path: Path, kind: str, row: str, words: str
-) -> None:
+def test_poses_of_each_kind_are_one_camera(tmp_path: Path, kind: str, row: str, words: str) -> None:
     (tmp_path / "poses.txt").write_text(row)
     (pose,), how = poses_of_frames(tmp_path / "poses.txt", ["a"], kind)
     np.testing.assert_allclose(pose, TURNED, atol=1e-15)

@@ -91,9 +91,7 @@ def requested(page: webdriver.Chrome) -> list[str]:
     return [each["params"]["request"]["url"] for each in sent]
 
 
-def test_it_opens_from_disk_without_an_error_or_a_network_and_loads_views_when_asked(
-    page: webdriver.Chrome,
-) -> None:
+def test_it_opens_without_a_network_and_loads_views_when_asked(page: webdriver.Chrome) -> None:
     loaded = (
         "const all = [...document.querySelectorAll('img')];"
         "all.forEach(each => { each.loading = 'eager' });"  # those below the window, too
@@ -128,9 +126,7 @@ def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chro
         assert (np.abs(drawn[first] - drawn[second]).sum(axis=2) > 20).mean() > 0.001
 
 
-def test_the_worst_frame_is_first_and_frames_can_be_sorted_and_searched(
-    page: webdriver.Chrome, report: Path
-) -> None:
+def test_frames_are_sorted_worst_first_and_searched(page: webdriver.Chrome, report: Path) -> None:
     frames = frames_of(report).values()
     ordered = sorted(frames, key=lambda frame: -frame["values"]["rmse_change"])
     worst_first = [frame["name"].replace("\n", "\\u000a") for frame in ordered]

@@ -82,9 +82,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_points_survive_every_format_and_what_is_no_number_is_left_to_the_gate(
-    tmp_path: Path, name: str
-) -> None:
+def test_points_survive_every_format_also_what_is_no_number(tmp_path: Path, name: str) -> None:
     bad = POINTS.copy()
     bad[5], bad[20, 0] = np.nan, np.inf
     for points in (1e-3 * POINTS, 1e4 * POINTS, bad):
