@@ -14,7 +14,7 @@ from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
 from pnpdepth_cli.io import formats
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_rows
-from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, array_files, images
+from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, images
 from pnpdepth_cli.points import SparsePoints
 
 TABLE = {
@@ -24,11 +24,11 @@ TABLE = {
     for name, suffixes, magic, read, write in (
         ("PNG", (".png",), (b"\x89PNG\r\n\x1a\n",), images.read_png, images.write_png),
         ("EXR", (".exr",), (b"v/1\x01",), images.read_exr, images.write_exr),
-        ("TIFF", (".tif", ".tiff"), (b"II*\0", b"MM\0*"), images.read_tiff, images.write_tiff),
-        ("NPY", (".npy",), (b"\x93NUMPY",), array_files.read_npy, array_files.write_npy),
+        ("NPY", (".npy",), (b"\x93NUMPY",), formats.read_npy, formats.write_npy),
         # an archive with an array, and an empty one
-        ("NPZ", (".npz",), (b"PK\3\4", b"PK\5\6"), array_files.read_npz, array_files.write_npz),
-        ("PFM", (".pfm",), (b"Pf",), array_files.read_pfm, array_files.write_pfm),
+        ("NPZ", (".npz",), (b"PK\3\4", b"PK\5\6"), formats.read_npz, formats.write_npz),
+        ("PFM", (".pfm",), (b"Pf",), formats.read_pfm, formats.write_pfm),
+        ("TIFF", (".tif", ".tiff"), (b"II*\0", b"MM\0*"), images.read_tiff, images.write_tiff),
     )
 }
 """The formats of this package by their names in `choices.FORMATS`."""

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
-from pnpdepth_cli.io.formats import kind_of
-from pnpdepth_cli.io.formats.array_files import parse_npy
+from pnpdepth_cli.io.formats import kind_of, parse_npy
 
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
