@@ -110,11 +110,12 @@ def diode(root: Path) -> None:
     np.save(f"{name}_depth_mask.npy", valid)
 
 
-def ibims(root: Path) -> None:
-    image(root / "rgb/corridor_01.png")
-    codes(root / "depth/corridor_01.png", round(2 * 65535 / 50))
-    mask(root / "mask_invalid/corridor_01.png")
-    image(root / "mask_transp/corridor_01.png")
+def ibims(root: Path, height: int = HEIGHT, width: int = WIDTH) -> None:
+    """A frame in 2 m, whose left half is valid."""
+    image(root / "rgb/corridor_01.png", height, width)
+    codes(root / "depth/corridor_01.png", round(2 * 65535 / 50), height, width)
+    mask(root / "mask_invalid/corridor_01.png", height, width)
+    image(root / "mask_transp/corridor_01.png", height, width)
 
 
 def scannet(root: Path) -> None:

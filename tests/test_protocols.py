@@ -22,7 +22,7 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
 from tests.commands.evaluation.test_evaluate import code_image, depth_file
-from tests.data_sets import SELECTED, codes, eth3d, image, mask, void
+from tests.data_sets import SELECTED, codes, eth3d, ibims, image, void
 
 KITTI = (352, 1216)
 
@@ -31,15 +31,6 @@ def nyu(root: Path) -> None:
     for name in ("0001", "0009"):
         image(root / f"image/{name}.png", 480, 640)
         depth_file(root / f"depth/{name}.npy", np.full((480, 640), 2.0))
-
-
-def ibims(root: Path) -> None:
-    """Two frames in 2 m, whose left half is valid."""
-    for name in ("corridor_01.png", "office_02.png"):
-        image(root / "rgb" / name, 480, 640)
-        image(root / "mask_transp" / name, 480, 640)
-        mask(root / "mask_invalid" / name, 480, 640)
-        codes(root / "depth" / name, round(2 * 65535 / 50), 480, 640)
 
 
 def scannet(root: Path) -> None:
@@ -65,7 +56,7 @@ def kitti(root: Path) -> None:
 BY_HAND: dict[str, tuple[Callable[[Path], None], int, int, int]] = {
     "marigold-dc-nyu": (nyu, 2, 500, 304 * 228),
     "omni-dc-nyu": (nyu, 2, 500, 304 * 228),
-    "marigold-dc-ibims": (ibims, 2, 1000, 480 * 320),
+    "marigold-dc-ibims": (partial(ibims, height=480, width=640), 1, 1000, 480 * 320),
     "marigold-dc-scannet": (scannet, 1, 500, 480 * 640),
     "marigold-dc-void": (void, 1, 6 * 8, 24 * 32),
     # the near point stays, and removes the four around it
@@ -123,15 +114,15 @@ def test_blocks_of_pixels_are_averaged_over_those_with_depth() -> None:
 
 
 def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) -> None:
-    ibims(tmp_path)
+    ibims(tmp_path, 480, 640)
     known = np.zeros((480, 640), bool)
     known[:, :320] = True
     pixels = np.argwhere(known)
     np.random.seed(2024)  # as the paper's code draws them
     np.random.shuffle(pixels)
     expected = {(x, y) for y, x in pixels[:1000].tolist()}
-    for each in read_as_batch(tmp_path, "marigold-dc-ibims").values():
-        assert {(int(x), int(y)) for x, y in each.points.xy.tolist()} == expected
+    (read,) = read_as_batch(tmp_path, "marigold-dc-ibims").values()
+    assert {(int(x), int(y)) for x, y in read.points.xy.tolist()} == expected
 
 
 def test_points_behind_the_foreground_are_those_of_two_windows() -> None:

@@ -8,7 +8,7 @@ from math import isnan
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pnpdepth_cli.core.metrics import score
@@ -41,7 +41,6 @@ depths = st.one_of(
 )
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(depths, depths), min_size=1, max_size=40))
 def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> None:
     predicted, gt = np.array([(2.0, 3.0), *pairs], np.float32).T

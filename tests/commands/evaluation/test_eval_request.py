@@ -19,7 +19,6 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("papre", {}, "paper, whole"),
     ("eigen", {"max_depth": 0.0}, "--max-depth"),
     ("paper", {"delta": 1.0}, "--delta"),
-    ("paper", {"gt_scale": 0.0}, "--gt-scale"),
     ("paper", {"pred_scale": float("nan")}, "--pred-scale"),
     ("paper", {"columns": ("rmse", "boundary")}, "boundary"),
     ("paper", {"depth_limits": (2.0, 1.0)}, "--by-depth"),
