@@ -90,7 +90,7 @@ class EvalRequest:
             raise UsageError(
                 f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"
             )
-        _ = self.shown
+        choose_measures((*self.measures, *OF_SIGMA), self.columns)
 
     @cached_property
     def rules(self) -> Protocol:
@@ -129,15 +129,6 @@ class EvalRequest:
             )
         named = (key for key in self.columns or () if key in choices.MEASURES)
         return (*usual, *of_parts, *(choices.MEASURES[key] for key in named))
-
-    @property
-    def shown(self) -> tuple[Measure, ...]:
-        """The measures of tables: those of `columns`, else all.
-
-        Raises:
-            UsageError: For an unknown one.
-        """
-        return choose_measures((*self.measures, *OF_SIGMA), self.columns)
 
     @property
     def scoring(self) -> dict[str, object]:

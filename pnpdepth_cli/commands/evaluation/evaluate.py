@@ -26,7 +26,7 @@ from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, scale_warning
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, frame_means
+from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, choose_measures, frame_means
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.protocols import WHOLE, FramePart
 
@@ -103,8 +103,8 @@ def evaluate(
         raise InputError(f"no frame could be scored; the first: {rows[0].message}")
     # means, and how sure they are over frames that count as independent
     scores = [scores_of(row) for row in scored]
-    of_sigma = [m for m in OF_SIGMA if any(m.key in each for each in scores)]
-    measures = (*request.measures, *of_sigma)
+    every = (*request.measures, *OF_SIGMA)
+    measures = tuple(m for m in every if any(m.key in each for each in scores))
     measured = [{m.key: each.get(m.key) for m in measures} for each in scores]
     mean, values = frame_means(measured), np.array([[*each.values()] for each in measured], float)
     clusters = find_clusters([row.group or "" for row in scored], values)
@@ -133,7 +133,7 @@ def evaluate(
             "coverage": sum(_numbers(scored, "predicted")) / sum(_numbers(scored, "known")),
         },
         measures=measures,
-        shown=measures if request.columns is None else request.shown,
+        shown=measures if request.columns is None else choose_measures(every, request.columns),
         mean=mean,
         interval=ends or None,
         clusters=clusters,

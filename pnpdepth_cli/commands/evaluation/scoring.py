@@ -86,7 +86,12 @@ def _score(
     # The ground truth that is scored, and the prediction as the protocol changes it.
     rules = request.rules
     gt, of_gt, notes = _read_truth(files, result, request)
-    given = _given_points(files, result.record, gt, required=rules.exclude_sparse)
+    try:
+        given = _given_points(files, result.record, gt)
+    except PnpDepthError:
+        if rules.exclude_sparse:
+            raise
+        given = None
     truth = np.where(_where_scored(gt, given, rules), gt, np.float32(0))
     if not truth.any():
         raise InputError(f"{files.gt} has no known depth where protocol {request.protocol} scores")
@@ -199,36 +204,29 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
     return replace(image, reading=image.reading._replace(assumed=assumed))
 
 
-def _given_points(
-    frame: FrameFiles, record: FrameRecord, gt: Depth, *, required: bool
-) -> Mask | None:
-    """(H, W) true at the network's sparse points; None where they are not known or unusable."""
+def _given_points(frame: FrameFiles, record: FrameRecord, gt: Depth) -> Mask:
+    """(H, W) true at the network's sparse points. Raises PnpDepthError if they are not known."""
     size, sparse = (gt.shape[0], gt.shape[1]), record.inputs.get("sparse")
     drawn = None if sparse is None else sparse.sampled
-    try:
-        # Points that were drawn from the ground truth are drawn again.
-        if drawn is not None and record.size == size[::-1]:
-            image = None
-            if drawn.kind == "features" and frame.image is not None:
-                image = frame.part.apply(read_image(frame.image))
-            xy = sample_points(gt, drawn, drawn.seed, image=image).xy
-        elif frame.sparse is not None:
-            points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
-            xy = points.xy
-            if points.size != size:
-                xy = frame.part.in_crop(xy, points.size)
-                if frame.part.apply(np.zeros(points.size, bool)).shape != size:
-                    what = f"sparse depth {frame.sparse}"
-                    raise unequal_sizes(what, points.size, "the ground truth", size)
-        else:
-            raise InputError(
-                f"frame {frame.name} has no sparse depth file to exclude: neither the record beside"
-                " the prediction nor the data set names one"
-            )
-    except PnpDepthError:
-        if required:
-            raise
-        return None
+    # Points that were drawn from the ground truth are drawn again.
+    if drawn is not None and record.size == size[::-1]:
+        image = None
+        if drawn.kind == "features" and frame.image is not None:
+            image = frame.part.apply(read_image(frame.image))
+        xy = sample_points(gt, drawn, drawn.seed, image=image).xy
+    elif frame.sparse is not None:
+        points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
+        xy = points.xy
+        if points.size != size:
+            xy = frame.part.in_crop(xy, points.size)
+            if frame.part.apply(np.zeros(points.size, bool)).shape != size:
+                what = f"sparse depth {frame.sparse}"
+                raise unequal_sizes(what, points.size, "the ground truth", size)
+    else:
+        raise InputError(
+            f"frame {frame.name} has no sparse depth file to exclude: neither the record beside the"
+            " prediction nor the data set names one"
+        )
     given = np.zeros(size, bool)
     given.flat[pixel_index(xy[in_frame(xy, size)], size)] = True
     return given
