@@ -86,7 +86,7 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     assert not any("forward" in module.__dict__ for module in network.module.modules())
 
 
-def test_frames_of_two_threads_are_refined_as_those_of_one(
+def test_threads_share_a_refiner_but_two_refiners_no_network(
     network: pnp.Network, frame: Frame
 ) -> None:
     rgb, sparse = frame
@@ -96,7 +96,12 @@ def test_frames_of_two_threads_are_refined_as_those_of_one(
         with ThreadPoolExecutor(2) as pool:
             given = [sparse, fewer] * 3
             together = list(pool.map(lambda each: refiner.refine(rgb, each).depth, given))
+        with pytest.raises(pnp.UsageError, match="Refiner"):
+            pnp.refine(network, rgb, sparse)
     assert all(np.array_equal(depth, alone[n % 2]) for n, depth in enumerate(together))
+    assert np.array_equal(
+        pnp.refine(network, rgb, sparse, pnp.Settings(iterations=1)).depth, alone[0]
+    )
 
 
 def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from torch import nn
 
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
@@ -37,6 +38,9 @@ UNITS = {"m": 1.0, "mm": 1000.0}
 FARTHEST_MEDIAN_M = 200.0
 """No frame has half of its depths farther than this; a larger median is in another unit."""
 
+_OPEN: set[nn.Module] = set()  # modules that refiners have cut open
+_OPENING = threading.Lock()
+
 Pair = tuple[ArrayLike | None, ArrayLike | SparsePoints]
 """An image and its sparse depth; see `Refiner.refine`."""
 
@@ -46,7 +50,8 @@ class Refiner:
 
     The networks stay cut open from frame to frame and are as before when it closes. What their
     definitions leave open (such as the RGB range of an ONNX file) is decided by the first frame.
-    Frames of several threads are refined one after the other.
+    Frames of several threads are refined one after the other. Another refiner cannot use a network
+    before this one closes.
 
     Args:
         network: Network from `load_network`; several are fused by the default method.
@@ -61,7 +66,7 @@ class Refiner:
             better.
 
     Raises:
-        UsageError: The settings contradict each other.
+        UsageError: The settings contradict each other, or another refiner uses a network.
         InputError: A frame of `adapt` cannot be used.
     """
 
@@ -151,15 +156,18 @@ class Refiner:
     def _method_for(self, first: Frame) -> Method:
         """The method, which this frame decides if it is the first."""
         if self._method is None:
-            networks = list(self._networks)
-            if self._adapt:
-                resolved = resolve_definition(networks[0], first.registered())
-                networks[0] = self._adapt_network(resolved)
-            method = Method(networks, self._asked, first, uncertainty=self._uncertainty)
-            self._method = self._stack.enter_context(method)
+            with ExitStack() as opening:
+                opening.enter_context(_opened([each.module for each in self._networks]))
+                networks = list(self._networks)
+                if self._adapt:
+                    resolved = resolve_definition(networks[0], first.registered())
+                    networks[0] = self._adapt_network(resolved, opening)
+                method = Method(networks, self._asked, first, uncertainty=self._uncertainty)
+                self._method = opening.enter_context(method)
+                self._stack = opening.pop_all()
         return self._method
 
-    def _adapt_network(self, network: Network) -> Network:
+    def _adapt_network(self, network: Network, opening: ExitStack) -> Network:
         """The network with the weights that it learnt, if they are better, and a note on them."""
         why, own = too_little(len(self._adapt), self._adapt[0]), "the network's own weights: "
         if why is None:
@@ -168,8 +176,24 @@ class Refiner:
             why = str(learnt)
             if learnt.is_better:
                 own = ""
-                self._stack.enter_context(weights_in_place(network, learnt.weights))
+                opening.enter_context(weights_in_place(network, learnt.weights))
         return replace(network, notes=(*network.notes, f"adapt: {own}{why}"))
+
+
+@contextmanager
+def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
+    """Inside, no other refiner opens these modules: two cuts of one would disturb each other."""
+    with _OPENING:
+        if len(set(modules)) < len(modules) or not _OPEN.isdisjoint(modules):
+            raise UsageError(
+                "a network is in use by another Refiner: close that one, share it between threads,"
+                " or load the network again"
+            )
+        _OPEN.update(modules)
+    try:
+        yield
+    finally:
+        _OPEN.difference_update(modules)
 
 
 def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[np.float32]:
