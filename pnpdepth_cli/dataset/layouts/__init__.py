@@ -181,8 +181,10 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
         layouts = {p: next((n for n in names if LAYOUTS[n].matches(p)), None) for p in folders}
         if found := {path: name for path, name in layouts.items() if name is not None}:
             return found
+    if len(names) == 1 and (lacked := LAYOUTS[names[0]].lacks(root)):
+        raise InputError("{} has no {}, which {} needs; add it".format(*lacked, names[0]))
     raise InputError(
         f"{root} does not look like {', '.join(names)}, whose folders docs/guides/many-frames.md"
-        " lists; put images into rgb/ and their sparse depth into sparse/, with equal names, or"
-        " give a CSV list with columns image and sparse"
+        " lists, and --layout NAME says what is missing; put images into rgb/ and their sparse"
+        " depth into sparse/, with equal names, or give a CSV list with columns image and sparse"
     )

@@ -34,7 +34,7 @@ from pnpdepth_cli.dataset.frame_files import (
     as_pose,
     find_files,
 )
-from pnpdepth_cli.dataset.layouts.layout import Layout, row
+from pnpdepth_cli.dataset.layouts.layout import Layout, lacking, row
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.colmap_model import model_files, read_model
 from pnpdepth_cli.io.file_bytes import numbered_lines, one_line, read_bytes, read_json
@@ -47,11 +47,6 @@ _LONGEST_POSE_GAP_S = 0.1
 """Longest gap between poses that are interpolated; motion capture takes them at 100 Hz."""
 
 Timed = tuple[float, Path]
-
-
-def _is_tum(root: Path) -> bool:
-    names = ("rgb.txt", "depth.txt")
-    return (root / _ASSOCIATIONS).is_file() or all((root / name).is_file() for name in names)
 
 
 def _frames_of_tum(root: Path) -> Iterator[FrameFiles | Unmatched]:
@@ -121,7 +116,8 @@ def _nearest_pairs(images: list[Timed], depths: list[Timed]) -> list[list[Timed]
     ]
 
 
-TUM = Layout(matches=_is_tum, frames=_frames_of_tum)
+_OF_TUM = (f"rgb.txt|{_ASSOCIATIONS}", f"depth.txt|{_ASSOCIATIONS}")
+TUM = Layout(matches=lambda root: not lacking(root, _OF_TUM), frames=_frames_of_tum, needs=_OF_TUM)
 
 
 def _colmap_models(root: Path) -> list[Path]:
@@ -161,7 +157,11 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
         yield FrameFiles(name=stem, image=path, sparse=model.folder, pose=pose)
 
 
-COLMAP = Layout(matches=_colmap_models, frames=_of_colmap)
+COLMAP = Layout(
+    matches=_colmap_models,
+    frames=_of_colmap,
+    needs=("images", "sparse/0|sparse|colmap/sparse/0"),
+)
 
 
 def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:

@@ -119,7 +119,10 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
 
 
 DEPTH = Layout(
-    matches=lambda root: _SELECTION.matches(root) or _scans_of_tree(root), frames=_frames_of_depth
+    matches=lambda root: _SELECTION.matches(root) or _scans_of_tree(root),
+    frames=_frames_of_depth,
+    needs=(f"velodyne_raw|proj_depth/velodyne_raw/{_CAMERAS}", "image|proj_depth"),
+    below="|*/|*/*/|data_depth_velodyne/*/*/",
 )
 
 
@@ -154,4 +157,9 @@ def _frames_of_camera(
             yield replace(found, name=f"{drive.name}_{found.name}_{camera}")
 
 
-RAW = Layout(matches=_raw_cameras, frames=_frames_of_raw)
+RAW = Layout(
+    matches=_raw_cameras,
+    frames=_frames_of_raw,
+    needs=(f"{_CAMERAS}/data", _SCANS),
+    below="|*/|*/*/",
+)

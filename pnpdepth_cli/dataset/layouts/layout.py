@@ -38,6 +38,16 @@ class Layout:
     matches: Callable[[Path], object]  # true for a folder or file of this layout
     frames: Callable[[Path], Iterable[FrameFiles | Unmatched]]
     """The frames of a folder or file that matches, and what is in no frame."""
+    needs: tuple[str, ...] = ()
+    """Patterns of what a place of the data set has, for errors; | between alternatives."""
+    below: str = ""  # patterns of where the places are, below the root, with | between them
+
+    def lacks(self, root: Path) -> tuple[Path, str] | None:
+        """Returns the place with the most that is needed, and what it lacks, if anything."""
+        found = (p.parent for start in self.below.split("|") for p in root.glob(f"{start}*"))
+        places = {place: lacking(place, self.needs) for place in (root, *found)}
+        place = min(places, key=lambda place: len(places[place]))
+        return (place, places[place][0].replace("|", " or ")) if places[place] else None
 
 
 Part = tuple[Path, str]
@@ -57,6 +67,11 @@ def _video(folder: Path, names: str) -> Path | None:
 
 def _exists(part: Part) -> bool:
     return part[0].is_dir() or _video(*part) is not None
+
+
+def lacking(place: Path, needs: Iterable[str]) -> list[str]:
+    """Returns the patterns, with | between alternatives, that nothing in a place has."""
+    return [need for need in needs if not any(next(place.glob(p), None) for p in need.split("|"))]
 
 
 def _files(folder: Path, names: str) -> tuple[dict[str, Path], list[Unmatched]]:
@@ -152,16 +167,13 @@ def row(
             it with further fields, or None for one that is not wanted.
         shared: A frame whose fields all frames have.
     """
-    needed = [text.rpartition("/")[0] for text in parts.values() if not text.endswith("?")]
+    needed = [_places(text) for text in parts.values() if "/" in text and not text.endswith("?")]
+    needs = (*needed, *marks)
     probe = marks[0] if marks else needed[-1].split("|")[0]
-
-    def is_place(place: Path) -> bool:
-        there = (part[1].endswith("?") or _exists(part) for part in parts_in(place).values())
-        return all(there) and all(next(place.glob(mark), None) for mark in marks)
 
     def find(root: Path) -> list[Path]:
         found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
-        return sorted(filter(is_place, found))
+        return sorted(place for place in found if not lacking(place, needs))
 
     def parts_in(place: Path) -> dict[str, Part]:
         return {field: _part(place, text) for field, text in parts.items()}
@@ -176,7 +188,14 @@ def row(
                 elif (frame := complete(found)) is not None:
                     yield replace(frame, name=name(root, place, frame.name))
 
-    return Layout(matches=find, frames=frames)
+    return Layout(matches=find, frames=frames, needs=needs, below=below)
+
+
+def _places(text: str) -> str:
+    """Where the files of a part may lie: its folders, and videos instead of images."""
+    folders, _, names = text.rpartition("/")
+    videos = VIDEO_SUFFIXES if names.endswith(".IMAGE") else ()
+    return "|".join(folder + end for end in ("", *videos) for folder in folders.split("|"))
 
 
 def _part(place: Path, text: str) -> Part:

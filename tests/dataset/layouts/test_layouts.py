@@ -316,6 +316,30 @@ def test_an_unknown_folder_or_layout_is_named(
         list_frames(tmp_path / root, name)
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "lacks"),
+    [
+        ("stray-scanner", "", "odometry.csv"),
+        ("stray-scanner", "", "rgb.mp4"),
+        ("arkitscenes", "Validation/41069021", "lowres_depth"),
+        ("diode", "indoors/scene_00019/scan_00183", "*_depth_mask.npy"),
+        ("kitti-raw", f"2011_09_26/{DRIVE}", "velodyne_points/data"),
+        ("tum", "", "depth.txt"),
+        ("colmap", "", "images"),
+    ],
+)
+def test_what_a_named_layout_lacks_is_named_with_its_place(
+    name: str, place: str, lacks: str, tmp_path: Path
+) -> None:
+    MAKERS[name][0](tmp_path)
+    (found,) = (tmp_path / place).glob(lacks)
+    found.rename(found.with_name("elsewhere"))
+    with pytest.raises(InputError) as error:
+        list_frames(tmp_path, name)
+    assert str(error.value).startswith(f"{tmp_path / place} has no ")
+    assert lacks in str(error.value)
+
+
 @pytest.mark.parametrize(("make", "confident"), [(stray_scanner, 0.75), (record3d, 1.0)])
 def test_a_phones_recording_is_a_frame(
     make: Callable[[Path], None], confident: float, tmp_path: Path
