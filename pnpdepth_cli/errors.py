@@ -86,10 +86,8 @@ def wrap_user_errors(what: str) -> Iterator[None]:
     """
     try:
         yield
-    except PnpDepthError:
-        raise
     except Exception as error:
-        if is_out_of_memory(error):
+        if isinstance(error, PnpDepthError) or is_out_of_memory(error):
             raise
         raise ModelError(f"{what} raises {describe(error)}") from error
 

@@ -58,14 +58,12 @@ COMMANDS = {
         ("eval", "--json --csv -", 2, "can go to stdout"),
         ("eval", "--protocol nyu-eigen", 3, "640×480"),
         ("compare missing.json", "missing.json", 3, "missing.json"),
-        ("compare bad.json", "bad.json", 3, "bad.json"),
     ],
 )
 def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
 ) -> None:
     Path("one_pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    Path("bad.json").write_text('{"frames": [{"name": "a", "scores": 3}]}')
     before = sorted(root.rglob("*"))
     assert run(f"{command} {COMMANDS.get(command.split()[-1], '')} {more}".split()) == code
     out, err = capsys.readouterr()
@@ -127,7 +125,6 @@ def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: P
     ("error", "code", "line"),
     [
         (MemoryError(), 6, "memory is exhausted"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 6, "memory is exhausted"),
         (PermissionError(errno.EACCES, "Permission denied", str(GT)), 3, "gt.png: Permission"),
         (OSError(errno.ENOSPC, "No space left on device"), 2, "No space"),
         (KeyboardInterrupt(), 130, "interrupted"),
