@@ -277,5 +277,5 @@ definitions = {
         defaults=Settings(layer="decoder.s8", iterations=2, lr="5%", schedule="linear"),
         build=Compact,
         checkpoint=Path(__file__).parent / "weights" / "compact.safetensors",
-    ),
+    )
 }

@@ -21,12 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnpdepth_cli.models.definition import (
-    ModelDefinition,
-    Multiple,
-    Normalisation,
-    Settings,
-)
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation, Settings
 
 FARTHEST = 200.0  # metres; our choice, so that depth stays finite
 TUNED = Settings(layer="decoder.s8", lr="10%")  # of `-tiny`, for 500 points

@@ -99,5 +99,5 @@ definitions = {
         build=NConv,
         layers=("nconv1[0]", "nconv2#1[0]", "nconv6[0]"),
         defaults=Settings(),
-    ),
+    )
 }

@@ -107,5 +107,5 @@ definitions = {
         build=Pncnn,
         layers=("conf_estimator.down3", "conf_estimator.up4", "conf_estimator"),
         defaults=Settings(),
-    ),
+    )
 }

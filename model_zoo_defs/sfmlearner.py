@@ -19,12 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnpdepth_cli.models.definition import (
-    Fixed,
-    ModelDefinition,
-    Normalisation,
-    Settings,
-)
+from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, Settings
 
 GAIN, FLOOR = 10.0, 0.01  # disparity is between FLOOR and GAIN + FLOOR
 DOWN = (1, 2, 4, 8, 16, 16, 16)  # channels of conv1 … conv7, in units of `width`

@@ -55,10 +55,7 @@ class CloudRequest:
         metavar="F",
     )
     min_views: int = option(
-        1,
-        "Keep pixels on which N views agree; their depth is the mean.",
-        metavar="N",
-        least=1,
+        1, "Keep pixels on which N views agree; their depth is the mean.", metavar="N", least=1
     )
     voxel: float | None = option(None, "Merge the points in cubes of this side.", metavar="M")
     overwrite: bool = False

@@ -181,13 +181,10 @@ class ReadOptions:
         metavar="S",
     )
     unit_scale: float | None = option(
-        None,
-        "Metres per unit of a COLMAP model.  [default: depth is in model units]",
-        metavar="M",
+        None, "Metres per unit of a COLMAP model.  [default: depth is in model units]", metavar="M"
     )
     sparse_range: bool = option(
-        False,
-        "Sparse depth is the distance from the camera, not depth z; needs --calib.",
+        False, "Sparse depth is the distance from the camera, not depth z; needs --calib."
     )
     registration: str = option(
         "auto",

@@ -191,10 +191,7 @@ def choose_camera(
 
 
 def _agreements(
-    points: Points,
-    rgb: NDArray[np.float32],
-    own: Calibration,
-    others: Mapping[str, Calibration],
+    points: Points, rgb: NDArray[np.float32], own: Calibration, others: Mapping[str, Calibration]
 ) -> dict[str, float]:
     """The edge agreement by each calibration; −1 where it puts few of the points into the image."""
     # Points that are seen by their own calibration, with its jumps of depth, are projected anew.

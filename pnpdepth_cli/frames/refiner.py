@@ -108,11 +108,7 @@ class Refiner:
         self._stack.close()
 
     def refine(
-        self,
-        image: ArrayLike | None,
-        sparse: ArrayLike | SparsePoints,
-        *,
-        unit: Unit | None = None,
+        self, image: ArrayLike | None, sparse: ArrayLike | SparsePoints, *, unit: Unit | None = None
     ) -> Refined:
         """Returns one frame of arrays refined.
 

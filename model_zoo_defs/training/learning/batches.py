@@ -43,11 +43,7 @@ class Batches:
     """
 
     def __init__(
-        self,
-        folders: Sequence[Path],
-        seed: int,
-        points: Points | None = None,
-        spliced: float = 0.0,
+        self, folders: Sequence[Path], seed: int, points: Points | None = None, spliced: float = 0.0
     ):
         self.sets = [Frames(folder) for folder in folders]
         self.seed, self.points, self.spliced = seed, points, spliced

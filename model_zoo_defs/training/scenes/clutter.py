@@ -150,10 +150,7 @@ def frame(kit: Kit) -> Group:
     )
     photo = kit.palette.new("poster", tile_m=tall, whole=True, mirror=0.03)
     group.add(
-        box(wide * 0.82, 0.002, tall * 0.82, fit=tall),
-        photo,
-        (0, -0.009, tall * 0.09),
-        pitch=-0.2,
+        box(wide * 0.82, 0.002, tall * 0.82, fit=tall), photo, (0, -0.009, tall * 0.09), pitch=-0.2
     )
     return group
 

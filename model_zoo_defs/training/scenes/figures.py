@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.rendering.shapes import (
-    Group,
-    cylinder,
-    rod,
-    superquadric,
-    torus,
-    tube,
-)
+from model_zoo_defs.training.rendering.shapes import Group, cylinder, rod, superquadric, torus, tube
 from model_zoo_defs.training.scenes.kit import Kit
 
 

@@ -6,13 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from model_zoo_defs.training.rendering.shapes import (
-    Group,
-    box,
-    cylinder,
-    quads,
-    rod,
-)
+from model_zoo_defs.training.rendering.shapes import Group, box, cylinder, quads, rod
 from model_zoo_defs.training.scenes import clutter, figures, furniture, seating
 from model_zoo_defs.training.scenes.kit import Kit
 from model_zoo_defs.training.scenes.walls import Hole, decorate, opening, openings, wall

@@ -80,11 +80,7 @@ def build(kind: str, rng: np.random.Generator) -> tuple[World, Plan]:
     plan = _MAKERS[kind](Kit(rng=rng, palette=palette))
     mesh, materials = plan.group.merged()
     world = World(
-        mesh=mesh,
-        face_material=materials,
-        table=palette.frozen(),
-        lights=plan.lights,
-        sky=plan.sky,
+        mesh=mesh, face_material=materials, table=palette.frozen(), lights=plan.lights, sky=plan.sky
     )
     return world, plan
 

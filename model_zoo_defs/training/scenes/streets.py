@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_zoo_defs.training.rendering.shapes import (
-    Group,
-    box,
-    rod,
-    surface,
-)
+from model_zoo_defs.training.rendering.shapes import Group, box, rod, surface
 from model_zoo_defs.training.scenes import buildings, clutter, figures, vehicles
 from model_zoo_defs.training.scenes.kit import Kit
 from model_zoo_defs.training.scenes.roadside import fence, hedge, leaf_green, pole, tree

@@ -7,14 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from model_zoo_defs.training.rendering.shapes import (
-    Group,
-    Mesh,
-    box,
-    quads,
-    rod,
-    surface,
-)
+from model_zoo_defs.training.rendering.shapes import Group, Mesh, box, quads, rod, surface
 from model_zoo_defs.training.scenes import clutter, furniture, seating
 from model_zoo_defs.training.scenes.kit import Kit
 

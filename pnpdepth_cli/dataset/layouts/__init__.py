@@ -88,8 +88,7 @@ TABLE: dict[str, Layout] = {
         shared=FrameFiles(gt_scale=65535 / 50),
     ),
     "image-depth": row(
-        {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"},
-        calib="calib.txt",
+        {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"}, calib="calib.txt"
     ),
     "kitti-object": row(
         {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},

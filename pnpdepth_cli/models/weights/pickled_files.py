@@ -24,12 +24,7 @@ from torch import Tensor
 
 from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.models.weights.pickle_reader import (
-    CONTENT_ERRORS,
-    MAX_NAME,
-    StandIn,
-    read_pickle,
-)
+from pnpdepth_cli.models.weights.pickle_reader import CONTENT_ERRORS, MAX_NAME, StandIn, read_pickle
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _MAX_DEPTH = 100  # of modules inside each other
