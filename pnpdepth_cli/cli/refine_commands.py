@@ -35,6 +35,13 @@ _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
 """Characters that a folder's name cannot have, on some system."""
+_min_confidence = click.option(
+    "--min-confidence",
+    type=float,
+    metavar="N",
+    help="Least value of a confidence mask, such as 2 of 0…2, whose depth is used."
+    "  [default: above 0]",
+)
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
 
@@ -68,12 +75,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     type=options.FILE,
     help="Confidence of the sparse depth, or a mask: image or array of its size or the image's.",
 )
-@click.option(
-    "--min-confidence",
-    type=float,
-    metavar="N",
-    help="Least value of the mask, such as 2 of 0…2, whose depth is used.  [default: above 0]",
-)
+@_min_confidence
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
 @click.option(
     "-o",
@@ -120,7 +122,7 @@ def refine(as_json: bool, **values: Any) -> None:
             *("--sample", "--layout", "--protocol", "--frames", "--every", "--limit", "--shard"),
         ),
         "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
-        "Input": (ScanOptions, ReadOptions),
+        "Input": ("--min-confidence", ScanOptions, ReadOptions),
         "Network": _NETWORK,
         "Method": (Settings, "--baselines", "--uncertainty", "--holdout"),
         "Study": ("--vary",),
@@ -136,6 +138,7 @@ def refine(as_json: bool, **values: Any) -> None:
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
+@_min_confidence
 @options.options_of_groups(BatchRequest)
 @click.option(
     "--vary",

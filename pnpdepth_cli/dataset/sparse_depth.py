@@ -88,7 +88,8 @@ class SparseDepth:
             f" which gives them {own.min():g} to {own.max():g}"
         )
         if not kept.any():
-            raise NoPointsError(f"{fact}; lower --min-confidence")
+            way_out = "use another mask" if least is None else "lower --min-confidence"
+            raise NoPointsError(f"{fact}; {way_out}")
         dropped = self.record.dropped | {"of low confidence": int((~kept).sum())}
         record = replace(self.record, mask=str(path), least=least, dropped=dropped)
         notes = (*self.notes, f"sparse: {fact}")

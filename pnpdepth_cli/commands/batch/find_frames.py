@@ -99,6 +99,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
             " draws so many points from the ground truth"
         )
+    masked = any(frame.sparse_mask is not None for frame in frames)
+    if request.refine.files.min_confidence is not None and not masked:
+        raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")
     _check_names(frames, request.refine)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
@@ -201,7 +204,10 @@ def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
 
 
 def _as_requested(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
-    """The frame; options of the user go before what the data set states."""
+    """The frame; options of the user go before what the data set states of all its frames."""
+    least = request.refine.files.min_confidence
+    if frame.sparse_mask is not None and frame.min_confidence is None:
+        frame = replace(frame, min_confidence=least)
     if request.protocol is not None:
         frame = replace(frame, part=find_protocol(request.protocol).part or frame.part)
     if request.reading.sample is None:

@@ -5,7 +5,7 @@ import json
 import os
 import re
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +215,18 @@ def test_frames_are_chosen_by_name_then_by_step_then_by_number_and_measures_by_c
     for mistake in ({"names": "A*"}, {"columns": ("mse",)}):
         with pytest.raises(UsageError, match=r"A\*|--columns"):
             batch(root, **mistake)
+
+
+def test_a_least_confidence_is_for_frames_with_a_mask_and_none_of_their_own(root: Path) -> None:
+    rows = ("sparse/a.png,1", "sparse/b.png,", ",")
+    lines = ["image,sparse,sparse_mask,min_confidence"]
+    lines += [f"rgb/{n}.png,sparse/{n}.png,{row}" for n, row in zip("abc", rows, strict=True)]
+    (root / "list.csv").write_text("\n".join(lines))
+    refine = refinement(root, min_confidence=2.0)
+    request = BatchRequest(source=root / "list.csv", output=root / "out", refine=refine)
+    assert [frame.min_confidence for frame in find_frames(request).frames] == [1, 2, None]
+    with pytest.raises(UsageError, match="--min-confidence"):
+        find_frames(replace(request, source=root))
 
 
 def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
