@@ -103,14 +103,9 @@ def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
 
 
 def _add_node(graph: FileGraph, target: str, inputs: list[_Json], outputs: list[_Json]) -> None:
-    positional: list[Argument] = []
-    keywords: dict[str, Argument] = {}
-    for one in inputs:
-        value = _argument(one["arg"], graph.values)
-        if one.get("kind") == _KEYWORD:
-            keywords[one["name"]] = value
-        else:
-            positional.append(value)
+    values = [(one, _argument(one["arg"], graph.values)) for one in inputs]
+    positional = [value for one, value in values if one.get("kind") != _KEYWORD]
+    keywords = {one["name"]: value for one, value in values if one.get("kind") == _KEYWORD}
     named = [name for output in outputs for name in _outputs_in(output)]
     alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
     name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
@@ -151,8 +146,7 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return _argument(value, values) if isinstance(value, Mapping) else value
         case "tensors" | "ints" | "floats" | "bools":
             kind = kind.removesuffix("s")
-            whole = [isinstance(one, Mapping) and "name" not in one for one in value]
-            each = [one if w else {kind: one} for one, w in zip(value, whole, strict=True)]
+            each = [v if isinstance(v, Mapping) and "name" not in v else {kind: v} for v in value]
             return [_argument(one, values) for one in each]
         case "scalar_type":
             return _DTYPES[value]
@@ -167,11 +161,11 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
 
 def _outputs_in(stated: _Json) -> list[str | None]:
     """The names that a stated output gives to values; None for a part without one."""
-    ((kind, value),) = dict(stated).items()
-    if kind == "as_tensors":
-        return [one["name"] for one in value]
-    if kind == "as_none":
-        return [None]
-    if kind != "as_tensor":
-        raise InputError(f"it computes {str(kind)[:40]!r}; export it with fixed sizes")
-    return [str(value["name"])]
+    match stated:
+        case {"as_tensor": {"name": name}}:
+            return [str(name)]
+        case {"as_tensors": parts}:
+            return [part["name"] for part in parts]
+        case {"as_none": _}:
+            return [None]
+    raise InputError(f"it computes {str([*stated])[:40]}; export it with fixed sizes")

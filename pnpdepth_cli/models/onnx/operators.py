@@ -29,18 +29,11 @@ OPERATORS: dict[str, Operator] = {}
 HOST_INPUTS: dict[str, tuple[int, ...]] = {}
 """Indices of an operator's inputs that are read as Python numbers; they stay on the CPU."""
 
-
 ONLY: dict[str, int | str] = {
-    "antialias": 0,
-    "batch_dims": 0,
-    "detect_negative": 1,
-    "detect_positive": 1,
-    "exclude_outside": 0,
-    "keep_aspect_ratio_policy": "stretch",
-    "noop_with_empty_axes": 0,
-    "reduction": "none",
-    "training_mode": 0,
-}
+    "antialias": 0, "batch_dims": 0, "exclude_outside": 0, "noop_with_empty_axes": 0,
+    "detect_negative": 1, "detect_positive": 1, "keep_aspect_ratio_policy": "stretch",
+    "reduction": "none", "training_mode": 0,
+}  # fmt: skip
 """Attributes that must have this value, the standard's default, if they are there."""
 
 
