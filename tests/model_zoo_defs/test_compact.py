@@ -10,6 +10,7 @@ from model_zoo_defs._compact.cloud import Cloud
 from model_zoo_defs._compact.points import Points
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.models.network import load_network
 
 definition = definitions["compact"]
 
@@ -60,23 +61,19 @@ def prior_of(sparse: Tensor) -> Tensor:
     return prior
 
 
-@pytest.mark.parametrize("with_prior", [False, True])
-def test_inputs_ten_times_as_far_give_depth_ten_times_as_far(
-    network: Compact, with_prior: bool
+def test_depth_scales_with_its_inputs_and_a_prior_that_is_unknown_everywhere_changes_nothing(
+    network: Compact,
 ) -> None:
     rgb, sparse = frame(96, 128, 300)
-    depths = (sparse, prior_of(sparse)) if with_prior else (sparse,)
+    prior, unknown = prior_of(sparse), torch.zeros_like(sparse)
     with torch.no_grad():
-        expected = network(rgb, *depths) * 10
-        depth = network(rgb, *(one * 10 for one in depths))
-    torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
-
-
-def test_a_prior_that_is_unknown_everywhere_changes_nothing(network: Compact) -> None:
-    rgb, sparse = frame(96, 128, 200)
-    with torch.no_grad():
-        depth, without = network(rgb, sparse, torch.zeros_like(sparse)), network(rgb, sparse)
-    torch.testing.assert_close(depth, without, rtol=1e-3, atol=0.0)
+        pairs = (
+            (network(rgb, 10 * sparse), 10 * network(rgb, sparse)),
+            (network(rgb, 10 * sparse, 10 * prior), 10 * network(rgb, sparse, prior)),
+            (network(rgb, sparse, unknown), network(rgb, sparse)),
+        )
+    for depth, expected in pairs:
+        torch.testing.assert_close(depth, expected, rtol=1e-3, atol=0.0)
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
@@ -97,13 +94,8 @@ def test_rear_of_front_is_the_network_bit_for_bit_and_errors_reach_every_layer(
     assert float((gradient != 0).float().mean()) > 0.3
 
 
-@pytest.mark.skipif(
-    definition.checkpoint is None or not definition.checkpoint.exists(), reason="not trained yet"
-)
 def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
-    safetensors = pytest.importorskip("safetensors.torch")
-    network = definition.build().eval()
-    network.load_state_dict(safetensors.load_file(definition.checkpoint))
+    network = load_network("compact", None).module
     generator = torch.Generator().manual_seed(5)
     rows, columns = torch.meshgrid(torch.arange(192.0), torch.arange(256.0), indexing="ij")
     ground_truth = (2.0 + 0.005 * rows + 0.003 * columns).view(1, 1, 192, 256)

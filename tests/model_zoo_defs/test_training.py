@@ -14,7 +14,6 @@ from torch import nn
 from model_zoo_defs.training.learning import recipes
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
-pytest.importorskip("safetensors")
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
 train = pytest.importorskip("model_zoo_defs.training.learning.train")
 

@@ -75,14 +75,12 @@ def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(
     assert len(points) > 50
 
 
-def test_a_crop_is_the_largest_in_the_middle_and_a_longest_side_is_not_enlarged() -> None:
+def test_sizes_are_cropped_in_the_middle_shrunk_to_the_longest_or_near_as_transformers() -> None:
     assert FrameMap.fit(Fixed(30, 40, "crop"), 60, 100).crop == (0, 10, 60, 80)
     assert FrameMap.fit(Fixed(10, 1000, "crop"), 1, 50).crop == (0, 0, 1, 50)  # of one pixel
     assert FrameMap.fit(Multiple(32, longest=640), 1000, 2000).resized == (320, 640)
     assert FrameMap.fit(Multiple(32, longest=640), 100, 200).resized == (100, 200)
 
-
-def test_a_size_near_one_is_that_of_transformers() -> None:
     assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
     assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
 

@@ -173,12 +173,16 @@ def saved(folder: Path, name: str) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONFIGS)
-def test_a_folder_loads_lists_layers_and_refines_without_network_access(
+def test_a_folder_loads_lists_layers_and_refines_without_its_code_or_network_access(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for owner, function in ((socket.socket, "connect"), (socket, "getaddrinfo")):
         monkeypatch.setattr(owner, function, None)  # a call raises
-    network = load_network(str(saved(tmp_path / name, name)), None)
+    folder = saved(tmp_path / name, name)
+    (folder / "code.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    code = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
+    network = load_network(str(changed(folder, {"auto_map": code})), None)
+    assert not (tmp_path / "ran").exists()
     definition = network.definition
     frame = FrameMap.fit(definition.size, 60, 90)
     _, points, _ = synthetic_frame(frame.image)
@@ -220,12 +224,3 @@ def test_a_network_larger_than_its_weights_or_of_fetched_code_is_not_built(
         pytest.raises(ModelError, match=message),
     ):
         load_network(str(folder), None)
-
-
-@pytest.mark.slow
-def test_code_in_a_folder_is_never_run(tmp_path: Path) -> None:
-    marker, folder = tmp_path / "ran", saved(tmp_path / "net", "glpn")
-    (folder / "code.py").write_text(f"open({str(marker)!r}, 'w')")
-    code = {"AutoModelForDepthEstimation": "code.Net", "AutoConfig": "code.Config"}
-    load_network(str(changed(folder, {"auto_map": code})), None)
-    assert not marker.exists()

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from pnpdepth_cli.errors import DeviceError, ModelError
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
+from pnpdepth_cli.models.definition import Multiple, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import (
     FARTHEST_DEPTH,
@@ -23,15 +23,11 @@ from pnpdepth_cli.models.network import (
     load_network,
 )
 from pnpdepth_cli.points import SparsePoints
-
-
-def definition(**more: Any) -> ModelDefinition:
-    settings = {"input_kind": "rgb", "size": Multiple(1), "build": nn.Identity, "layers": ("",)}
-    return ModelDefinition(name="mine", **settings | more)
+from tests.models.test_definition import definition
 
 
 def network(**more: Any) -> Network:
-    return load_network(definition(**more), None)
+    return load_network(definition(layers=("",), **more), None)
 
 
 def test_an_image_is_normalised_and_points_are_scattered() -> None:
@@ -86,7 +82,7 @@ def test_a_network_that_is_no_better_than_the_median_depth_is_named(
     points = SparsePoints(xy=xy.float(), depth=at, size=(40, 40))
     reader = AlignedDepth(network(output_scale="affine"), points, "auto")
     reader(of_depth * depth + of_noise * unrelated)
-    assert any("network 'mine' says nothing about" in note for note in reader.notes) == said
+    assert any("network 'n' says nothing about" in note for note in reader.notes) == said
 
 
 # ------------------------------------------------------------------ loading
@@ -97,7 +93,7 @@ def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_ch
 ) -> None:
     weights = tmp_path / "own.safetensors"
     save_file({"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}, weights)
-    bare = definition(build=lambda: nn.Conv2d(1, 1, 1))
+    bare = definition(build=lambda: nn.Conv2d(1, 1, 1), layers=("",))
     owned = replace(bare, checkpoint=weights)
     for spec, checkpoint in ((owned, None), (bare, weights)):
         loaded = load_network(spec, checkpoint)
@@ -113,7 +109,7 @@ def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_ch
 
 @pytest.mark.parametrize("build", [lambda: 1 / 0, lambda: "text", nn.Conv2d(1, 1, 1)])
 def test_a_build_that_raises_or_returns_no_module_is_refused(build: Callable[..., Any]) -> None:
-    with pytest.raises(ModelError, match="'mine'"):
+    with pytest.raises(ModelError, match="build of network 'n'"):
         load_network(definition(build=build), None)
 
 

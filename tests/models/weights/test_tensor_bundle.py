@@ -75,8 +75,9 @@ def bundle(folder: Path, entries: dict[str, bytes], *contents: bytes) -> Path:
     return folder / "x.index"
 
 
-def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path: Path) -> None:
-    tensors = read_checkpoint(written(tmp_path))
+def test_what_tensorflow_wrote_is_read_to_the_bit_or_refused_if_it_is_cut(tmp_path: Path) -> None:
+    index = written(tmp_path)
+    tensors, whole = read_checkpoint(index), index.read_bytes()
     expected = {
         "conv1.biases": torch.tensor([-1, 2.5, 3]),
         "conv1.weights": torch.arange(12.0).reshape(1, 2, 2, 3),
@@ -88,18 +89,18 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_and_text_is_left_out(tmp_path:
     for name, tensor in expected.items():
         assert tensors[name].dtype == tensor.dtype
         assert torch.equal(tensors[name], tensor)
+    for length in range(len(whole)):
+        index.write_bytes(whole[:length])
+        refused(index)
 
 
 def test_variables_of_two_files_are_read(tmp_path: Path) -> None:
-    arrays = [np.full((n % 3, 2), n, np.float32) for n in range(40)]
-    contents, entries = [b"", b""], {}
-    for n, array in enumerate(arrays):
-        entries[f"layer{n}/w"] = entry(1, array.shape, len(contents[n % 2]), array.nbytes, n % 2)
-        contents[n % 2] += array.tobytes()
-    tensors = read_checkpoint(bundle(tmp_path, entries, *contents))
-    assert len(tensors) == 40
-    for n, array in enumerate(arrays):
-        assert np.array_equal(tensors[f"layer{n}.w"].numpy(), array)
+    first, second = np.arange(6, dtype=np.float32), np.full((2, 1), 7, np.float32)
+    entries = {"b/w": entry(1, (3,), 12, 12), "a/w": entry(1, (2, 1), 0, 8, 1)}
+    entries["empty"] = entry(1, (0, 2), 0, 0, 1)
+    index = bundle(tmp_path, entries, first.tobytes(), second.tobytes())
+    values = {name: tensor.tolist() for name, tensor in read_checkpoint(index).items()}
+    assert values == {"a.w": [[7], [7]], "b.w": [3, 4, 5], "empty": []}
 
 
 @pytest.mark.parametrize(
@@ -132,11 +133,3 @@ def test_names_that_grow_from_one_another_and_blocks_named_again_take_no_memory(
         index.write_bytes(content)
         with little():
             assert message in refused(index)
-
-
-def test_an_index_cut_anywhere_is_refused(tmp_path: Path) -> None:
-    index = written(tmp_path)
-    whole = index.read_bytes()
-    for length in range(len(whole)):
-        index.write_bytes(whole[:length])
-        refused(index)
