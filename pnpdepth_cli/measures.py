@@ -244,8 +244,8 @@ def _boundary_counts(
         rows = slice(1 + margin + down, 1 + height - margin + down)
         return rows, slice(1 + margin + right, 1 + width - margin + right)
 
-    counts, pairs = np.zeros((3, len(offsets), len(_RATIOS))), 0
-    for number, offset in enumerate(offsets):
+    counts, pairs, ratios = [], 0, np.array(_RATIOS)[:, None]
+    for offset in offsets:
         # the pixels and their neighbours, and by which factor these are farther
         here, there = moved(0, 0), moved(*offset)
         known = (truth[here] > 0) & (truth[there] > 0)
@@ -254,11 +254,9 @@ def _boundary_counts(
         for image in (predicted, truth):
             own, other = (image[part][known].astype(np.float64) for part in (here, there))
             factors.append(np.divide(other, own, out=np.zeros_like(own), where=own > 0))
-        for place, ratio in enumerate(_RATIOS):
-            is_own, is_true = (factor > ratio for factor in factors)
-            found = (is_own & is_true, is_own, is_true)
-            counts[:, number, place] = [np.count_nonzero(each) for each in found]
-    return counts if pairs else counts * math.nan
+        is_own, is_true = (factor > ratios for factor in factors)
+        counts.append([each.sum(axis=1) for each in (is_own & is_true, is_own, is_true)])
+    return np.array(counts, np.float64).swapaxes(0, 1) * (1.0 if pairs else math.nan)
 
 
 def _weigh(hits: Floats, of: Floats, weights: Sequence[float]) -> float:
