@@ -18,7 +18,7 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.statistics import Clusters, find_clusters
 from pnpdepth_cli.commands.tables import Style, Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import groups_of
-from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
@@ -27,6 +27,8 @@ from pnpdepth_cli.stages import AFTER, BEFORE, GT
 
 Means = dict[str, float | None]
 """Means by the key of their measure; None where no frame has it."""
+Rows = list[list[int | float | None]]
+"""The values of a frame a row."""
 ALPHA = 0.05
 _SUMMARY = "summary.json"
 _PAPER = EvalRequest(prediction=Path(), ground_truth=Path())  # as batches score
@@ -52,9 +54,10 @@ class Run:
     varied: dict[str, str]
     """Options that `batch --vary` varied, with their values; empty for other runs."""
 
-    def scores(self, names: Sequence[str], stage: str = AFTER) -> list[Scores]:
-        """Returns the scores of these frames; empty where a frame lacks the stage."""
-        return [self.frames[name].errors[GT].get(stage, {}) for name in names]
+    def rows(self, names: Sequence[str], keys: Sequence[str], stage: str = AFTER) -> Rows:
+        """Returns the values of a stage with these keys for each frame; None for what it lacks."""
+        scores = (self.frames[name].errors[GT].get(stage, {}) for name in names)
+        return [[*map(own.get, keys)] for own in scores]
 
 
 @dataclass(frozen=True)
@@ -126,17 +129,13 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
     # the values that all runs have; None becomes NaN
-    scores = [run.scores(names) for run in runs]
-    values = np.array([[[*map(own.get, keys)] for own in of_run] for of_run in scores], np.float64)
+    values = np.array([run.rows(names, keys) for run in runs], np.float64)
     known = np.asarray(np.isfinite(values).all(axis=0))
     values[:, ~known] = math.nan  # (runs, frames, measures)
     # the tests, over frames that count as independent
     groups = groups_of(names, [runs[0].frames[name].group for name in names])
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
-    means = [
-        frame_means(dict(zip(keys, row, strict=True)) for row in of_run)
-        for of_run in values.tolist()
-    ]
+    means = [_means(of_run.tolist(), keys) for of_run in values]
     gains = [{}, *_gains(values, means, measures, clusters)]
     is_unique = len({run.name for run in runs}) == len(runs)
     compared = [
@@ -144,9 +143,9 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
             name=run.name if is_unique else run.path,
             path=run.path,
             mean=mean,
-            before=_means(run.scores(names, BEFORE), keys),
+            before=_means(run.rows(names, keys, BEFORE), keys),
             varied=run.varied,
-            coverage=_means(run.scores(names), [COVERAGE.key])[COVERAGE.key],
+            coverage=_means(run.rows(names, [COVERAGE.key]), [COVERAGE.key])[COVERAGE.key],
             gains=of_first,
         )
         for run, mean, of_first in zip(runs, means, gains, strict=True)
@@ -161,8 +160,8 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     )
 
 
-def _means(scores: Sequence[Scores], keys: Sequence[str]) -> Means:
-    return frame_means({key: own.get(key) for key in keys} for own in scores)
+def _means(rows: Rows, keys: Sequence[str]) -> Means:
+    return frame_means(dict(zip(keys, row, strict=True)) for row in rows)
 
 
 def _shared(
@@ -225,8 +224,8 @@ def _notes(
                 f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
                 f" left out: {some_names(unshared)}"
             )
-    of_runs = zip(*(run.scores(names) for run in runs), strict=True)
-    if others := sum(len({own.get("pixels") for own in each}) > 1 for each in of_runs):
+    pixels = zip(*(run.rows(names, ["pixels"]) for run in runs), strict=True)
+    if others := sum(any(own != each[0] for own in each) for each in pixels):
         shares = ", ".join(COVERAGE.text(run.coverage) for run in compared)
         yield (
             f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
