@@ -261,8 +261,7 @@ def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
             + (f" ({count:,} of {len(rows):,})" if count < len(rows) else "")
             for reading, count in _readings(rows, side)
         ]
-        if texts:
-            yield f"{side}: {some_names(texts)}"
+        yield f"{side}: {some_names(texts)}"
     # Frames that are in no mean, and what was made of ground truth that is none.
     failed = [
         f"warning: frame {one_line(row.name)} was not scored: {row.message}"
@@ -305,10 +304,7 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
             " errors against the ground truth show nothing; --scale-by median scales each image"
         )
     ratios = _numbers(scored, "median_ratio") or [math.nan]
-    by_option = {
-        option: next((reading for reading, _ in _readings(scored, side)), None)
-        for side, option in _OPTIONS.items()
-    }
+    by_option = {option: _readings(scored, side)[0][0] for side, option in _OPTIONS.items()}
     if warning := scale_warning("predictions", float(np.median(ratios)), by_option):
         yield warning
 
