@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 import sys
 import time
@@ -12,11 +13,16 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.settings import Settings, flag_of, options_of
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
     from pnpdepth_cli.dataset.frame_record import FrameRecord
 
+_SETTING = re.compile(r"`(\w+)`")
+_FLAGS = {e.name: flag_of(e) for e in (*options_of(Settings), *options_of(RefineRequest))}
 _LINE_EVERY_S = 60.0
 _SHOWN_AFTER_S = 1.0
 INTERRUPTED = 128 + signal.SIGINT
@@ -24,9 +30,13 @@ INTERRUPTED = 128 + signal.SIGINT
 
 
 def printable(text: object) -> str:
-    """Returns the text with unprintable characters, such as line breaks, as escapes."""
+    """Returns the text with unprintable characters as escapes, and `name` of an option as --name.
+
+    Messages that the Python API shares have the names of settings in backticks.
+    """
+    text = _SETTING.sub(lambda found: _FLAGS.get(found[1], found[0]), str(text))
     return "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
     )
 
 

@@ -90,7 +90,7 @@ def refine(
                     raise ModelError(
                         f"the network's prediction is not finite at any of {len(points):,} sparse"
                         " points, before any update of z; are its weights, its input range"
-                        " (normalise) and precision right?"
+                        " (`normalise`) and precision right?"
                     )
                 points, at_points = points.select(known), at_points[known]
             loss = loss_of(at_points, points.depth)

@@ -40,11 +40,12 @@ def check_combination(asked: Settings, networks: int) -> None:
     Raises:
         UsageError: They do.
     """
-    fixed = asked.fixed_by.replace("--", "")
+    words = [word.removeprefix("--") for word in asked.fixed_by.split() if word != asked.method]
+    fixed = ", ".join(f"`{word}`" for word in words)
     if fixed and networks > 1:
         raise UsageError(f"several networks are fused, but {fixed} fixes one")
     if fixed and asked.method == "alone":
-        raise UsageError(f"with {fixed}, the network is refined alone: leave out method alone")
+        raise UsageError(f"with {fixed} the network is refined alone: leave out `method` alone")
 
 
 class Method:

@@ -163,9 +163,9 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
-    unsure, hint = "", "normalise changes it"
+    unsure, hint = "", "`normalise` changes it"
     if rival is not None:
-        hint = f"normalise {chosen} confirms it, {rival} is the next likely"
+        hint = f"`normalise` {chosen} confirms it, {rival} is the next likely"
         unsure = ", unsure"
     note = f"input: rgb range {chosen!r}{unsure} (error after alignment: {listed}); {hint}"
     return candidates[chosen], note

@@ -253,7 +253,7 @@ class AlignedDepth:
             f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
             f" {lost:,} of {len(seen):,} sparse points there out of the loss"
         )
-        doubt = "; are the network's weights and input range (normalise) right?"
+        doubt = "; are the network's weights and input range (`normalise`) right?"
         return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
@@ -282,7 +282,7 @@ class AlignedDepth:
             notes.append(
                 f"warning: network {self._network.definition.name!r} says nothing about this scene:"
                 f" aligned, it is off by {fit.misfit:.1%} at the points, their median depth by"
-                f" {of_median:.1%}; check the network, its input range (normalise) and the image"
+                f" {of_median:.1%}; check the network, its input range (`normalise`) and the image"
             )
         return tuple(notes)
 
@@ -330,7 +330,7 @@ def load_network(
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []
     if definition.complete and checkpoint is not None:
-        raise UsageError(f"{name} comes with its weights; leave out the checkpoint")
+        raise UsageError(f"{name} comes with its weights; leave out `checkpoint`")
     if not definition.complete:
         notes += _load_weights(module, definition, path)
     module.eval().requires_grad_(False)
@@ -352,15 +352,15 @@ def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | N
     """Loads the weights; returns notes. Never random weights."""
     if path is None and module.state_dict():
         raise ModelError(
-            f"network {definition.name!r} comes without weights; name a checkpoint, or, where its"
-            " build loads them itself, say complete=True in a definition"
+            f"network {definition.name!r} comes without weights; name them by `checkpoint`, or,"
+            " where its build loads them itself, say complete=True in a definition"
         )
     if path is None:
         return []
     if path.parent.parent.name == "model_zoo_defs" and not path.is_file():
         raise ModelError(
             f"checkpoint {path} does not exist, as the package has the weights of few networks;"
-            f" take {path.name} from the repository, and name it as the checkpoint"
+            f" take {path.name} from the repository, and name it by `checkpoint`"
         )
     return load_checkpoint(module, definition, path)
 

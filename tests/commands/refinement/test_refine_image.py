@@ -148,7 +148,7 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
     second = frame.folder / "second.py"
     text = frame.model.read_text().replace('name="tiny"', 'name="second", complete=True')
     second.write_text(text)
-    with pytest.raises(UsageError, match="several networks are fused"):
+    with pytest.raises(UsageError, match="several networks are fused, but `propagate` fixes"):
         run(frame, more_models=(str(second),), propagate="none")
     method = run(frame, more_models=(str(second),), propagate=None).method
     assert method is not None
