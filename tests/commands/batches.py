@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
-from tests.commands.frames import frame_on_disk, gradient, thinned
+from tests.commands.frames import frame_on_disk
 
 NAMES = ("a", "b", "c", "d")
 STEP_M = 0.1
@@ -53,8 +53,7 @@ class RecordingListener:
 def pairs_on_disk(root: Path, names: tuple[str, ...] = NAMES) -> Path:
     """rgb/ sparse/ gt/ with these frames, all a little different, and net/ with a network."""
     (root / "net").mkdir(parents=True)
-    frame_on_disk(root / "net")
-    image = gradient(46, 62)
+    image = cv2.imread(str(frame_on_disk(root / "net").image))
     for number, name in enumerate(names):
         add_frame(root, name, np.roll(image, number, axis=1))
     return root
@@ -66,8 +65,7 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
     Every frame is 0.1 m ahead of the one before; there are two walls and a floor.
     """
     (root / "net").mkdir(parents=True)
-    frame_on_disk(root / "net")
-    image = gradient(46, 62)
+    image = cv2.imread(str(frame_on_disk(root / "net").image))
     for part in ("rgb", "sparse", "calib"):
         (root / part).mkdir()
     y, x = np.mgrid[:46, :62]
@@ -78,7 +76,9 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
             floor = np.where(down > 0, 1.5 / down, np.inf)
             left = np.where(right < 0, -1 / right, np.inf)
         depth = np.minimum(np.minimum(floor, left), 5 - STEP_M * number)
-        sparse, name = thinned(depth, points, np.random.default_rng(number)), f"drive_{number:03}"
+        known = np.random.default_rng(number).permutation(depth.size)[:points]
+        sparse, name = np.zeros(depth.shape, np.float32), f"drive_{number:03}"
+        sparse.flat[known] = depth.flat[known]
         write_depth(root / f"sparse/{name}.png", sparse, scale=1000)
         cv2.imwrite(str(root / f"rgb/{name}.png"), np.roll(image, number, axis=1))
         (root / f"calib/{name}.txt").write_text("K: [60, 0, 30.5, 0, 60, 22.5, 0, 0, 1]")

@@ -45,21 +45,6 @@ t: [0.1, -0.05, -0.2]
 """
 
 
-def gradient(height: int, width: int) -> NDArray[np.uint8]:
-    """(H, W, 3) an image that changes from left to right and from top to bottom."""
-    y, x = np.mgrid[:height, :width]
-    return np.stack([255 * x / width, 255 * y / height, 128 + 0 * x], -1).astype(np.uint8)
-
-
-def thinned(
-    depth: NDArray[np.floating], count: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """The depth at so many pixels, 0 elsewhere."""
-    sparse, known = np.zeros(depth.size, np.float32), rng.permutation(depth.size)[:count]
-    sparse[known] = depth.ravel()[known]
-    return sparse.reshape(depth.shape)
-
-
 @dataclass(frozen=True)
 class FrameOnDisk:
     """Files of one frame, with the arrays that are in them."""
@@ -76,9 +61,12 @@ class FrameOnDisk:
 def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDisk:
     y, x = np.mgrid[:height, :width]
     depth = (1.5 + x / width + 0.5 * (y > height // 2)).astype(np.float32)
+    rgb = np.stack([255 * x / width, 255 * y / height, 128 + 0 * x], -1).astype(np.uint8)
     image, sparse, gt = folder / "img.png", folder / "s.png", folder / "gt.png"
-    cv2.imwrite(str(image), gradient(height, width))
-    write_depth(sparse, thinned(depth, 60, np.random.default_rng(0)), scale=1000)
+    cv2.imwrite(str(image), rgb)
+    points, thin = np.random.default_rng(0).permutation(depth.size)[:60], np.zeros_like(depth)
+    thin.flat[points] = depth.flat[points]
+    write_depth(sparse, thin, scale=1000)
     write_depth(gt, depth, scale=1000)
     model, checkpoint = folder / "my_net.py", folder / "my_net.safetensors"
     model.write_text(NETWORK)
@@ -92,10 +80,7 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
 
 
 def run(frame: FrameOnDisk, **changes: Any) -> FrameRecord:
-    """The record of `pnpdepth refine` of the frame, with these changes of the request.
-
-    The method is the network's own refinement; `propagate=None` gives the default method.
-    """
+    """The record of the frame, refined by its network alone; by the default method without it."""
     request: dict[str, Any] = {
         "image": frame.image,
         "sparse": frame.sparse,
@@ -122,9 +107,11 @@ class ScanOnDisk:
 
 def scan_on_disk(folder: Path) -> ScanOnDisk:
     rng = np.random.default_rng(0)
-    truth = (4 + 0.02 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    truth = (4 + 0.02 * x).astype(np.float32)
     image, scan, calib, gt = (folder / n for n in ("img.png", "img.bin", "calib.txt", "gt.png"))
-    cv2.imwrite(str(image), gradient(HEIGHT, WIDTH))
+    rgb = np.stack([255 * x / WIDTH, 255 * y / HEIGHT, 128 + 0 * x], -1).astype(np.uint8)
+    cv2.imwrite(str(image), rgb)
     write_depth(gt, truth, scale=1000)
     pixels = rng.permutation(HEIGHT * WIDTH)[:150]
     xy = np.column_stack([pixels % WIDTH, pixels // WIDTH]) + rng.uniform(-0.4, 0.4, (150, 2))
