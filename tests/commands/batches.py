@@ -68,8 +68,7 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
     image = cv2.imread(str(frame_on_disk(root / "net").image))
     for part in ("rgb", "sparse", "calib"):
         (root / part).mkdir()
-    y, x = np.mgrid[:46, :62]
-    right, down = (x - 30.5) / 60, (y - 22.5) / 60
+    down, right = (np.mgrid[:46, :62] - np.array([22.5, 30.5])[:, None, None]) / 60
     rows = []
     for number in range(frames):
         with np.errstate(divide="ignore"):
@@ -98,9 +97,9 @@ def add_frame(root: Path, name: str, image: Any = None) -> None:
 
 
 def refinement(root: Path, **changes: Any) -> RefineRequest:
-    """A request to refine with the network in net/, without the choice unless it is asked for."""
+    """A request to refine with the network in net/ alone, unless a method is asked for."""
     fields: dict[str, Any] = {
-        "propagate": None if {"method", "auto"} & changes.keys() else "none",
+        "propagate": None if "method" in changes else "none",
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }
@@ -115,12 +114,9 @@ def batch(
     **changes: Any,
 ) -> BatchSummary:
     """A batch of the folder into its out/."""
-    fields: dict[str, Any] = {
-        "source": root,
-        "output": root / "out",
-        "refine": refinement(root, **(refine or {})),
-    }
-    return run_batch(BatchRequest(**fields | changes), listener or RecordingListener())
+    fields: dict[str, Any] = {"source": root, "output": root / "out"}
+    request = BatchRequest(refine=refinement(root, **(refine or {})), **fields | changes)
+    return run_batch(request, listener or RecordingListener())
 
 
 def done(root: Path, listener: RecordingListener | None = None, **changes: Any) -> list[str]:
@@ -133,16 +129,15 @@ def done(root: Path, listener: RecordingListener | None = None, **changes: Any) 
 def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
     """Every result below a folder: bytes, and records without times, folders, what a batch adds."""
     contents: dict[str, bytes | dict[str, Any]] = {}
-    for path in sorted(folder.rglob("*")):
+    for path in filter(Path.is_file, folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.is_dir() or name.startswith(("summary.", "batch.", ".batch.")):
+        if name.startswith(("summary.", ".batch.")):
             continue
+        contents[name] = path.read_bytes()
         if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
             record = json.loads(path.read_text())
             for key in ("seconds", "peak_memory_mb", "batch"):
                 record.pop(key, None)
-            record["outputs"] = {k: Path(file).name for k, file in record["outputs"].items()}
-            contents[name] = record
-        else:
-            contents[name] = path.read_bytes()
+            outputs = {kind: Path(file).name for kind, file in record["outputs"].items()}
+            contents[name] = record | {"outputs": outputs}
     return contents

@@ -89,9 +89,7 @@ def test_colmap_reads_the_maps_and_fuses_them_into_the_surface(root: Path) -> No
     assert xyz[:, 2] == pytest.approx(4, abs=1e-3)
 
 
-def test_3dgs_gets_the_inverse_depth_of_the_model_and_no_pixel_is_infinitely_far(
-    root: Path,
-) -> None:
+def test_3dgs_gets_the_inverse_depth_of_the_model_at_every_pixel(root: Path) -> None:
     depth = DEPTH.copy()
     depth[:2] = 0  # unknown: taken from the nearest pixel
     folder = results(root, depth, unit_scale=0.25)
@@ -112,9 +110,7 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_and_no_pixel_is_infinitely_far
 
 
 @pytest.mark.parametrize("unit_scale", [None, 0.25])
-def test_transforms_put_every_pixel_where_the_model_has_it(
-    root: Path, unit_scale: float | None
-) -> None:
+def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: float | None) -> None:
     scene, far = root / "scene", DEPTH.copy()
     far[:2] = np.array([[65.534], [65.535]]) / (unit_scale or 1)  # of which 16 bits hold one
     what, notes = export_results(results(root, far, unit_scale), scene, to="nerfstudio")
@@ -203,9 +199,7 @@ def test_results_that_cannot_be_exported_are_one_line(
     assert sorted(path for path in root.parent.rglob("*") if path.is_file()) == before
 
 
-def test_results_need_depth_and_masks_of_their_size_and_nothing_is_replaced_unasked(
-    root: Path,
-) -> None:
+def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -> None:
     folder, dense = results(root), root / "dense"
     export_results(folder, dense, to="colmap")
     export_results(folder, dense, to="colmap", overwrite=True)

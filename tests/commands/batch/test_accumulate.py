@@ -36,9 +36,7 @@ def record_of(root: Path, name: str) -> Any:
     return json.loads((root / "out" / f"{name}.json").read_text())
 
 
-def test_a_frame_takes_the_points_of_its_neighbours_and_held_out_points_score_better(
-    tmp_path: Path,
-) -> None:
+def test_points_of_neighbours_lower_the_error_at_held_out_points(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path, points=150)
     refine = {"iterations": 0, "propagate": "gp", "holdout": 0.2}
     accumulating(root, refine=refine)
@@ -66,9 +64,7 @@ def test_points_of_neighbours_are_sampled_from_their_ground_truth(tmp_path: Path
     assert points["used"] == 50 + points["moved"]
 
 
-def test_shards_give_the_same_and_a_neighbours_new_points_or_poses_another_run(
-    tmp_path: Path,
-) -> None:
+def test_shards_give_the_same_and_a_changed_neighbour_another_run(tmp_path: Path) -> None:
     root = drive_on_disk(tmp_path)
     accumulating(root)
     whole = results(root / "out")
@@ -94,9 +90,7 @@ def linked(root: Path, rows: list[str], poses: str = "") -> list[FrameFiles]:
     return [*find_frames(request).frames]
 
 
-def test_neighbours_are_of_one_sequence_and_camera_and_motion_leads_to_the_frames_camera(
-    tmp_path: Path,
-) -> None:
+def test_neighbours_are_of_one_camera_and_move_to_that_of_the_frame(tmp_path: Path) -> None:
     kinds = [("a_1", 2), ("a_2", 2), ("b_1", 2), ("a_3", 3), ("a_4", 3)]
     rows = [f"{name},s.png,{camera},calib.txt" for name, camera in kinds]
     still, turned = "1 0 0 0 0 1 0 0 0 0 1 0\n", "0 -1 0 4 1 0 0 0 0 0 1 1\n"

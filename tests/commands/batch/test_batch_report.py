@@ -29,9 +29,7 @@ def report(tmp_path: Path) -> Path:
     return tmp_path / "report"
 
 
-def test_the_page_links_the_panels_that_a_frames_record_names_and_shows_their_errors(
-    root: Path, report: Path
-) -> None:
+def test_the_page_links_panels_of_the_records_and_shows_errors(root: Path, report: Path) -> None:
     batch(root, html=report)
     frame = frames_of(report)["c"]
     figures = json.loads((root / "out/c.json").read_text())["figures"]
@@ -58,9 +56,7 @@ def test_the_page_links_the_panels_that_a_frames_record_names_and_shows_their_er
     assert frame["values"]["mae_change"] == after / before - 1 != 0
 
 
-def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what_changed(
-    root: Path, report: Path
-) -> None:
+def test_a_report_has_what_all_runs_gave_and_draws_what_changed(root: Path, report: Path) -> None:
     answers = iter([False, True, True, True])
     batch(root, RecordingListener(lambda: next(answers)), html=report)
     assert list(frames_of(report)) == ["a"]
@@ -84,9 +80,7 @@ def test_a_report_has_what_runs_before_and_other_shards_gave_and_draws_only_what
     assert frames["b"]["values"]["rmse_change"] is not None
 
 
-def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_there_are_none(
-    root: Path, report: Path
-) -> None:
+def test_without_ground_truth_changes_are_at_held_out_points(root: Path, report: Path) -> None:
     shutil.rmtree(root / "gt")
     batch(root, html=report)
     data, frame = page_data(report), frames_of(report)["a"]
@@ -111,9 +105,7 @@ def test_without_ground_truth_changes_are_those_at_held_out_points_and_else_ther
     assert table["title"] == "means: errors at held-out points, 4 frames"
 
 
-def test_each_frame_has_its_weights_and_the_errors_that_it_shares_with_the_others(
-    root: Path, report: Path
-) -> None:
+def test_each_frame_has_its_weights_and_the_errors_all_share(root: Path, report: Path) -> None:
     (root / "gt/b.png").unlink()
     (root / "rgb/d.png").write_bytes(b"no image")
     batch(root, html=report, refine={"propagate": None})
@@ -128,9 +120,7 @@ def test_each_frame_has_its_weights_and_the_errors_that_it_shares_with_the_other
     assert f"{largest} {weights[largest]:.0%}" in " ".join(frames["a"]["notes"])
 
 
-def test_a_report_may_lie_in_the_results_but_holds_nothing_and_replaces_none_unasked(
-    root: Path, tmp_path: Path
-) -> None:
+def test_a_report_may_lie_in_results_and_replaces_none_unasked(root: Path, tmp_path: Path) -> None:
     for folder in (root / "rgb", root, root / "out", tmp_path):
         with pytest.raises(OutputError, match=re.escape(str(folder))):
             batch(root, html=folder, refine={"overwrite": True})

@@ -56,9 +56,7 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def test_a_second_run_does_nothing_and_a_batch_equals_as_many_single_refinements(
-    root: Path,
-) -> None:
+def test_a_second_run_does_nothing_and_a_batch_equals_single_refinements(root: Path) -> None:
     refine = {"holdout": 0.3, "seed": 5}
     batch(root, refine=refine)
     os.utime(root / "rgb/a.png", (1, 1))  # that a file was touched or moved does not matter
@@ -79,9 +77,7 @@ def test_a_second_run_does_nothing_and_a_batch_equals_as_many_single_refinements
     assert together == results(root / "out")
 
 
-def test_only_what_is_missing_or_changed_is_done_again_and_the_end_is_that_of_one_run(
-    root: Path,
-) -> None:
+def test_only_what_is_missing_or_changed_is_done_again_as_by_one_run(root: Path) -> None:
     (root / "gt/b.png").unlink()
     batch(root)
     for source, changed, why in (
@@ -203,9 +199,7 @@ def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: P
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
-def test_frames_are_chosen_by_name_then_by_step_then_by_number_and_measures_by_columns(
-    root: Path,
-) -> None:
+def test_frames_are_chosen_by_name_step_and_number_measures_by_columns(root: Path) -> None:
     assert done(root, names="[b-d]", every=2) == ["b", "d"]
     assert done(root, names="[a-c]", every=2, limit=1, columns=("delta1", "mae")) == ["a"]
     assert summary(root)["counts"]["pending"] == 1
@@ -229,9 +223,7 @@ def test_a_least_confidence_is_for_frames_with_a_mask_and_none_of_their_own(root
         find_frames(replace(request, source=root))
 
 
-def test_a_batch_can_be_stopped_between_frames_and_goes_on_without_what_was_left(
-    root: Path,
-) -> None:
+def test_a_stopped_batch_goes_on_without_what_a_kill_left(root: Path) -> None:
     stops = iter([False, False, True, True])
     assert batch(root, RecordingListener(lambda: next(stops))).counts["pending"] == 2
     (root / "out" / "deep").mkdir()

@@ -80,9 +80,7 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
 
 
 @pytest.mark.slow
-def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
-    cluster: Any, tmp_path: Path
-) -> None:
+def test_a_frame_that_kills_its_worker_is_named_others_done(cluster: Any, tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", NAMES[:6])
     add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
     model, start = root / "net" / "my_net.py", "    def forward(self, rgb):\n"
@@ -98,9 +96,7 @@ def test_a_frame_that_kills_its_worker_is_named_and_the_others_are_done(
 
 
 @pytest.mark.slow
-def test_a_mistake_of_all_frames_ends_a_batch_and_a_stopped_one_does_what_is_begun(
-    cluster: Any, root: Path
-) -> None:
+def test_a_mistake_of_all_frames_or_the_user_ends_a_batch(cluster: Any, root: Path) -> None:
     with pytest.raises(DeviceError, match="device cuda"):
         batch(root, ray=cluster.address, refine={"device": "cuda"})
     with pytest.raises(ModelError, match="nowhere"):
@@ -209,9 +205,7 @@ def test_a_disk_that_is_full_stops_it_and_with_room_it_goes_on(tmp_path: Path) -
     assert done(root) == list("abcd")
 
 
-def test_a_second_run_on_the_same_folder_is_refused_and_other_shards_are_not(
-    tmp_path: Path,
-) -> None:
+def test_a_second_run_on_a_folder_is_refused_other_shards_are_not(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", ("a", "b"))
     inner = RecordingListener()
 

@@ -52,9 +52,7 @@ def unpack(text: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(shape)
 
 
-def test_depths_and_directions_are_those_of_the_cloud_and_colours_the_images(
-    frame: FrameOnDisk,
-) -> None:
+def test_a_3d_view_has_the_depth_and_directions_of_the_cloud(frame: FrameOnDisk) -> None:
     calib = frame.folder / "k.txt"
     calib.write_text("K: [50, 0, 30, 0, 50, 20, 0, 0, 1]\ndistortion: [-0.2, 0.03, 0.001, 0.0]")
     run(frame, view_3d=True, scan=ScanOptions(calib=calib), format="npy", gt=frame.gt)

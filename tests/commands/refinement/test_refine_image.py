@@ -32,9 +32,7 @@ from tests.completion.unregistered import SIZE, UNREGISTERED
 from tests.completion.unregistered import frame as unregistered
 
 
-def test_refinement_lowers_the_error_and_the_scores_are_those_of_the_file(
-    frame: FrameOnDisk,
-) -> None:
+def test_refinement_lowers_the_error_that_its_files_have(frame: FrameOnDisk) -> None:
     asked = {"gt": frame.gt, "lr": "20%", "update": "adam", "format": "npy"}
     record = run(frame, **asked, iterations=40)
     for basis in ("used", "ground_truth"):
@@ -191,9 +189,7 @@ def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) ->
     return run(own, **files | {"output": folder / "out", "overwrite": True} | options)
 
 
-def test_an_unregistered_image_is_moved_but_not_if_off_nor_by_the_papers_method(
-    tmp_path: Path, frame: FrameOnDisk
-) -> None:
+def test_an_image_is_moved_unless_off_or_by_the_paper(tmp_path: Path, frame: FrameOnDisk) -> None:
     moved = refined(tmp_path, frame)
     assert moved.registration is not None
     assert moved.registration["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
@@ -204,9 +200,7 @@ def test_an_unregistered_image_is_moved_but_not_if_off_nor_by_the_papers_method(
     assert given == {"zoom": 0.9, "right": -5.0, "down": 3.0}
 
 
-def test_a_moved_image_gives_what_the_same_image_moved_on_disk_gives(
-    tmp_path: Path, frame: FrameOnDisk
-) -> None:
+def test_moving_gives_what_an_image_moved_on_disk_gives(tmp_path: Path, frame: FrameOnDisk) -> None:
     refined(tmp_path, frame, registration=(1.0, -4.0, 3.0), output=tmp_path / "a.npy")
     files = write_frame(tmp_path, 0, 500)
     image = cv2.imread(str(files["image"]))
@@ -226,9 +220,7 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     assert record.registration != whole
 
 
-def test_the_frames_of_a_batch_share_a_registration_that_none_shows_alone(
-    tmp_path: Path, frame: FrameOnDisk
-) -> None:
+def test_frames_share_a_registration_none_shows_alone(tmp_path: Path, frame: FrameOnDisk) -> None:
     assert refined(tmp_path / "alone", frame, count=80).registration is None
     for seed in range(8):
         write_frame(tmp_path / "in", seed, 80)
