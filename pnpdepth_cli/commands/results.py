@@ -88,16 +88,13 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 
 def _frame(name: str, depth: Path) -> ResultFrame:
-    endings = endings_of(depth.suffix)
-    path = _beside(depth, endings["record"])
+    def beside(kind: str) -> Path | None:
+        path = depth.with_name(depth.stem.removesuffix(_DEPTH) + endings_of(depth.suffix)[kind])
+        return path if path != depth and path.is_file() else None
+
+    path = beside("record")
     record = FrameRecord() if path is None else FrameRecord.read(path)
-    files = {kind: endings[kind] for kind in ("sigma", "valid")}
-    if path is not None:  # others are of other runs
-        files = {kind: ending for kind, ending in files.items() if kind in record.outputs}
-    companions = {kind: _beside(depth, ending) for kind, ending in files.items()}
+    # Files that the record does not name are of other runs.
+    kinds = [kind for kind in ("sigma", "valid") if path is None or kind in record.outputs]
+    companions = {kind: beside(kind) for kind in kinds}
     return ResultFrame(name=name, depth=depth, record=record, **companions)
-
-
-def _beside(depth: Path, ending: str) -> Path | None:
-    path = depth.with_name(depth.stem.removesuffix(_DEPTH) + ending)
-    return path if path != depth and path.is_file() else None
