@@ -129,6 +129,8 @@ def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
     held.sum().backward()
     assert below.grad is not None
     assert float(below.grad) == pytest.approx(1.0, rel=1e-4)
+    as_it_is = align(d, points_of(d), ("depth",), "none")
+    assert as_it_is.beyond(torch.tensor(as_it_is.bounds, dtype=torch.float64)) == 0
 
 
 @pytest.mark.parametrize(
@@ -136,6 +138,7 @@ def test_a_value_held_at_a_bound_still_has_a_gradient() -> None:
     [
         (torch.ones(20), "affine", ModelError),
         (torch.ones(1), "affine", NoPointsError),
+        (torch.ones(2), "affine", ModelError),
         (torch.full((20,), math.nan), "scale", ModelError),
         (torch.zeros(20), "scale", ModelError),
     ],

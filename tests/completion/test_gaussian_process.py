@@ -142,6 +142,7 @@ def test_the_fit_has_the_smallest_error_of_all_length_scales_and_then_of_all_noi
             assert getattr(fitted, name) == getattr(best, name)
         chosen.add(best.depth_length)
     assert len(chosen) >= 3
+    assert [fit(few) is few for few in (field(4), field(5))] == [True, False]
 
 
 def test_colours_are_those_of_the_formula_from_the_primaries_of_srgb() -> None:

@@ -52,7 +52,7 @@ def inliers_in_numpy(residuals: ResidualField) -> np.ndarray:
 
 def test_inliers_are_those_of_the_description() -> None:
     shares = []
-    for seed in range(12):
+    for seed in (*range(12), 62, 74):  # in the last two, each cut-off decides
         rng, residuals = np.random.default_rng(seed), field(90, size=(60, 80), seed=seed)
         xy = residuals.points.xy.numpy() + rng.uniform(-0.4, 0.4, (90, 2)).astype(np.float32)
         corridor = np.hypot(*(xy - rng.uniform(10, 50, 2)).T) < rng.uniform(5, 14)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from pnpdepth_cli.frames.frame import Frame
@@ -29,18 +30,16 @@ def seen_twice(frame: Frame, weight: float = 1.0) -> tuple[Expert, Expert]:
 
 def test_a_mirrored_frame_has_left_and_right_exchanged_and_mirrored_again_is_the_frame() -> None:
     frame = replace(frame_in_memory(), prior=depth_of_scene())
-    mirrored = frame.mirrored()
-    width = frame.size[1]
-    xy = frame.points.xy.numpy()
-    np.testing.assert_array_equal(mirrored.points.xy.numpy()[:, 0], width - 1 - xy[:, 0])
-    np.testing.assert_array_equal(mirrored.points.xy.numpy()[:, 1], xy[:, 1])
+    mirrored, width = frame.mirrored(), frame.size[1]
+    x, y = frame.points.xy.unbind(1)
+    assert torch.equal(mirrored.points.xy, torch.stack([width - 1 - x, y], 1))
     assert mirrored.rgb is not None
     assert mirrored.prior is not None
-    torch.testing.assert_close(mirrored.rgb[..., 0], frame.rgb[..., -1])  # type: ignore[index]
-    torch.testing.assert_close(mirrored.points.sample(mirrored.prior), frame.points.depth)
+    assert torch.equal(mirrored.rgb[..., 0], frame.rgb[..., -1])  # type: ignore[index]
+    assert torch.equal(mirrored.points.sample(mirrored.prior), frame.points.depth)
     twice = mirrored.mirrored()
-    torch.testing.assert_close(twice.points.xy, frame.points.xy)
-    torch.testing.assert_close(twice.rgb, frame.rgb)
+    assert torch.equal(twice.points.xy, frame.points.xy)
+    assert torch.equal(twice.rgb, frame.rgb)  # type: ignore[arg-type]
 
 
 def test_with_few_points_the_depth_is_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> (
@@ -57,10 +56,9 @@ def test_with_few_points_the_depth_is_the_geometric_mean_of_the_frame_and_the_mi
     np.testing.assert_allclose(twice.dense(split), np.sqrt(left * right), rtol=1e-4)
 
 
-def test_with_many_points_or_without_weight_an_expert_sees_the_frame_alone() -> None:
-    for frame, weight in (
-        (frame_in_memory(count=MIRRORED_BELOW), 1.0),
-        (frame_in_memory(count=20), 0.0),
-    ):
-        once, twice = seen_twice(frame, weight)
-        assert twice is once
+@pytest.mark.parametrize(("count", "weight"), [(MIRRORED_BELOW, 1.0), (20, 0.0)])
+def test_with_many_points_or_without_weight_an_expert_sees_the_frame_alone(
+    count: int, weight: float
+) -> None:
+    once, twice = seen_twice(frame_in_memory(count), weight)
+    assert twice is once

@@ -76,7 +76,8 @@ def test_the_deviation_is_the_calibrated_product_of_four_differences(count: int)
         random_points(30, seed=5), xy=torch.from_numpy(xy).float(), depth=torch.rand(30) + 1
     )
     predicted, weights = depth[xy[:, 1], xy[:, 0]].copy(), rng.uniform(0.06, 1, 30)
-    predicted[:3], weights[3:6] = 0, 0.04  # unknown or an outlier: these do not calibrate
+    # unknown or an outlier: these do not calibrate
+    predicted[:3], weights[3:6] = 0, (0.03, 0.04, 0.05)
     validation = Validation(
         points=truth, kept=kept, network=torch.from_numpy(network),
         weights=torch.from_numpy(weights), predicted={"after": torch.from_numpy(predicted)},
@@ -90,7 +91,9 @@ def test_the_deviation_is_the_calibrated_product_of_four_differences(count: int)
     shape = shape_in_numpy(whole, network, depth)
     shared = 0.0 if count == 5 else 0.01  # of a map's points, less than 10 pixels apart
     expected = np.hypot(factor_in_numpy(residual, sigma, count) * shape, shared) * depth
-    np.testing.assert_allclose(with_uncertainty(frame).sigma, expected, rtol=1e-4)
+    found = with_uncertainty(frame)
+    np.testing.assert_allclose(found.sigma, expected, rtol=1e-4)
+    assert "24 validation points" in found.notes[0]
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.3, 1e9])
