@@ -17,17 +17,18 @@ def field(network: nn.Module, layer: str, size: int = 32) -> tuple[Patch | None,
         return influential_field(split, z, lambda output: output)
 
 
-def test_two_3x3_convolutions_reach_5x5_of_z_and_9x9_of_the_output() -> None:
+@pytest.mark.parametrize(
+    ("stride", "patches"),
+    [
+        (1, ((5, 5), (9, 9))),
+        # 3×3 of the strided map read 7×7 of z; those move (7 + 2) / 2 + 1 = 5 cells, widened to 7
+        (2, ((7, 7), (7, 7))),
+    ],
+)
+def test_two_3x3_convolutions_reach_as_far_as_counted(stride: int, patches: object) -> None:
     torch.manual_seed(0)
-    network = nn.Sequential(conv(3, 4), conv(4, 4), conv(4, 1))
-    assert field(network, "0") == ((5, 5), (9, 9))
-
-
-def test_a_stride_behind_the_cut_widens_the_patch_of_z() -> None:
-    torch.manual_seed(0)
-    network = nn.Sequential(conv(3, 4), conv(4, 4, stride=2), conv(4, 1))
-    # 3×3 of the strided map read 7×7 of z; those move (7 + 2) / 2 + 1 = 5 cells, widened to 7
-    assert field(network, "0") == ((7, 7), (7, 7))
+    network = nn.Sequential(conv(3, 4), conv(4, 4, stride=stride), conv(4, 1))
+    assert field(network, "0") == patches
 
 
 def test_tokens_that_are_mixed_reach_everywhere_and_have_no_patch() -> None:
@@ -37,9 +38,8 @@ def test_tokens_that_are_mixed_reach_everywhere_and_have_no_patch() -> None:
 
 
 def test_a_cut_that_does_not_reach_the_output_has_no_field() -> None:
-    network = Net(
-        lambda net, x: (net.cut(x), net.head(x))[1], cut=conv(3, 4), head=nn.Sequential(conv(3, 1))
-    )
+    parts = {"cut": conv(3, 4), "head": conv(3, 1)}
+    network = Net(lambda net, x: (net.cut(x), net.head(x))[1], **parts)
     assert field(network, "cut") == ((0, 0), (0, 0))
 
 

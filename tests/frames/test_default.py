@@ -134,10 +134,8 @@ def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None
 
 def test_a_useless_network_has_no_part_which_is_said() -> None:
     frame = frame_in_memory(100)
-    useless, alone = (
-        refined(frame, member(Noise, settings=ALIGNED), compact()),
-        refined(frame, compact()),
-    )
+    useless = refined(frame, member(Noise, settings=ALIGNED), compact())
+    alone = refined(frame, compact())
     assert useless.weights["noise"] < 0.01
     assert np.allclose(useless.after, alone.after, rtol=1e-4)
     (note,) = [note for note in useless.notes if note.startswith("noise has no part")]
@@ -255,9 +253,7 @@ def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_err
     assert "80 validation points" in note
     assert "compact without the image" in wrong.weights
     assert wrong.validation is not None
-    assert (
-        "alone" not in wrong.validation.predicted
-    )  # nothing else than compact, which has an image
+    assert "alone" not in wrong.validation.predicted  # there is nothing but compact
     stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
     assert "compact without the image" not in stated.weights
     assert not any(note.startswith("warning: the image") for note in stated.notes)
@@ -278,9 +274,8 @@ def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> Non
 
 
 def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
-    mean = weighted_mean(
-        [(torch.tensor([4.0, 0.0, 0.0]), 0.25), (torch.tensor([1.0, 3.0, 0.0]), 0.75)]
-    )
+    one, other = torch.tensor([[4.0, 0.0, 0.0], [1.0, 3.0, 0.0]])
+    mean = weighted_mean([(one, 0.25), (other, 0.75)])
     assert torch.allclose(mean, torch.tensor([4.0**0.25, 3.0, 0.0]))
     alone = torch.tensor([2.0, 3.0, 7.0, 0.0])
     assert torch.equal(weighted_mean([(alone, 0.3), (alone + 1, 0.0)]), alone)
@@ -358,18 +353,13 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     assert before == state_of(network.module)
 
 
-def spoiled(frame: Frame) -> tuple[Frame, torch.Tensor]:
-    """The frame with every fifth point 2.5 times as far, and which these are."""
-    bad = torch.arange(len(frame.points)) % 5 == 0
-    depth = torch.where(bad, 2.5 * frame.points.depth, frame.points.depth)
-    return frame.with_points(replace(frame.points, depth=depth)), bad
-
-
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
-    frame, bad = spoiled(frame_in_memory(60))
+    frame, bad = frame_in_memory(60), torch.arange(60) % 5 == 0
+    depth = torch.where(bad, 2.5, 1.0) * frame.points.depth
     with member(Brightness) as judge:
+        clean, _ = without_outliers(judge, frame)
+        frame = frame.with_points(replace(frame.points, depth=depth))
         inliers, _ = without_outliers(judge, frame)
-        clean, _ = without_outliers(judge, frame_in_memory(60))
     assert inliers.outliers is not None
     assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])

@@ -165,10 +165,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
-def with_an_unused_layer() -> nn.Module:
-    return Net(lambda net, x: net.head(x), head=conv(3, 1), unused=conv(1, 1))
-
-
 @pytest.mark.parametrize(
     ("make", "layer"),
     [
@@ -178,7 +174,7 @@ def with_an_unused_layer() -> nn.Module:
         (UNet, "ups.3"),
         (UNet, "bottleneck["),
         (UNet, "encoder.stages"),
-        (with_an_unused_layer, "unused"),
+        (lambda: Net(lambda net, x: net.head(x), head=conv(3, 1), unused=conv(1, 1)), "unused"),
         (NETWORKS["repeated"], "same"),
         (NETWORKS["repeated"], "same#4"),
         (NETWORKS["nested output"], "cut[wide]"),
