@@ -19,8 +19,6 @@ _OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, er
 LOCKS = ".batch*.lock"
 """Pattern of the names of all lock files."""
 _WHOLE = ".batch.lock"
-_TRIED_S = 0.2
-"""Longest wait for a lock; another process that looks for shards holds it for a moment."""
 
 
 @contextmanager
@@ -150,8 +148,9 @@ def in_turn(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _hold(path: Path, timeout_s: float = _TRIED_S) -> Iterator[None]:
+def _hold(path: Path, timeout_s: float = 0.2) -> Iterator[None]:
     """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
+    # The default is longer than another process holds it that looks for shards.
     from filelock import FileLock, Timeout  # it imports asyncio
 
     if not path.parent.is_dir():  # filelock would make it

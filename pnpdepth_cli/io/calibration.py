@@ -32,9 +32,6 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, one_line, parse_yaml, read_json, read_text
 from pnpdepth_cli.io.poses import check_pose, numbers_in, pose_of_matrix
 
-CAMERA = 2
-"""KITTI's left colour camera, whose images the benchmarks have."""
-
 _360_FILES = ("perspective.txt", "calib_cam_to_velo.txt")
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
@@ -202,8 +199,8 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
 
 def _kitti(fields: _Fields, camera: int | None, kind: str, lidar: Extrinsics | None) -> Calibration:
     """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
-    # The number of the camera.
-    number, path = CAMERA if camera is None else camera, fields.path
+    # The number of the camera; the benchmarks have images of the left colour camera.
+    number, path = 2 if camera is None else camera, fields.path
     matches = (re.fullmatch(r"P(?:_rect_0)?(\d)", name) for name in fields.values)
     present = sorted(int(match[1]) for match in matches if match)
     if number not in present:

@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.file_bytes import (
-    check_pixel_count,
-    damaged,
-    numbered_lines,
-    read_bytes,
-    size_of_regular_file,
-)
+from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, numbered_lines, read_bytes
 from pnpdepth_cli.io.poses import rotation_of
 
 Integers = NDArray[np.int64]
@@ -114,7 +108,7 @@ def read_model(path: Path) -> ColmapModel:
         InputError: There is none, or it is damaged or cut short.
     """
     files = model_files(find_model(path))
-    states = tuple((file, size_of_regular_file(file), file.stat().st_mtime_ns) for file in files)
+    states = tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files)
     with _LOCK:
         return _read(states)
 

@@ -27,10 +27,8 @@ _SIGNED = {"gain": ((25, 90, 190), (220, 105, 0)), "change": ((1, 102, 94), (118
 colour-blind eyes."""
 
 LOGARITHMIC_FROM = 8.0
-"""Ratio of far to near from which the scale is logarithmic.
-
-On a linear scale, nearly all of a street would have the colour of its far end.
-"""
+"""Ratio of far to near from which the scale is logarithmic; on a linear one, nearly all of a street
+would have the colour of its far end."""
 
 # Pixels of a figure.
 FIGURE_WIDTH, MARGIN, GAP = 1600, 24, 20

@@ -5,6 +5,7 @@ Every size is checked against the bytes there are.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -48,9 +49,6 @@ _TO_BGR = {
 }
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1}
 _CHANNELS |= {name: 1 for name in _TO_BGR if name.startswith("bayer_")}
-
-_STATIC = "/tf_static"
-"""End of the name of the topic of fixed transforms."""
 
 
 def image_file(message: Message, topic: str) -> tuple[str, bytes]:
@@ -173,22 +171,17 @@ def nearest_pairs(
     """
     images = deque[tuple[float, Message]]()
     scans = deque[tuple[float, Message]](maxlen=_MOST_WAITING)
-    for is_image, time_s, message in stream:
+    for is_image, time_s, message in itertools.chain(stream, [(False, math.inf, None)]):
         (images if is_image else scans).append((time_s, message))
-        # an image is decided once a scan after it is known
+        # An image is decided once a scan after it is known.
         while images and ((scans and scans[-1][0] >= images[0][0]) or len(images) > _MOST_WAITING):
-            yield _pair(*images.popleft(), scans, tolerance_s)
-    for image in images:
-        yield _pair(*image, scans, tolerance_s)
-
-
-def _pair(
-    time_s: float, image: Message, scans: deque[tuple[float, Message]], tolerance_s: float
-) -> tuple[float, Message, Message | None]:
-    while len(scans) > 1 and scans[1][0] <= time_s:
-        scans.popleft()
-    nearest = min(scans, key=lambda scan: abs(scan[0] - time_s), default=(math.inf, None))
-    return time_s, image, nearest[1] if abs(nearest[0] - time_s) <= tolerance_s else None
+            image_s, image = images.popleft()
+            while len(scans) > 1 and scans[1][0] <= image_s:
+                scans.popleft()
+            gaps_s = [abs(scan_s - image_s) for scan_s, _ in scans]
+            least_s = min(gaps_s, default=math.nan)
+            scan = scans[gaps_s.index(least_s)][1] if least_s <= tolerance_s else None
+            yield image_s, image, scan
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
@@ -233,7 +226,7 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
     """Returns the scanner's pose in the camera's coordinates, by /tf_static; None without one."""
     # The transforms, each in both directions.
     links = list[tuple[str, str, Extrinsics]]()
-    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith(_STATIC)]
+    topics = [name for name in bag.topics(TRANSFORMS) if name.endswith("/tf_static")]
     for _, _, message in bag.messages(topics):
         for each in message.transforms:
             parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
