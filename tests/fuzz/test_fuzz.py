@@ -71,16 +71,6 @@ def write_files() -> dict[str, str]:
     pixels = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     cv2.imwrite("rgb.png", pixels)
     cv2.imwrite("wide.png", np.zeros((480, 640, 3), np.uint8))  # of the calibrations
-    return {
-        **_pixels(depth, pixels),
-        **_scans(rng),
-        **_cameras(),
-        **_networks(rng),
-        **_data_sets(depth),
-    }
-
-
-def _pixels(depth: np.ndarray, pixels: np.ndarray) -> dict[str, str]:
     commands = {}
     for suffix in ("png", "exr", "npy", "npz", "pfm", "tif"):
         write_depth(Path(f"depth.{suffix}"), depth)
@@ -89,7 +79,7 @@ def _pixels(depth: np.ndarray, pixels: np.ndarray) -> dict[str, str]:
         cv2.imwrite(f"image.{suffix}", pixels)
         features = f"sample depth.npy --count features:5 {OUT}"
         commands[f"image.{suffix}"] = f"{features} --image image.{suffix}"
-    return commands
+    return commands | _scans(rng) | _cameras() | _networks(rng) | _data_sets(depth)
 
 
 def _scans(rng: np.random.Generator) -> dict[str, str]:
@@ -107,12 +97,9 @@ def _scans(rng: np.random.Generator) -> dict[str, str]:
 
 
 def _cameras() -> dict[str, str]:
-    calibrations = {
-        "kitti.txt": KITTI,
-        "ros.yaml": ROS.format(model="equidistant", data=FOUR),
-        "kalibr.yaml": KALIBR,
-        "opencv.yml": opencv_file(FOUR),
-    }
+    ros = ROS.format(model="equidistant", data=FOUR)
+    calibrations = {"kitti.txt": KITTI, "ros.yaml": ros, "kalibr.yaml": KALIBR}
+    calibrations["opencv.yml"] = opencv_file(FOUR)
     texts = calibrations | {f"pose{n}.yaml": text for n, text in enumerate(POSES.values())}
     commands = {}
     for name, text in texts.items():
