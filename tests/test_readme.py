@@ -25,13 +25,13 @@ README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 YOUR_NETWORK = ROOT / "docs" / "guides" / "your-network.md"
 RECONSTRUCTION = ROOT / "docs" / "guides" / "reconstruction.md"
+BLOCK = re.compile(r'^```(\w+)(?: title="(.+?)")?\n(.*?)^```', re.DOTALL | re.MULTILINE)
 WRITES_FILES = ("refine", "project", "sample", "simulate", "cloud")
 
 
 def blocks(page: Path, language: str) -> list[str]:
     """The code blocks of a page in this language, with or without a title."""
-    pattern = rf"^```{language}(?: [^\n]*)?\n(.*?)^```"
-    return re.findall(pattern, page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return [text for each, _, text in BLOCK.findall(page.read_text("utf-8")) if each == language]
 
 
 def shown_commands(page: Path) -> list[list[str]]:
@@ -43,8 +43,7 @@ def shown_commands(page: Path) -> list[list[str]]:
 
 def titled_blocks(page: Path) -> dict[str, str]:
     """The files that a page shows, by their name."""
-    pattern = r'^```\w+ title="([^"]+)"\n(.*?)^```'
-    return dict(re.findall(pattern, page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE))
+    return {title: text for _, title, text in BLOCK.findall(page.read_text("utf-8")) if title}
 
 
 def named(page: Path) -> str:
