@@ -16,6 +16,7 @@ from pnpdepth_cli.commands.refinement.refine_image import refine_image
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
+from pnpdepth_cli.models.registry import find_definition
 
 NETWORK = """
 import torch
@@ -70,10 +71,8 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
     write_depth(gt, depth, scale=1000)
     model, checkpoint = folder / "my_net.py", folder / "my_net.safetensors"
     model.write_text(NETWORK)
-    space: dict[str, object] = {}
-    exec(NETWORK, space)
     torch.manual_seed(0)
-    state = space["Net"]().state_dict()  # type: ignore[operator]
+    state = find_definition(str(model)).build().state_dict()
     state["decode.weight"].abs_()  # so that z can move the depth of a whole neighbourhood
     save_file(state, checkpoint)
     return FrameOnDisk(folder, image, sparse, gt, model, checkpoint, depth)

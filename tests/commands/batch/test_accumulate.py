@@ -143,18 +143,13 @@ def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: P
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:
     root, other = drive_on_disk(tmp_path / "drive", frames=2), tmp_path / "other.txt"
-    plain = {"iterations": 0}
-
-    def farthest() -> float:
-        """The depth of the farthest point of the cloud along z."""
-        output = tmp_path / "cloud.ply"
-        write_depth_cloud(CloudRequest(depth=root / "out", output=output, overwrite=True))
-        return float(read_scan(output)[0][:, 2].max())
-
-    # Poses of the folder; then of a file, with which the frames that moved are done again.
-    batch(root, refine=plain)
-    near = farthest()
-    assert record_of(root, "drive_001")["camera"]["pose"][2][3] == STEP_M
     other.write_text((root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n"))
-    assert done(root, poses=other, refine=plain) == ["drive_001"]
-    assert farthest() > near + 50
+    # Poses of the folder; then of a file, with which the frames that moved are done again.
+    farthest, both = [], ["drive_000", "drive_001"]
+    for poses, redone, z in ((None, both, STEP_M), (other, both[1:], 100)):
+        assert done(root, poses=poses, refine={"iterations": 0}) == redone
+        assert record_of(root, "drive_001")["camera"]["pose"][2][3] == z
+        output = tmp_path / f"{z}.ply"
+        write_depth_cloud(CloudRequest(depth=root / "out", output=output))
+        farthest.append(read_scan(output)[0][:, 2].max())
+    assert farthest[1] > farthest[0] + 50
