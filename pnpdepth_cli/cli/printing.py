@@ -102,7 +102,7 @@ def print_refinement(record: FrameRecord) -> None:
     if record.method.kind != "default":
         settings = record.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
-        parts.insert(0, f"{settings['iterations']} updates ({how})")
+        parts.insert(0, f"{count_of(len(record.loss) - 1, 'update')} ({how})")
     say(" · ".join(parts))
     say(f"wrote {'  '.join(record.outputs.values())}")
 

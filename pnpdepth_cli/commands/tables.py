@@ -214,7 +214,8 @@ def stage_titles(record: FrameRecord) -> dict[str, str]:
         return {stage: title.format(**of) for stage, title in _ROWS.items()}
     name, settings = record.model.name, record.settings
     before = f"{name}, aligned with the points" if settings["align"] != "none" else name
-    steps = [f"{settings['iterations']} updates of z"] if settings["iterations"] else []
+    made = f"{count_of(len(record.loss) - 1, 'update')} of z"  # fewer than asked if it diverged
+    steps = [made] if settings["iterations"] else []
     steps += ["residual propagated"] if settings["propagate"] != "none" else []
     return {BEFORE: before, AFTER: ", ".join([name, *steps]), LINEAR: _LINEAR}
 

@@ -66,13 +66,13 @@ def test_errors_are_shown_where_they_are_measured_and_at_other_points_only_witho
         "used": at_points(2000, before=0.5, after=0.25),
     }
     settings = {"layer": "middle", "align": "none", "iterations": 5, "propagate": "none"}
-    record = record_of(settings=settings, errors=errors)
+    record = record_of(settings=settings, loss=[1.0] * 4, errors=errors)  # it diverged after 3
     truth, held_out = refinement_tables(record)
     pixels = "errors against ground truth, 1,200 pixels (50.0% of those known)"
     assert truth.title == f"net cut at middle: {pixels}"
     assert texts(truth) == [
         ["net", "2.0000 m", "50.00%", "–"],
-        ["net, 5 updates of z", "1.0000 m", "75.00%", "–"],
+        ["net, 3 updates of z", "1.0000 m", "75.00%", "–"],
     ]
     assert held_out.title.endswith("errors at held-out points, 1,000 points")
     for basis, count in (("validation", 12), ("used", 2000)):

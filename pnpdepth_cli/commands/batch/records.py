@@ -239,6 +239,7 @@ def write_summary(
         own = [record.weights[name] for record in results if name in record.weights]
         weights[name] = {"mean": sum(own) / len(own), "least": min(own), "largest": max(own)}
     means = {name: weight["mean"] for name, weight in weights.items()}
+    longest = max(results, key=lambda record: len(record.loss), default=None)  # none diverged early
     summary = BatchSummary(
         source=str(request.source),
         output=str(request.output),
@@ -250,7 +251,7 @@ def write_summary(
         columns=request.columns,
         notes=_notes([record for record in results if GT in record.errors]),
         errors=_means(results),
-        titles=stage_titles(replace(results[0], weights=means)) if results else {},
+        titles=stage_titles(replace(longest, weights=means)) if longest else {},
         weights=weights,
         frame_notes=_frame_notes(results),
         unmatched=[*found.unmatched],

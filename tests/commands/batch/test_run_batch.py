@@ -238,7 +238,9 @@ def test_a_stopped_batch_goes_on_without_what_a_kill_left(root: Path) -> None:
 def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root: Path) -> None:
     formula = "2 + 3 * self.decode(torch.tanh(self.middle(self.encode(rgb))))"
     edit(root / "net/my_net.py", formula, "torch.exp(self.decode(self.middle(self.encode(rgb))))")
-    assert batch(root, refine={"lr": "1e4"}).counts["diverged"] == 4
+    summary = batch(root, refine={"lr": "1e4"})
+    assert summary.counts["diverged"] == 4
+    assert "0 updates" in summary.titles["after"]  # of the updates asked for, none is in the depth
     assert done(root, refine={"lr": "1e4"}) == []
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
 
