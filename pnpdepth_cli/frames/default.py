@@ -8,6 +8,7 @@ predict the validation points best, close to prior weights, fuse the depths from
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> tuple[Frame, Predictio
     suspected = outliers(torch.ones(points.size), points, frame.rgb)
     # A network that weighs its points is given the outliers too, once they are known.
     again = bool(suspected.any()) and judge.weighs_points
-    consistent = frame.with_points(points.select(~suspected)) if bool(suspected.any()) else frame
+    consistent = replace(frame, points=points.select(~suspected))
     judged = predict(judge, consistent, updates=not again)
     outlying = outliers(judged.before, points, frame.rgb)
     if len(points) >= FEW_POINTS:

@@ -101,10 +101,6 @@ class Frame:
             return replace(self, register=None)
         return replace(self, rgb=tensor_of(how.apply_to(image)), register=None, registration=how)
 
-    def with_points(self, points: SparsePoints) -> Frame:
-        """Returns the same image with other sparse depth."""
-        return replace(self, points=points)
-
     def mirrored(self) -> Frame:
         """Returns the frame with left and right of image, points and prior exchanged."""
         outliers, prior = self.outliers, self.prior

@@ -125,7 +125,7 @@ def split_frame(frame: Frame, judged: Tensor, seed: int) -> ValidatedFrame:
     residual = validation.depth.double().log() - at.clamp_min(1e-6).double().log()
     weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
     weights = weights if bool(weights.any()) else torch.ones_like(weights)
-    kept = frame.with_points(points.select(~chosen))
+    kept = replace(frame, points=points.select(~chosen))
     return ValidatedFrame(whole=frame, kept=kept, points=validation, weights=weights)
 
 

@@ -233,7 +233,9 @@ def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None
     numbers = held.nonzero(as_tuple=True)[0]
     changed = frame.points.depth.clone()
     changed[numbers[0]] *= 1.01
-    again = refined(frame.with_points(replace(frame.points, depth=changed)), *members).validation
+    again = refined(
+        replace(frame, points=replace(frame.points, depth=changed)), *members
+    ).validation
     assert again is not None
     assert torch.equal(again.points.xy, first.points.xy)
     one = (again.points.xy == frame.points.xy[numbers[0]]).all(dim=1)
@@ -289,7 +291,7 @@ def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: boo
     track = (frame.points.xy - 60).norm(dim=1) < 20  # points that agree with each other
     wrong = replace(frame.points, depth=torch.where(track, 1.5, 1.0) * frame.points.depth)
     blind = member(Brightness, weighs_points=weighs)  # sees the image alone
-    result = refined(frame.with_points(wrong), blind)
+    result = refined(replace(frame, points=wrong), blind)
     assert int(track.sum()) > 5
     assert torch.equal(result.used.xy, wrong.select(~(track & weighs)).xy)
     assert any("outliers: " in note for note in result.notes) == weighs
@@ -318,7 +320,7 @@ def test_few_points_at_few_positions_are_enough(count: int, positions: int) -> N
     at = torch.arange(count) % positions
     close = frame.points.xy[at] + 0.01 * torch.arange(count)[:, None]
     points = replace(frame.points, xy=close, depth=frame.points.depth[at])
-    result = refined(frame.with_points(points), member(Brightness))
+    result = refined(replace(frame, points=points), member(Brightness))
     assert (result.validation is None) == (count < MIN_POINTS)
     off = (torch.from_numpy(result.after) / depth_of_scene()).log().abs()
     assert float(off.mean()) < 0.5
@@ -338,7 +340,7 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
     first = next(network.module.encoder.children())
     handle = first.register_forward_hook(lambda *_: runs.append(1))
     frame, settings = frame_in_memory(60), ClosedSettings(iterations=1, lr="5%")
-    fewer = frame.with_points(frame.points.select(torch.arange(60) < 55))
+    fewer = replace(frame, points=frame.points.select(torch.arange(60) < 55))
     with OpenNetwork(network, "decoder.s8", settings, coarse=True) as one:
         one.refine(frame)
         count = len(runs)
@@ -358,7 +360,7 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     depth = torch.where(bad, 2.5, 1.0) * frame.points.depth
     with member(Brightness) as judge:
         clean, _ = without_outliers(judge, frame)
-        frame = frame.with_points(replace(frame.points, depth=depth))
+        frame = replace(frame, points=replace(frame.points, depth=depth))
         inliers, _ = without_outliers(judge, frame)
     assert inliers.outliers is not None
     assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])

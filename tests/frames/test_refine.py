@@ -36,7 +36,7 @@ def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
     frame, xy = frame_in_memory(), torch.tensor([[1.0, 20.0]])  # left of the square crop
     outside = SparsePoints(xy=xy, depth=torch.ones(1), size=frame.size)
     with pytest.raises(NoPointsError):
-        refined(Brightness, frame.with_points(outside), size=Fixed(32, 32, fit="crop"))
+        refined(Brightness, replace(frame, points=outside), size=Fixed(32, 32, fit="crop"))
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_an_infinite_sky_is_unknown_and_its_points_have_no_part(
     frame, settings = frame_in_memory(), replace(SETTINGS, align=align)
     below = frame.points.select(frame.points.xy[:, 1] >= 15)
     lost = len(frame.points) - len(below)
-    right = refined(Brightness, frame.with_points(below), settings)
+    right = refined(Brightness, replace(frame, points=below), settings)
     result = refined(Sky, frame, settings)
     assert not result.after[:15].any()
     np.testing.assert_allclose(result.after[15:], right.after[15:], rtol=1e-5)
@@ -80,7 +80,7 @@ def test_a_validated_frame_is_refined_again_without_its_validation_points() -> N
         checked = refine_fixed(network, frame, validated=True).validation
         assert checked is not None
         assert (len(checked.points), len(checked.kept)) == (12, 48)
-        again = refine_fixed(network, frame.with_points(checked.kept))
+        again = refine_fixed(network, replace(frame, points=checked.kept))
         assert refine_fixed(network, frame_in_memory(4), validated=True).validation is None
     assert again.validation is None
     for stage, depth in (("before", again.before), ("after", again.after)):
