@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -21,7 +21,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.errors import InputError, ModelError
 from pnpdepth_cli.models.definition import (
     UNTUNED_DEFAULTS,
     Fixed,
@@ -119,7 +119,8 @@ def hf_definition(folder: Path) -> ModelDefinition:
     if not isinstance(kind, str) or kind not in _FAMILIES:
         known = ", ".join(_FAMILIES)
         raise ModelError(f"{folder}: network type {str(kind)[:60]!r} is not one of {known}")
-    _check_settings(config, folder / "config.json")
+    with wrap_content_errors(str(folder / "config.json")):
+        _check_settings(config)
     # What its numbers are, and how images are prepared.
     output_kind, output_scale, of = _FAMILIES[kind]
     if config.get("depth_estimation_type") == "metric":
@@ -150,23 +151,17 @@ def hf_definition(folder: Path) -> ModelDefinition:
     )
 
 
-def _check_settings(config: Mapping[str, object], file: Path) -> None:
-    """ModelError for a huge number, or an attention that transformers may fetch and run."""
-    pending: list[object] = [config]
-    while pending:
-        value = pending.pop()
-        if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
-            raise ModelError(f"{file}: {str(value)[:20]} is larger than any part of a network")
-        for key, setting in value.items() if isinstance(value, Mapping) else ():
-            names = setting.values() if isinstance(setting, Mapping) else (setting,)
-            for name in names if "attn_implementation" in key else ():
-                if isinstance(name, str) and name not in _PLAIN_ATTENTION:
-                    raise ModelError(
-                        f"{file}: {key} {name[:60]!r} may fetch and run code; only"
-                        f" {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
-                    )
-            pending.append(setting)
-        pending += value if isinstance(value, list) else []
+def _check_settings(value: object, *, attention: bool = False) -> None:
+    """InputError for a huge number, or an attention that transformers may fetch and run."""
+    if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
+        raise InputError(f"{str(value)[:20]} is larger than any part of a network")
+    if attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:
+        way_out = f"only {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
+        raise InputError(f"attn_implementation {value[:60]!r} may fetch and run code; {way_out}")
+    for key, setting in value.items() if isinstance(value, dict) else ():
+        _check_settings(setting, attention=attention or "attn_implementation" in key)
+    for setting in value if isinstance(value, list) else ():
+        _check_settings(setting, attention=attention)
 
 
 def _read(file: Path, kind: type[_Kind]) -> _Kind:

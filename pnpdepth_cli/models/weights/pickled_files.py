@@ -156,13 +156,9 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
 
 
 def _load_storage(
-    storages: dict[str, Tensor],
-    read: Callable[[str, int], bytearray],
-    kind: str,
-    key: str,
-    count: int,
-    more: Sequence[object],
-) -> Tensor:
+    storages: dict[str, Tensor], read: Callable[[str, int], bytearray],
+    kind: str, key: str, count: int, more: Sequence[object],
+) -> Tensor:  # fmt: skip
     """The storage, made once of what `read` returns for its key and bytes; or a view of it."""
     if kind not in _DTYPES:
         raise InputError(f"a storage of type {kind[:40]}")
