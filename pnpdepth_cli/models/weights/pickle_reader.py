@@ -50,7 +50,6 @@ _OPCODES = (
 LoadStorage = Callable[[str, str, int, Sequence[object]], Tensor]
 """Function that returns a flat tensor from its type, key and elements, and what follows these."""
 
-
 CONTENT_ERRORS: tuple[type[Exception], ...] = (
     *(InputError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
     *(struct.error, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
