@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import UsageError
@@ -87,10 +87,6 @@ class FileRecord:
     """(3, 4) from the camera's coordinates at the neighbour to those at the frame."""
     contradicts_images: bool = False
     """Whether the images show another motion."""
-
-    def to_json(self) -> dict[str, object]:
-        """Returns what applies, by name."""
-        return asdict(self, dict_factory=what_applies)
 
 
 @dataclass(frozen=True, kw_only=True)

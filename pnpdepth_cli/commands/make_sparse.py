@@ -16,7 +16,7 @@ from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import OutputError
-from pnpdepth_cli.file_record import FileRecord, SamplePattern
+from pnpdepth_cli.file_record import FileRecord, SamplePattern, what_applies
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
@@ -64,7 +64,7 @@ def _write(
     content = {
         "version": __version__,
         **settings,
-        "inputs": {name: part.to_json() for name, part in inputs.items()},
+        "inputs": {k: asdict(part, dict_factory=what_applies) for k, part in inputs.items()},
         "points": {
             "count": len(points),
             "fraction_of_pixels": len(points) / image.size,
