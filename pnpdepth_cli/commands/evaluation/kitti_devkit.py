@@ -94,14 +94,12 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
 
 def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns (M,) the mean of (N, M) values of N frames, summed in order in single precision."""
-    return np.asarray(
-        np.cumsum(values, axis=0, dtype=np.float32)[-1] / np.float32(len(values)), float
-    )
+    return np.asarray(_sum(values) / np.float32(len(values)), float)
 
 
-def _sum(values: Floats) -> np.float32:
+def _sum(values: NDArray[np.floating]) -> Floats:
     # cumsum adds one after the other; sum would add in pairs
-    return np.float32(np.cumsum(values, dtype=np.float32)[-1])
+    return np.asarray(np.cumsum(values, axis=0, dtype=np.float32)[-1])
 
 
 def _log(values: Floats) -> Floats:
