@@ -18,8 +18,8 @@ import click
 from click.core import ParameterSource
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.terminal import INTERRUPTED, BatchProgress, print_json, progress_bar, say
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.cli.terminal import INTERRUPTED, print_json, progress_bar, say, say_above_bar
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
@@ -216,14 +216,14 @@ def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSumma
     from pnpdepth_cli.commands.tables import count_of
 
     with progress_bar("batch", "frame") as show:
-        progress = BatchProgress(show, pressed)
-        summary = run_batch(request, progress)
+        listener = Listener(say_above_bar, show, pressed)
+        summary = run_batch(request, listener)
     print_batch(summary)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
-    stopped = progress.done < progress.to_do
+    stopped = listener.done < listener.to_do
     if stopped:
-        count = f"{progress.done:,} of {count_of(progress.to_do, 'frame')}"
+        count = f"{listener.done:,} of {count_of(listener.to_do, 'frame')}"
         say(f"stopped after {count}; run the same command to continue")
     return summary, stopped
 

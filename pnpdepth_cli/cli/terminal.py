@@ -19,8 +19,6 @@ from pnpdepth_cli.settings import Settings, flag_of, options_of
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from pnpdepth_cli.dataset.frame_record import FrameRecord
-
 _SETTING = re.compile(r"`(\w+)`")
 _FLAGS = {e.name: flag_of(e) for e in (*options_of(Settings), *options_of(RefineRequest))}
 _LINE_EVERY_S = 60.0
@@ -84,27 +82,8 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
             bar.close()
 
 
-class BatchProgress:
-    """Progress of a run over frames on stderr; its counts are numbers of frames."""
+def say_above_bar(text: str) -> None:
+    """Prints a line on stderr, above a progress bar."""
+    from tqdm import tqdm
 
-    def __init__(self, show: Callable[[int, int], None], stopped: Callable[[], bool]) -> None:
-        self.done = self.to_do = 0
-        self.stopped, self._show = stopped, show
-
-    def say(self, text: str) -> None:
-        """Prints a line on stderr, above the bar."""
-        from tqdm import tqdm
-
-        tqdm.write(printable(text), file=sys.stderr)
-
-    def begin(self, to_do: int) -> None:
-        """Starts counting; `to_do` frames follow."""
-        self.to_do = to_do
-        self._show(0, to_do)
-
-    def frame(self, record: FrameRecord) -> None:
-        """Counts a frame, and prints why it failed if it did."""
-        if record.status != "done":
-            self.say(f"{record.status}: {record.name}: {record.message}")
-        self.done += 1
-        self._show(self.done, self.to_do)
+    tqdm.write(printable(text), file=sys.stderr)

@@ -15,7 +15,8 @@ import pytest
 
 from pnpdepth_cli.cli import refine_commands as command
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.cli.terminal import BatchProgress, progress_bar
+from pnpdepth_cli.cli.terminal import progress_bar, say_above_bar
+from pnpdepth_cli.commands.batch.batch_request import Listener
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
@@ -98,12 +99,12 @@ def test_without_a_terminal_there_is_a_line_a_minute(
     now = 0.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     with progress_bar("batch", "frame") as show:
-        display = BatchProgress(show, lambda: False)
-        display.begin(600)
+        listener = Listener(say_above_bar, show, lambda: False)
+        listener.begin(600)
         for number in range(300):
             now += 1.0
             status = "failed" if number == 10 else "done"
-            display.frame(FrameRecord(name="x", status=status, message="bad"))
+            listener.frame(FrameRecord(name="x", status=status, message="bad"))
     failed, first, *others = capsys.readouterr().err.splitlines()
     assert failed == "failed: x: bad"
     assert "60/600 [01:00<09:00" in first

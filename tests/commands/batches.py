@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
+from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.batch.records import BatchSummary
 from pnpdepth_cli.commands.batch.run_batch import run_batch
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
@@ -23,7 +23,7 @@ NAMES = ("a", "b", "c", "d")
 STEP_M = 0.1
 
 
-class RecordingListener:
+class RecordingListener(Listener):
     """Keeps the messages and records of a batch."""
 
     def __init__(
@@ -31,17 +31,13 @@ class RecordingListener:
         stopped: Callable[[], bool] = lambda: False,
         on_frame: Callable[[], object] = lambda: None,
     ) -> None:
-        self.stopped, self._on_frame = stopped, on_frame
+        self._on_frame = on_frame
         self.messages: list[str] = []
         self.records: list[FrameRecord] = []
-
-    def say(self, text: str) -> None:
-        self.messages.append(text)
-
-    def begin(self, to_do: int) -> None:
-        """Nothing to show."""
+        super().__init__(self.messages.append, lambda done, of: None, stopped)
 
     def frame(self, record: FrameRecord) -> None:
+        super().frame(record)
         self.records.append(record)
         self._on_frame()
 

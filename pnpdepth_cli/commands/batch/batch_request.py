@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
@@ -42,20 +42,35 @@ def parse_address(text: str) -> str:
     )
 
 
-class Listener(Protocol):
-    """Receives the progress of a batch, and may stop it."""
+class Listener:
+    """Hears of the progress of a batch, and may stop it; its counts are numbers of frames.
 
-    def say(self, text: str) -> None:
-        """Receives a note or a warning, one line."""
+    Args:
+        say: Receives a note or a warning, one line.
+        show: Receives how many frames are done or have failed, of how many.
+        stopped: Asked before each frame; True ends the batch.
+    """
+
+    def __init__(
+        self,
+        say: Callable[[str], None],
+        show: Callable[[int, int], None],
+        stopped: Callable[[], bool],
+    ) -> None:
+        self.say, self.stopped, self._show = say, stopped, show
+        self.done = self.to_do = 0
 
     def begin(self, to_do: int) -> None:
-        """Called with the number of frames to do."""
+        """Starts counting; `to_do` frames follow."""
+        self.to_do = to_do
+        self._show(0, to_do)
 
     def frame(self, record: FrameRecord) -> None:
-        """Called with the record of each frame that is done or has failed."""
-
-    def stopped(self) -> bool:
-        """Asked before each frame; True ends the batch."""
+        """Counts a frame, and says why it failed if it did."""
+        if record.status != "done":
+            self.say(f"{record.status}: {record.name}: {record.message}")
+        self.done += 1
+        self._show(self.done, self.to_do)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
+from pnpdepth_cli.commands.tables import write_text
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.sensors.point_cloud import depth_normals
 
@@ -34,9 +35,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
         done()
     for listed in _files(folder, frames)[2 * len(frames) :]:
-        with atomic_path(listed) as temporary:
-            text = "".join(f"{frame.image_name}\n" for frame in frames)
-            temporary.write_text(text, encoding="utf-8", newline="\n")
+        write_text(listed, "".join(f"{frame.image_name}\n" for frame in frames))
     return distortion_note(frames, "COLMAP's fusion")
 
 

@@ -21,8 +21,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
+from pnpdepth_cli.commands.tables import write_text
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.file_bytes import write_json
@@ -123,8 +123,7 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
             index = len(lines["points3D"])
             lines["points3D"].append(f"{index} {place} {red} {green} {blue} 0\n")
     for part, text in lines.items():
-        with atomic_path(folder / f"{part}.txt") as temporary:
-            temporary.write_text("".join(text), encoding="utf-8", newline="\n")
+        write_text(folder / f"{part}.txt", "".join(text))
 
 
 EXPORT = Export(needs_pose=False, files=_files, write=_write, copies_images=True)
