@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
@@ -25,7 +26,6 @@ from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
-from tests.exr_files import write_exr
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 INDOOR = STREET.parent / "indoor"
@@ -223,7 +223,7 @@ def test_only_sparse_depth_of_enough_confidence_is_used(
     stored = (confidence * of / 2).astype(np.float32 if suffix == ".exr" else np.uint8)
     path = tmp_path / f"confidence{suffix}"
     if suffix == ".exr":
-        write_exr(path, {"Z": stored})
+        OpenEXR.File({}, {"Z": stored}).write(str(path))
     elif suffix == ".npy":
         np.save(path, stored)
     else:

@@ -25,7 +25,6 @@ from pnpdepth_cli.io.depth import (
     write_depth,
 )
 from pnpdepth_cli.io.formats import Reading
-from tests.exr_files import write_exr
 from tests.models.weights.files import Hostile
 
 CODES = np.array([[0, 256, 512], [1000, 25600, 65534]], dtype=np.uint16)
@@ -37,12 +36,14 @@ def save(path: Path, values: Any, text: str | None = None) -> Path:
     """Writes by the suffix, a mapping as channels; `text` is the scale in the file itself."""
     if path.suffix == ".npz":
         np.savez(path, **values)
+    elif path.suffix == ".exr":
+        OpenEXR.File({}, values).write(str(path))
     elif text is not None:
         info = PngInfo()
         info.add_text("pnpdepth:scale", text)
         Image.fromarray(values).save(path, pnginfo=info)
     else:
-        by_suffix = {".npy": np.save, ".exr": write_exr, ".pfm": Path.write_bytes}
+        by_suffix = {".npy": np.save, ".pfm": Path.write_bytes}
         by_suffix.get(path.suffix, lambda p, v: cv2.imwrite(str(p), v))(path, values)
     return path
 
@@ -163,13 +164,10 @@ def test_every_truncation_of_a_depth_file_is_refused_in_one_line(
 
 
 def test_an_exr_of_several_parts_or_with_a_crop_of_its_display_is_refused(tmp_path: Path) -> None:
-
-    header = {"type": OpenEXR.scanlineimage}
-    parts = [OpenEXR.Part(dict(header), {name: METRES}, name) for name in ("left", "right")]
-    with OpenEXR.File(parts) as file:
-        file.write(str(tmp_path / "parts.exr"))
+    parts = [OpenEXR.Part({}, {name: METRES}, name) for name in ("left", "right")]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
     window = (np.array([0, 0], np.int32), np.array([4, 3], np.int32))
-    write_exr(tmp_path / "crop.exr", {"Z": METRES}, displayWindow=window)
+    OpenEXR.File({"displayWindow": window}, {"Z": METRES}).write(str(tmp_path / "crop.exr"))
     for name in ("parts.exr", "crop.exr"):
         with pytest.raises(InputError, match=name):
             read_depth(tmp_path / name)

@@ -24,7 +24,6 @@ from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
 from pnpdepth_cli.io.file_bytes import read_json, sha256_of
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from tests.exr_files import write_exr
 from tests.models.weights.files import little
 
 TAGS, HIGH = 3000, 2**31 - 1
@@ -66,10 +65,10 @@ def overlapping_pages() -> bytes:
 def exr(*names: str, **header: object) -> bytes:
     """An uncompressed file of 4×2 pixels, as OpenEXR writes it."""
     channels = {name: np.full((2, 4), 2, np.float32) for name in names}
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.exr"
-        write_exr(path, channels, compression=OpenEXR.NO_COMPRESSION, **header)
-        return path.read_bytes()
+    with tempfile.NamedTemporaryFile(suffix=".exr") as file:
+        attributes = {"compression": OpenEXR.NO_COMPRESSION, **header}
+        OpenEXR.File(attributes, channels).write(file.name)
+        return Path(file.name).read_bytes()
 
 
 def claiming(content: bytes, name: str, kind: str, value: bytes) -> bytes:

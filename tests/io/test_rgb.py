@@ -7,12 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
-from tests.exr_files import write_exr
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
@@ -101,11 +101,11 @@ def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(tmp_path: Path
 def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Path) -> None:
     path, linear = tmp_path / "a.exr", np.array([[0, 0.002, 0.2140411], [0.5, 1, 0]], np.float32)
     layer = {f"V.Combined.{c}": linear * shown for c, shown in zip("RGB", (1, 1, 0), strict=True)}
-    write_exr(path, {**layer, "V.Depth.Z": linear})
+    OpenEXR.File({}, {**layer, "V.Depth.Z": linear}).write(str(path))
     encoded = np.array([[0, 12.92 * 0.002, 0.5], [0.7353569, 1, 0]])[:, :, None] * [1, 1, 0]
     np.testing.assert_allclose(read_rgb(path).values, encoded, atol=1e-6)
     bright = np.array([[0.5, 4.0], [np.nan, np.inf]], np.float16)
-    write_exr(path, {"Y": bright, "A": bright})
+    OpenEXR.File({}, {"Y": bright, "A": bright}).write(str(path))
     image = read_rgb(path)
     np.testing.assert_allclose(image.values[:, :, 0], [[0.7353569, 1], [0, 1]], atol=1e-6)
     assert "50 %" in str(image.note)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import re
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -92,14 +91,6 @@ def test_points_survive_every_format_also_what_is_no_number(tmp_path: Path, name
         np.testing.assert_array_equal(got, points.astype(np.float32))
 
 
-def lies() -> Iterator[tuple[str, bytes]]:
-    """Files with a count of points that they do not hold."""
-    for name in FILES:
-        for count in (b"9037", b"9" * 5000, b"9" * 12, b"-1"):
-            if name.endswith((".pcd", ".ply")):
-                yield name, re.sub(rb"(POINTS|vertex) 37", rb"\g<1> " + count, FILES[name](POINTS))
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -116,7 +107,13 @@ def lies() -> Iterator[tuple[str, bytes]]:
         ("a.ply", b"ply\nend_header\n"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n"),
         ("a.ply", ply_bytes(POINTS).replace(b"uchar red", b"list uchar int red")),
-        *lies(),
+        # counts of points that the files do not hold
+        *(
+            (name, re.sub(rb"(POINTS|vertex) 37", rb"\g<1> " + count, content(POINTS)))
+            for name, content in FILES.items()
+            if name.endswith((".pcd", ".ply"))
+            for count in (b"9037", b"9" * 5000, b"9" * 12, b"-1")
+        ),
     ],
 )
 def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, content: bytes) -> None:
