@@ -44,43 +44,39 @@ class OpenList(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         """Returns the entry. Raises UsageError for an unknown name."""
-        if name in self._modules:
-            module = importlib.import_module(self._modules[name])
-            if self._names:
-                return module.TABLE[name]
-            return module if self._attribute is None else getattr(module, self._attribute)
-        if name in self._entry_points:
-            return self._entry_points[name].load()
+        if name in self._entries:
+            entry = self._entries[name].load()
+            return entry[name] if name in self._names else entry
         if name in self:
             return _from_file(name, str(self._in_file))
         raise UsageError(f"{name!r} is none of the {self._group} {', '.join(self)}")
 
     def __contains__(self, name: object) -> bool:
         is_file = self._in_file is not None and str(name).endswith(".py")
-        return is_file or name in self._modules or name in self._entry_points
+        return is_file or name in self._entries
 
     def __iter__(self) -> Iterator[str]:
-        return iter({**self._modules, **self._entry_points})
+        return iter(self._entries)
 
     def __len__(self) -> int:
-        return len({**self._modules, **self._entry_points})
+        return len(self._entries)
 
     @functools.cached_property
-    def _modules(self) -> dict[str, str]:
-        if self._names:
-            return dict.fromkeys(self._names, self._module)
-        package = importlib.util.find_spec(self._module)
-        assert package is not None
-        return {
-            file.name.replace("_", "-"): f"{self._module}.{file.name}"
-            for file in pkgutil.iter_modules(package.submodule_search_locations)
-            if not file.name.startswith("_") and not file.ispkg
-        }
-
-    @functools.cached_property
-    def _entry_points(self) -> dict[str, EntryPoint]:
-        found = entry_points(group=f"pnpdepth.{self._group}")
-        return {point.name: point for point in sorted(found, key=lambda point: point.name)}
+    def _entries(self) -> dict[str, EntryPoint]:
+        """The package's own, in their order, then those of others by name."""
+        places = dict.fromkeys(self._names, f"{self._module}:TABLE")
+        if not self._names:
+            package = importlib.util.find_spec(self._module)
+            assert package is not None
+            for file in pkgutil.iter_modules(package.submodule_search_locations):
+                if not file.name.startswith("_") and not file.ispkg:
+                    place = f"{self._module}.{file.name}"
+                    if self._attribute is not None:
+                        place += f":{self._attribute}"
+                    places[file.name.replace("_", "-")] = place
+        own = {name: EntryPoint(name, place, self._group) for name, place in places.items()}
+        others = {point.name: point for point in entry_points(group=f"pnpdepth.{self._group}")}
+        return own | {name: others[name] for name in sorted(others.keys() - own.keys())}
 
 
 @functools.cache
