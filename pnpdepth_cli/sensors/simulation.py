@@ -65,40 +65,34 @@ _VLP_32C_DEG = (
     -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333, -3.667, -4.0, -4.667, -5.333, -6.148,
     -7.254, -8.843, -11.31, -15.639, -25.0,
 )  # fmt: skip
+_HDL_64E_DEG = evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32)
 _SHEETS = {
-    "vlp-16": (evenly_spaced(15, 2, 16), 0.2, 100, 0.03),
-    "vlp-32c": (_VLP_32C_DEG, 0.2, 200, 0.03),
-    "hdl-32e": (evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02),
-    "hdl-64e": (evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32), 0.1728, 120, 0.02),
+    "vlp-16": (evenly_spaced(15, 2, 16), 0.2, 100, 0.03, 0.0),
+    "vlp-32c": (_VLP_32C_DEG, 0.2, 200, 0.03, 0.0),
+    "hdl-32e": (evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02, 0.0),
+    "hdl-64e": (_HDL_64E_DEG, 0.1728, 120, 0.02, 0.0),
+    # Wang et al. 2019, table on LiDAR types: fields of view of 30, 40, 41 and 27 degrees, with
+    # beams evenly spaced by the vertical resolution. The table gives no elevation of the top beam,
+    # which is the data sheet's here. It gives no azimuth step and no size of its "random noise on
+    # rotation" either: these two are ours, chosen once for all four so that their fractions of
+    # sampled pixels are about those printed there, in SYNTHIA's view of 100° by 71° at 512×304.
+    "paper-vlp-16": (evenly_spaced(15, 2, 16), 0.19, np.inf, 0.0, 0.4),
+    "paper-vlp-32c": (evenly_spaced(15, 0.3, 134), 0.19, np.inf, 0.0, 0.4),
+    "paper-hdl-32e": (evenly_spaced(10.67, 1.3, 32), 0.19, np.inf, 0.0, 0.4),
+    "paper-hdl-64e": (evenly_spaced(2, 0.4, 68), 0.19, np.inf, 0.0, 0.4),
 }
-"""Elevations and azimuth step, degrees; range and its noise, metres."""
-
-# Wang et al. 2019, table on LiDAR types: field of view and vertical resolution, beams evenly
-# spaced. The table gives no elevation of the top beam, which is the data sheet's here. It gives no
-# azimuth step and no size of its "random noise on rotation" either: these two are ours, chosen once
-# for all four so that their fractions of sampled pixels are about those printed there, in SYNTHIA's
-# view of 100° by 71° at 512×304 pixels.
-_PAPER_FOV = {
-    "vlp-16": (30, 2.0, 15.0),
-    "vlp-32c": (40, 0.3, 15.0),
-    "hdl-32e": (41, 1.3, 10.67),
-    "hdl-64e": (27, 0.4, 2.0),
-}
-
+"""Elevations and azimuth step, degrees; range and its noise, metres; noise of angles, degrees."""
 
 LIDARS = {
     name: Lidar(
-        name=name, elevations_deg=beams, azimuth_step_deg=step, max_range=reach, range_noise=noise
+        name=name,
+        elevations_deg=beams,
+        azimuth_step_deg=step,
+        max_range=reach,
+        range_noise=range_noise,
+        angle_noise_deg=angle_noise,
     )
-    for name, (beams, step, reach, noise) in _SHEETS.items()
-} | {
-    f"paper-{name}": Lidar(
-        name=f"paper-{name}",
-        elevations_deg=evenly_spaced(top_deg, step_deg, int(fov_deg / step_deg + 1e-9) + 1),
-        azimuth_step_deg=0.19,
-        angle_noise_deg=0.4,
-    )
-    for name, (fov_deg, step_deg, top_deg) in _PAPER_FOV.items()
+    for name, (beams, step, reach, range_noise, angle_noise) in _SHEETS.items()
 }
 """The scanners that can be named, as `choices.SENSORS` lists them."""
 
