@@ -32,20 +32,8 @@ from pnpdepth_cli.io.bags import (
     Message,
     check_topics,
     choose_topic,
+    messages,
     open_bag,
-)
-from pnpdepth_cli.io.bags.messages import (
-    camera_of_bag,
-    camera_trajectory,
-    cloud_points,
-    depth_image,
-    frame_of,
-    image_file,
-    is_depth,
-    nearest_pairs,
-    poses_topics,
-    seconds_of,
-    static_pose,
 )
 from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.io.depth import write_depth
@@ -173,7 +161,8 @@ def _write_pairs(
     lost, times, dropped = 0, list[float](), Counter[str]()
     first, last = request.between or (0, math.inf)
     numbers = itertools.count()
-    for time_s, image, scan in nearest_pairs(stream(bag, sensors, offset), request.tolerance):
+    pairs = messages.nearest_pairs(stream(bag, sensors, offset), request.tolerance)
+    for time_s, image, scan in pairs:
         if scan is None:
             lost += 1
             continue
@@ -189,7 +178,7 @@ def _write_pairs(
         dropped.update(counts)
         times.append(time_s)
         name = f"{time_s:.6f}".replace(".", "_")
-        suffix, data = image_file(image, sensors.images)
+        suffix, data = messages.image_file(image, sensors.images)
         with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
             temporary.write_bytes(data)
         sparse = request.output / "sparse" / name
@@ -204,14 +193,14 @@ def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: 
     """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera."""
     # The camera, from camera_info.
     topics = sensors.images, sensors.points
-    camera, points = (frame_of(next(bag.messages([each]))[2]) for each in topics)
-    if (of_bag := camera_of_bag(bag, sensors.images)) is None:
+    camera, points = (messages.frame_of(next(bag.messages([each]))[2]) for each in topics)
+    if (of_bag := messages.camera_of_bag(bag, sensors.images)) is None:
         say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
         return camera
     calibration, camera = of_bag[0], of_bag[1] or camera
     source = calibration.camera.source
     # The pose of the scanner, from static transforms.
-    if (scanner := static_pose(bag, camera, points)) is not None:
+    if (scanner := messages.static_pose(bag, camera, points)) is not None:
         source += f", and /tf_static from {camera} to {points}"
         calibration = replace(calibration, scanner=scanner)
     if scanner is None and not sensors.is_map:
@@ -253,13 +242,13 @@ def _write_poses(
     request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
 ) -> str | None:
     """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
-    topics = poses_topics(bag, request.topics)
+    topics = messages.poses_topics(bag, request.topics)
     if len(topics) != 1:
         if topics:
             say(f"poses: none, as several topics give some; --topic {' | '.join(topics)}")
         return None
     (topic,) = topics
-    trajectory = camera_trajectory(bag, topic, camera)
+    trajectory = messages.camera_trajectory(bag, topic, camera)
     if trajectory is None:
         say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
         return None
@@ -305,7 +294,7 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     # Topics of images hold colours or depth, which the first message tells.
     topics = bag.topics(IMAGES)
     first = {n: each[2] for n in topics for each in itertools.islice(bag.messages([n]), 1)}
-    depths = {name: topics[name] for name, message in first.items() if is_depth(message, name)}
+    depths = {n: topics[n] for n, message in first.items() if messages.is_depth(message, n)}
     colours = {name: topics[name] for name in first if name not in depths}
     # Points are clouds, unless depth images are named or alone.
     images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
@@ -313,13 +302,13 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
         points = choose_topic(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
         return Sensors(images=images, points=points, is_depth=False)
     # Depth images with the colours' frame_id are preferred.
-    frame = frame_of(first[images])
-    registered = {name: count for name, count in depths.items() if frame_of(first[name]) == frame}
+    frame = messages.frame_of(first[images])
+    registered = {n: depths[n] for n in depths if messages.frame_of(first[n]) == frame}
     usable = depths if set(wanted) & set(depths) else registered or depths
     points = choose_topic(bag, wanted, usable, "depth images")
     same = Sensors(images=images, points=points, is_depth=True)
     # They may be of a camera of their own.
-    found = camera_of_bag(bag, images), camera_of_bag(bag, points)
+    found = messages.camera_of_bag(bag, images), messages.camera_of_bag(bag, points)
     of_images, of_depth = (None if each is None else each[0].camera for each in found)
     if of_depth is None:
         if points not in registered:
@@ -341,9 +330,9 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
     """
     topic = sensors.points
     if not sensors.is_depth:
-        cloud = cloud_points(message, topic)
+        cloud = messages.cloud_points(message, topic)
     else:
-        depth = depth_image(message, topic)
+        depth = messages.depth_image(message, topic)
         if not depth.any():
             raise NoPointsError(f"{topic}: a depth image without depth")
         if sensors.depth_camera is None:
@@ -360,7 +349,7 @@ def stream(bag: Bag, sensors: Sensors, offset: float) -> Iterator[tuple[bool, fl
     """Yields whether it is an image, its time, and the message; adds `offset` to that of points."""
     for topic, logged_ns, message in bag.messages([sensors.images, sensors.points]):
         is_image = topic == sensors.images
-        time_s = seconds_of(message, logged_ns) + (0.0 if is_image else offset)
+        time_s = messages.seconds_of(message, logged_ns) + (0.0 if is_image else offset)
         yield is_image, time_s, message
 
 
@@ -373,7 +362,7 @@ def clock_offset(bag: Bag, sensors: Sensors, say: Say) -> float:
     delays = list[list[float]]()
     for topic in (sensors.images, sensors.points):
         first = itertools.islice(bag.messages([topic]), _DELAYS)
-        delays.append([1e-9 * ns - seconds_of(message, ns) for _, ns, message in first])
+        delays.append([1e-9 * ns - messages.seconds_of(message, ns) for _, ns, message in first])
     if not all(delays):
         return 0.0
     offset = round(float(np.median(delays[1]) - np.median(delays[0])), 6)

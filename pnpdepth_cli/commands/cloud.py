@@ -18,15 +18,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
-from pnpdepth_cli.sensors.point_cloud import (
-    PointCloud,
-    View,
-    cloud_from_depth,
-    consistent_depth,
-    merge_in_voxels,
-    neighbouring_views,
-    points_of_depth,
-)
+from pnpdepth_cli.sensors import point_cloud
 
 _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
@@ -59,7 +51,7 @@ def write_depth_cloud(
     placed = [np.eye(3, 4) if pose is None else pose for pose in poses]
     parts = _parts(request, frames, placed, coloured, notes, show)
     make_folder(request.output.parent)
-    merged = parts if request.voxel is None else [merge_in_voxels(parts, request.voxel)]
+    merged = parts if request.voxel is None else [point_cloud.merge_in_voxels(parts, request.voxel)]
     points = write_cloud(request.output, merged)
     colours = "coloured" if coloured else "without colours (no image is known)"
     return f"{points:,} points, {colours}", notes
@@ -94,7 +86,7 @@ def _parts(
     coloured: bool,
     notes: list[str],
     show: Callable[[int, int], None],
-) -> Iterator[PointCloud]:
+) -> Iterator[point_cloud.PointCloud]:
     """Yields the clouds of all depth maps in the world. Raises InputError if there is no point."""
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
@@ -105,20 +97,20 @@ def _parts(
         return depth, camera
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
-    def view(index: int) -> View:
+    def view(index: int) -> point_cloud.View:
         depth, camera = depth_and_camera(index)
-        return points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
+        return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
 
     empty = True
     for index, frame in enumerate(frames):
         show(index, len(frames))
         depth, camera = depth_and_camera(index)
         if request.min_views > 1:
-            others = (view(other) for other in neighbouring_views(np.stack(poses), index))
-            depth = consistent_depth(view(index), others, request.min_views)
+            near = point_cloud.neighbouring_views(np.stack(poses), index)
+            depth = point_cloud.consistent_depth(view(index), map(view, near), request.min_views)
         image = request.image or frame.image
         rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
-        for part in cloud_from_depth(depth, camera, rgb):
+        for part in point_cloud.cloud_from_depth(depth, camera, rgb):
             empty &= not len(part.xyz)
             yield part.transform(poses[index])
     if empty:

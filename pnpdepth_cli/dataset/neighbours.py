@@ -16,13 +16,7 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
-from pnpdepth_cli.sensors.accumulation import (
-    Keypoints,
-    Scan,
-    accumulate,
-    keypoints_of,
-    motion_of_images,
-)
+from pnpdepth_cli.sensors import accumulation
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import Points
 
@@ -63,7 +57,7 @@ def read_neighbours(
             " column calib in a list"
         )
     own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
-    scans, records, notes = dict[int, list[Scan]](), list[FileRecord](), list[str]()
+    scans, records, notes = dict[int, list[accumulation.Scan]](), list[FileRecord](), list[str]()
     for each in files.neighbours:
         # The neighbour's points, and the motion that the images show where it is of use.
         points, source = points_of(each.files), each.files.sparse or each.files.gt
@@ -72,7 +66,7 @@ def read_neighbours(
         is_nearest = each.apart == 1 and 1 not in scans
         if here is not None and there is not None and (each.motion is None or is_nearest):
             seen = _keypoints_of(here, files.part), _keypoints_of(there, each.files.part)
-            shown, basis = motion_of_images(*seen, points, camera)
+            shown, basis = accumulation.motion_of_images(*seen, points, camera)
         # Its motion is that, or of poses, which must not contradict the images.
         motion, poses, off_px = shown, f"{each.poses}: {basis}", 0.0
         if each.motion is not None:
@@ -106,7 +100,7 @@ def read_neighbours(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({basis}); give"
             " --poses, or leave out --accumulate"
         )
-    return accumulate(own, scans, camera).tensors(), records, notes
+    return accumulation.accumulate(own, scans, camera).tensors(), records, notes
 
 
 def _distance_px(one: Floats, other: Floats, points: Points, camera: Camera) -> float:
@@ -118,14 +112,14 @@ def _distance_px(one: Floats, other: Floats, points: Points, camera: Camera) -> 
     return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)))
 
 
-def _keypoints_of(image: ImageSource, part: FramePart) -> Keypoints:
+def _keypoints_of(image: ImageSource, part: FramePart) -> accumulation.Keypoints:
     return _keypoints(image, part, fingerprint(file_of(image)).sha256)
 
 
 @functools.lru_cache(maxsize=16)  # images
-def _keypoints(image: ImageSource, part: FramePart, digest: str) -> Keypoints:
+def _keypoints(image: ImageSource, part: FramePart, digest: str) -> accumulation.Keypoints:
     """The keypoints of an image whose file has this digest."""
-    return keypoints_of(np.ascontiguousarray(part.apply(read_image(image))))
+    return accumulation.keypoints_of(np.ascontiguousarray(part.apply(read_image(image))))
 
 
 def _name_of(files: FrameFiles) -> str:

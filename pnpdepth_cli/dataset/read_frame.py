@@ -10,15 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.arrays import (
-    apply_masks,
-    camera_of_exif,
-    camera_of_file,
-    move_depth,
-    raw_depth,
-    read_image,
-    record_of,
-)
+from pnpdepth_cli.dataset import arrays, sparse_depth
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
@@ -28,12 +20,6 @@ from pnpdepth_cli.dataset.frame_files import (
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
-from pnpdepth_cli.dataset.sparse_depth import (
-    SparseDepth,
-    depth_of_distances,
-    read_colmap_points,
-    read_map_points,
-)
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord, Sampling
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
@@ -137,8 +123,8 @@ def _read_pixels(
             image = read_rgb(files.image, upright=files.sparse is None or not files.sparse.is_dir())
             rgb, notes = image.values, [f"image: {image.note}"] if image.note else []
         else:
-            rgb = read_image(files.image)
-        size, found["image"] = (rgb.shape[0], rgb.shape[1]), (record_of(files.image), notes)
+            rgb = arrays.read_image(files.image)
+        size, found["image"] = (rgb.shape[0], rgb.shape[1]), (arrays.record_of(files.image), notes)
     if files.gt is not None:
         truth, record, lines = _read_ground_truth(files, options, files.gt, size)
         found["gt"] = record, lines
@@ -161,19 +147,19 @@ def _read_ground_truth(
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, notes
     # The option is the scale of the scan, if there is one, unless the map has none of its own.
-    file = raw_depth(source, files.image) or read_depth(source, scale=scale)
+    file = arrays.raw_depth(source, files.image) or read_depth(source, scale=scale)
     if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
-        own = raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
+        own = arrays.raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
         file = file if own.reading.assumed else own
     # Pixels that a mask or the gate rules out are unknown.
-    values, reading = apply_masks(file.values, files.masks), file.reading
+    values, reading = arrays.apply_masks(file.values, files.masks), file.reading
     if files.gt_other_size and size is not None and values.shape != size:
-        values = move_depth(source, values, size)
+        values = arrays.move_depth(source, values, size)
     option = "--depth-scale" if files.sparse is None else "gt_scale of a list"
     values, notes = plausible_map(values, reading, "gt", option, scale)
     described = describe_range(values, reading, noun="pixels", option=option)
     truth = DepthFile(values=values, reading=reading)
-    return truth, record_of(source, reading), [f"gt: {described}", *notes]
+    return truth, arrays.record_of(source, reading), [f"gt: {described}", *notes]
 
 
 def _sample_sparse(
@@ -182,7 +168,7 @@ def _sample_sparse(
     rgb: NDArray[np.float32] | None,
     truth: DepthFile | None,
     seed: int,
-) -> SparseDepth:
+) -> sparse_depth.SparseDepth:
     """Points sampled from the ground truth."""
     if options.sparse_range:
         raise UsageError("--sparse-range is of sparse depth from a file, and there is none")
@@ -199,7 +185,7 @@ def _sample_sparse(
     how = f"{options.sample.kind} of the ground truth, seed {seed}"
     reading = Reading(how, truth.reading.scale)
     sampling = Sampling(**asdict(options.sample), seed=seed)
-    return SparseDepth(
+    return sparse_depth.SparseDepth(
         points=points,
         reading=reading,
         record=FileRecord(path=str(files.gt), sampled=sampling),
@@ -209,7 +195,7 @@ def _sample_sparse(
 
 def _read_sparse(
     files: FrameFiles, options: ReadOptions, size: tuple[int, int] | None
-) -> SparseDepth:
+) -> sparse_depth.SparseDepth:
     """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
     path, image, scan = files.sparse, files.image_file, options.scan.over(files)
     assert path is not None
@@ -226,13 +212,13 @@ def _read_sparse(
             raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
         if replace(options.scan, keep_occluded=False) != ScanOptions():
             raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
-        sparse = read_colmap_points(path, image, size, unit_scale=options.unit_scale)
+        sparse = sparse_depth.read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif is_scan:
         sparse = read_scan_points(path, scan, size, image, scale=scale)
     else:
-        sparse = read_map_points(path, options, size, scale)
+        sparse = sparse_depth.read_map_points(path, options, size, scale)
         if options.sparse_range:
-            sparse = depth_of_distances(sparse, scan, image)
+            sparse = sparse_depth.depth_of_distances(sparse, scan, image)
     # Those that are sure enough, in the part of the frame.
     if files.sparse_mask is not None:
         sparse = sparse.confident(files.sparse_mask, files.min_confidence)
@@ -250,10 +236,10 @@ def _camera_of(
     image, scan = files.image_file, options.scan.over(files)
     notes = list[str]()
     if known is None and scan.calib is not None:
-        known, notes = camera_of_file(scan.calib, scan.camera, size, image)
+        known, notes = arrays.camera_of_file(scan.calib, scan.camera, size, image)
     if known is None and is_needed:
         lacking = f"--html-3d needs the camera, and {image or files.sparse} has no calibration"
-        known, notes = camera_of_exif(image, size, lacking)
+        known, notes = arrays.camera_of_exif(image, size, lacking)
     return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
@@ -285,7 +271,7 @@ def _compare(
     files: FrameFiles,
     gt: NDArray[np.float32],
     reading: Reading,
-    sparse: SparseDepth,
+    sparse: sparse_depth.SparseDepth,
     points: SparsePoints,
 ) -> list[str]:
     """Warnings on ground truth and sparse depth that seem to be of two scales, or one."""

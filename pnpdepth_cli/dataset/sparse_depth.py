@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.dataset.arrays import (
-    camera_of_file,
-    check_same_view,
-    moved_note,
-    read_levels,
-    record_of,
-)
+from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_values
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
@@ -76,9 +70,9 @@ class SparseDepth:
             InputError: The file holds no confidence of this view.
             NoPointsError: No point is left.
         """
-        levels = read_levels(path)
+        levels = arrays.read_levels(path)
         size = (levels.shape[0], levels.shape[1])
-        check_same_view(str(path), size, self.points.size)
+        arrays.check_same_view(str(path), size, self.points.size)
         pixel = pixel_index(self.points.resized(*size).xy, (size[0], size[1]))
         own = levels.ravel()[pixel.clip(0, levels.size - 1)]
         kept = own > 0 if least is None else own >= least
@@ -131,10 +125,10 @@ def read_map_points(
     points = points.select(~far)
     depth, own = points.depth, points.size
     size = size or own
-    check_same_view(str(path), own, size)
+    arrays.check_same_view(str(path), own, size)
     # What a person should know of them.
     lines = [describe_range(depth, reading), *lines]
-    lines += [moved_note(own, size)] if own != size else []
+    lines += [arrays.moved_note(own, size)] if own != size else []
     # Points that the camera does not see go.
     hidden, dropped = None, dict[str, int]()
     if options.foreground is not None:
@@ -157,7 +151,7 @@ def read_map_points(
     return SparseDepth(
         points=replace(points, depth=points.depth / np.float32(divisor)),
         reading=reading,
-        record=replace(record_of(path, reading), dropped=dropped),
+        record=replace(arrays.record_of(path, reading), dropped=dropped),
         notes=(*(f"sparse: {line}" for line in lines), *of_pixels, *warnings),
     )
 
@@ -173,7 +167,7 @@ def depth_of_distances(sparse: SparseDepth, scan: ScanOptions, image: Path | Non
     if scan.calib is None:
         raise UsageError("--sparse-range needs the camera of the distances; give --calib")
     points = sparse.points
-    camera, _ = camera_of_file(scan.calib, scan.camera, points.size, image)
+    camera, _ = arrays.camera_of_file(scan.calib, scan.camera, points.size, image)
     length = np.linalg.norm(unproject(camera, points.xy, np.ones(len(points))), axis=1)
     seen = np.isfinite(length)
     points = replace(points, depth=(points.depth / length).astype(np.float32)).select(seen)
@@ -211,7 +205,7 @@ def read_colmap_points(
     name = name_in_model(model, image)
     camera, pose = model.images[name].camera, model.images[name].pose.inverse()
     assert camera.size is not None  # of every camera of a model
-    check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
+    arrays.check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
     # Its points, without far values.
     points, notes = _points_in(model, name, unit_scale or 1.0)
     dropped = points.dropped
@@ -225,7 +219,7 @@ def read_colmap_points(
     )
     notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}", *notes]
     if camera.size != size:
-        notes.append(f"sparse: {moved_note(camera.size, size)}")
+        notes.append(f"sparse: {arrays.moved_note(camera.size, size)}")
     if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     if lost := describe_dropped(dropped):
