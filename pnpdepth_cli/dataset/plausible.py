@@ -11,6 +11,7 @@ the option that mends.
 | a surface has several depths | the largest on 0.5 %, at least 3, far above the rest | unknown |
 | depths are of one order | above 1,000 times the median | unknown |
 | depth is in metres | the median; whole numbers in a float file | stops |
+| a deep view is near | floats of a median above 200 m, from near to twice as far | warns |
 | two files of a frame agree | their ratio's median is a quotient of common scales | stops |
 | a list holds pixels | all within 0…1 or −1…1; many below 0 | stops |
 | pixels are of this image | all in the upper left corner | warns |
@@ -42,8 +43,11 @@ _FAR_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the 
 _FAR = 1000.0  # times the median depth; no point of an image is farther
 _CODES = 100.0  # median from which floats that are whole numbers are codes
 _COMMON_M = (0.2, 200.0)
+_MIDDLE_M = (0.5, 80.0)  # medians of most frames
+_DEEP = 2.0  # times a tenth of the depths is another tenth farther; not so below an aircraft
 # Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
+_UNITS = (1000.0, 100.0, 10.0, 1.0)  # per metre, of numbers that are no codes
 _OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
@@ -204,20 +208,26 @@ def divisor_to_metres(
     median, floats = float(np.median(depth)), reading.scale is None
     many = floats and median >= _CODES and depth.size >= _FEW
     codes = many and bool((np.rint(depth) == depth).all())
-    if low <= median <= high and not codes:
+    likely = low <= median <= high and not codes
+    far = floats and median > _COMMON_M[1] and depth.size >= _FEW
+    near_m, far_m = np.quantile(depth, (0.1, 0.9)) if likely and far else (1.0, 1.0)
+    if likely and (far_m <= _DEEP * near_m or scale == 1):
         return 1.0, []
     if floats and scale is not None and scale != 1 and low <= median / scale <= high:
         return scale, [f"{what}: ÷ {scale:g}, as {metres(median)} m are implausible"]
     kind = " of whole numbers" if codes else ""
-    fact = f"{what}: median{kind} {metres(median)} m is implausible, the scale is probably wrong"
-    now, (low_m, high_m) = reading.scale or 1.0, _COMMON_M
-    better = next((s for s in _COMMON_SCALES if low_m <= median * now / s <= high_m), None)
+    doubt = "far for so deep a view" if likely else "implausible"
+    fact = f"{what}: median{kind} {metres(median)} m is {doubt}, the scale is probably wrong"
+    now = reading.scale or 1.0
+    common = _COMMON_SCALES if codes or not floats else _UNITS
+    scales = [(s, limits) for limits in (_MIDDLE_M, _COMMON_M) for s in common]
+    better = next((s for s, (least, most) in scales if least <= median * now / s <= most), None)
     if better is None or better == now:
         advice = f"give numbers per metre with {option} (now {now:g})"
     else:
         made = metres(median * now / better)
         advice = f"{option} {better:g} (now {now:g}) would make it {made} m"
-    if scale is not None or not (floats or reading.assumed):
+    if likely or scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
 

@@ -155,11 +155,16 @@ def _read_ground_truth(
     values, reading = arrays.apply_masks(file.values, files.masks), file.reading
     if files.gt_other_size and size is not None and values.shape != size:
         values = arrays.move_depth(source, values, size)
-    option = "--depth-scale" if files.sparse is None else "gt_scale of a list"
+    option = "--depth-scale" if files.sparse is None else _gt_scale_option(files)
     values, notes = plausible_map(values, reading, "gt", option, scale)
     described = describe_range(values, reading, noun="pixels", option=option)
     truth = DepthFile(values=values, reading=reading)
     return truth, arrays.record_of(source, reading), [f"gt: {described}", *notes]
+
+
+def _gt_scale_option(files: FrameFiles) -> str:
+    """What sets the scale of ground truth beside sparse depth; `refine` names no frame."""
+    return "gt_scale of a list" if files.name else "--depth-scale (of both files)"
 
 
 def _sample_sparse(
@@ -298,5 +303,5 @@ def _compare(
             " are the sparse depth itself, so errors against it show nothing; give another --gt,"
             " or keep points out with --holdout"
         )
-    by_option = {"--depth-scale": sparse.reading, "gt_scale of a list": reading}
+    by_option = {"--depth-scale": sparse.reading, _gt_scale_option(files): reading}
     return notes + check_same_scale(depth, gt, by_option)

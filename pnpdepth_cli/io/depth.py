@@ -106,21 +106,25 @@ def depth_from_stored(
         fact = f"has the shape {stored.values.shape}"
         raise InputError(f"{path} {fact}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
+    source, below = stored.reading.source, int(np.count_nonzero(np.less(values, 0)))
+    lost = f", {below:,} pixels below 0 taken as unknown" if below else ""
     if values.dtype.kind == "f":
-        return DepthFile(values=known_metres(values), reading=Reading(stored.reading.source))
+        return DepthFile(values=known_metres(values), reading=Reading(source + lost))
     own = stored.reading.scale
     assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
     divisor = scale or own or assumed
-    source = f"{stored.reading.source} ÷ {divisor:.12g}"
-    if scale is None and own is not None:
+    source += f" ÷ {divisor:.12g}"
+    if own is not None and divisor == own:
         source += " (from the file)"
+    elif own is not None:
+        source += f" (not {own:.12g}, as the file says)"
     saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
     if saturated.any():
         count = int(saturated.sum())
         source += f", {count:,} pixels of value {formats.SATURATED_CODE} taken as unknown"
         values = np.where(saturated, 0, values)
     metres = values.astype(np.float64) / divisor
-    reading = Reading(source, divisor, assumed=scale is None and own is None)
+    reading = Reading(source + lost, divisor, assumed=scale is None and own is None)
     return DepthFile(values=known_metres(metres), reading=reading)
 
 

@@ -162,7 +162,8 @@ def test_plausible_metres_need_no_word(depth: np.ndarray, reading: Reading) -> N
     [
         (2000.0, 1.0, "--depth-scale 1000 (now 1) would make it 2.0 m"),
         (0.01, 100_000.0, "--depth-scale 1000 (now 100000) would make it 1.0 m"),
-        (0.002, 1000.0, "--depth-scale 10 (now 1000) would make it 0.2 m"),
+        (0.002, 1000.0, "--depth-scale 1 (now 1000) would make it 2.0 m"),  # whole metres
+        (0.0002, 1000.0, "--depth-scale 1 (now 1000) would make it 0.2 m"),
         (4e9, 1.0, "give numbers per metre with --depth-scale (now 1)"),
     ],
 )
@@ -193,6 +194,15 @@ def test_a_float_file_in_millimetres_stops_and_the_option_reads_it(
     assert divisor(depth, FLOAT, 1000.0, *kind)[0] == 1000
     kept, (warning,) = divisor(depth, FLOAT, 1.0, *kind)
     assert (kept, warning.startswith("warning: ")) == (1, True)
+
+
+def test_a_room_in_centimetres_is_doubted_but_not_the_ground_below_an_aircraft() -> None:
+    room, ground = np.linspace(100.5, 500, 50), np.linspace(250.5, 350, 50)
+    kept, (warning,) = divisor(room, FLOAT)
+    assert kept == 1
+    assert "--depth-scale 100 (now 1) would make it 3.0 m" in warning
+    assert divisor(room, FLOAT, 100.0)[0] == 100
+    assert divisor(room, FLOAT, 1.0) == divisor(ground, FLOAT) == (1, [])
 
 
 LIST = RNG.uniform(0, 1, (100, 2)) * (639, 479)

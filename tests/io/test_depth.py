@@ -66,6 +66,7 @@ def test_a_given_scale_beats_that_in_the_file_which_beats_kittis(
         assert np.array_equal(depth.values, (CODES / used).astype(np.float32))
         assert depth.reading.assumed == (text is None and scale is None)
         assert depth.reading.scale == used
+        assert ("not 1000" in depth.reading.source) == (text is not None and used != 1000)
     for senseless in (0.0, -256.0, math.nan):
         with pytest.raises(UsageError):
             read_depth(path, scale=senseless)
@@ -80,6 +81,7 @@ UNSIGNED = {"Z": np.array([[512, 0]], np.uint32)}
 LITTLE = b"Pf\n3 2\n-1.0\n" + METRES[::-1].astype("<f4").tobytes()
 BIG = b"Pf\n3 2\n1.0\n" + METRES[::-1].astype(">f4").tobytes()
 UNKNOWN = "16-bit PNG ÷ 256, 2 pixels of value 65535 taken as unknown"
+BELOW = ", 1 pixels below 0 taken as unknown"
 FACTOR = "PFM, scale factor 0.25 of its header not applied"
 
 
@@ -88,7 +90,7 @@ FACTOR = "PFM, scale factor 0.25 of its header not applied"
     [
         *(("d.npy", METRES.astype(k), KNOWN, f"{np.dtype(k)} NPY") for k in ("<f2", "<f8", ">f4")),
         *(("d.npy", METRES.reshape(s), KNOWN, "float32 NPY") for s in [(2, 3, 1), (1, 1, 2, 3)]),
-        ("d.npy", PIXELS.astype(np.int16), [[0, 1]], "int16 NPY ÷ 256"),
+        ("d.npy", PIXELS.astype(np.int16), [[0, 1]], f"int16 NPY ÷ 256{BELOW}"),
         ("d.npy", np.maximum(PIXELS, 0).astype(np.uint64), [[0, 1]], "uint64 NPY ÷ 256"),
         ("d.npy", np.array([[1e300, 2.0]]), [[0, 2]], "float64 NPY"),
         ("d.npz", ANYTHING, KNOWN, "float32 NPZ array anything"),
@@ -110,7 +112,7 @@ def test_every_format_gives_metres_where_they_are_finite_and_above_zero(
     path = save(tmp_path / name, values)
     depth = read_depth(path)
     assert depth.values.tolist() == np.asarray(expected, np.float32).tolist()
-    assert depth.reading.source == source
+    assert depth.reading.source == source + (BELOW if expected is KNOWN else "")
     assert depth.reading.assumed == ("÷" in source)
     if "÷" not in source:  # floats are metres, whatever the scale
         assert np.array_equal(read_depth(path, scale=1000).values, depth.values)
