@@ -9,10 +9,9 @@ from torch import nn
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
-from pnpdepth_cli.models.frame_map import FrameMap
+from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.registry import find_definition
-from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 CUTS = {
@@ -25,11 +24,6 @@ CUTS = {
     "sparse2dense-tiny-kitti": ("bn2", (1, 64, 8, 29)),
     "sparseconv": ("sparse_convs.0[0]", (1, 16, 64, 96)),
 }
-POINTS = SparsePoints(
-    xy=torch.tensor([[12.0, 9.0], [42.0, 9.0], [24.0, 18.0], [48.0, 27.0]]),
-    depth=torch.tensor([1.0, 2.0, 3.0, 4.0]),
-    size=(30, 60),
-)
 
 
 def built(definition: ModelDefinition) -> Network:
@@ -55,6 +49,7 @@ def test_every_layer_can_be_cut_at_and_z_is_where_the_paper_has_it(name: str) ->
     if isinstance(size, Fixed) and name != "fcrn-tiny":
         height, width = size.height, size.width
     arguments = network.synthetic_arguments(FrameMap.fit(Fixed(height, width), height, width))
+    _, points, _ = synthetic_frame((height, width))
     assert network.definition.default_layer == CUTS[name][0]
     aligned = "auto" if name == "sfmlearner-tiny" else "none"
     assert network.definition.default_alignment == aligned
@@ -63,7 +58,7 @@ def test_every_layer_can_be_cut_at_and_z_is_where_the_paper_has_it(name: str) ->
             z = split.front(*arguments)
             assert torch.equal(split.rear(z), network.module(*arguments))
             once = ClosedSettings(iterations=1)
-            refinement = refine(split, arguments, POINTS, once, depth_of=network.depth_of)
+            refinement = refine(split, arguments, points, once, depth_of=network.depth_of)
         assert not torch.equal(refinement.before, refinement.after)
         if layer == CUTS[name][0]:
             assert z.shape == CUTS[name][1]

@@ -31,11 +31,7 @@ def written(folder: Path) -> Path:
 
 
 def varint(value: int) -> bytes:
-    digits = []
-    while value > 127:
-        digits.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*digits, value])
+    return bytes([value]) if value < 128 else bytes([value & 127 | 128]) + varint(value >> 7)
 
 
 def entry(dtype: int, shape: tuple[int, ...], offset: int, size: int, shard: int = 0) -> bytes:
@@ -58,11 +54,11 @@ def index_of(*blocks: bytes, copies: int = 1) -> bytes:
     for part in blocks:
         handles += [(b"\xff", varint(len(data)) + varint(len(part) - 5))] * copies
         data += part
-    tables = []
+    tables = b""
     for part in (block([]), block(handles)):
-        tables.append(varint(len(data)) + varint(len(part) - 5))
+        tables += varint(len(data)) + varint(len(part) - 5)
         data += part
-    return data + b"".join(tables).ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
+    return data + tables.ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)
 
 
 def bundle(folder: Path, entries: dict[str, bytes], *contents: bytes) -> Path:
