@@ -27,11 +27,7 @@ def plain(network: nn.Module, x: Tensor) -> Any:
 
 
 def naive_refine(
-    network: nn.Module,
-    layer: str,
-    x: Tensor,
-    points: SparsePoints,
-    settings: ClosedSettings,
+    network: nn.Module, layer: str, x: Tensor, points: SparsePoints, settings: ClosedSettings
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
     cut = CutPoint.find(network, layer)

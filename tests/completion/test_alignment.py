@@ -31,9 +31,7 @@ def spoiled(depth: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-def test_of_many_points_a_fifth_of_outliers_moves_the_depth_by_less_than_2_percent(
-    kind: str,
-) -> None:
+def test_many_points_with_a_fifth_of_outliers_are_off_by_less_than_2_percent(kind: str) -> None:
     d = scene(2000, 2)
     fit = align(d / 0.4, points_of(spoiled(d)), ("depth",), kind)
     assert torch.allclose(fit.depth(d / 0.4), d, rtol=0.02)
@@ -41,9 +39,7 @@ def test_of_many_points_a_fifth_of_outliers_moves_the_depth_by_less_than_2_perce
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("kind", ["median", "scale", "affine"])
-def test_a_fit_despite_outliers_is_its_own_biweight_least_squares_with_errors_of_its_depth(
-    space: str, kind: str
-) -> None:
+def test_a_fit_is_its_own_biweight_least_squares_and_has_its_errors(space: str, kind: str) -> None:
     rng = np.random.default_rng(7)
     true = scene(61).double().numpy()
     points = points_of(spoiled(scene(61)) * torch.from_numpy(np.exp(0.05 * rng.normal(size=61))))

@@ -23,9 +23,7 @@ def on_lines(gap: int, step: int) -> SparsePoints:
 
 @settings(deadline=None, max_examples=40)
 @given(count=st.integers(1, 300), folds=st.integers(2, 6), seed=st.integers(0, 99))
-def test_every_point_has_a_fold_and_the_folds_are_about_equally_large(
-    count: int, folds: int, seed: int
-) -> None:
+def test_all_points_have_folds_of_about_one_size(count: int, folds: int, seed: int) -> None:
     xy = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed)) * 89
     fold = spatial_folds(points_at(xy, (90, 90)), folds, seed=seed)
     sizes = torch.bincount(fold, minlength=folds)

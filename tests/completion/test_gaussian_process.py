@@ -74,9 +74,7 @@ def test_the_mean_is_that_of_the_textbook(count: int, colour: bool) -> None:
 
 @pytest.mark.parametrize("size", [(60, 80), (40, 100)])
 @pytest.mark.parametrize("count", [300, 900])
-def test_the_mean_from_the_points_nearest_to_a_block_is_near_that_from_all(
-    count: int, size: tuple[int, int]
-) -> None:
+def test_the_mean_from_near_points_is_near_that_of_all(count: int, size: tuple[int, int]) -> None:
     residuals = field(count, size=size)
     off = np.abs(predict(residuals).numpy() - dense_reference(residuals))
     assert off.max() < 0.02
@@ -117,9 +115,7 @@ def test_errors_and_variances_of_left_out_points_are_those_of_leaving_them_out(c
 
 
 @pytest.mark.parametrize("colour", [True, False])
-def test_the_fit_has_the_smallest_error_of_all_length_scales_and_then_of_all_noises(
-    colour: bool,
-) -> None:
+def test_the_fit_has_the_smallest_error_of_all_lengths_and_then_of_all_noises(colour: bool) -> None:
     chosen = set()
     for seed in range(12):
         residuals = field(60, colour=colour, seed=seed)
@@ -161,9 +157,7 @@ def test_colours_are_those_of_the_formula_from_the_primaries_of_srgb() -> None:
 
 
 @pytest.mark.parametrize("colour", [True, False])
-def test_features_are_the_position_in_the_longer_side_and_depth_and_colour_in_deviations(
-    colour: bool,
-) -> None:
+def test_features_are_position_in_sides_and_depth_and_colour_in_deviations(colour: bool) -> None:
     log_depth = torch.tensor([[0.0, 2.0], [math.nan, 0.0], [2.0, 2.0]])
     rgb = torch.zeros(3, 3, 2)
     rgb[:, :, 1] = 1.0

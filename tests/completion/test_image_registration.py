@@ -19,9 +19,7 @@ from pnpdepth_cli.points import SparsePoints
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 
 
-def evidence_of(
-    seed: int, registration: ImageRegistration | None = None, count: int = 500
-) -> Evidence:
+def evidence_of(seed: int, registration: ImageRegistration | None, count: int = 500) -> Evidence:
     known = evidence(*frame(seed, registration, count))
     assert known is not None
     return known

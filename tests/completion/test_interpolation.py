@@ -37,9 +37,7 @@ def scattered(count: int, *, on_grid: bool = False) -> SparsePoints:
 @pytest.mark.parametrize("name", FILLS)
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
 @pytest.mark.parametrize("on_grid", [True, False])
-def test_every_pixel_gets_a_depth_among_those_of_the_points(
-    name: str, count: int, on_grid: bool
-) -> None:
+def test_every_depth_is_among_those_of_the_points(name: str, count: int, on_grid: bool) -> None:
     points = scattered(count, on_grid=on_grid)
     dense = FILLS[name](points)
     assert (dense.shape, dense.dtype) == (points.size, torch.float32)
@@ -48,9 +46,7 @@ def test_every_pixel_gets_a_depth_among_those_of_the_points(
 
 
 @pytest.mark.parametrize("name", FILLS)
-def test_of_points_at_one_position_the_nearest_counts_and_those_beyond_the_border_do(
-    name: str,
-) -> None:
+def test_of_points_at_one_position_the_nearest_counts_and_any_beyond_the_border(name: str) -> None:
     points = scattered(30, on_grid=True)
     xy, depth = points.xy.repeat(2, 1), torch.cat([points.depth + 5, points.depth])
     assert torch.equal(FILLS[name](points_at(xy, depth, points.size)), FILLS[name](points))
@@ -62,9 +58,7 @@ def test_of_points_at_one_position_the_nearest_counts_and_those_beyond_the_borde
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_linear_is_what_scipy_gives_in_its_space_inside_the_hull_and_nearest_outside(
-    space: str,
-) -> None:
+def test_linear_is_scipys_in_its_space_inside_the_hull_and_nearest_outside(space: str) -> None:
     points = scattered(300)
     value = {"depth": points.depth, "inverse": 1 / points.depth, "log": points.depth.log()}[space]
     within = LinearNDInterpolator(points.xy.double().numpy(), value.double().numpy())

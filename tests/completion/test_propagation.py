@@ -14,9 +14,7 @@ from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 @pytest.mark.parametrize("count", [30, 400])
 @pytest.mark.parametrize("flat", [None, "image", "prediction"])
-def test_a_prediction_that_drifts_is_put_right_with_and_without_an_image(
-    kind: str, count: int, flat: str | None
-) -> None:
+def test_a_drifting_prediction_is_put_right(kind: str, count: int, flat: str | None) -> None:
     gt, rgb, prediction = scene()
     if flat == "prediction":
         prediction, rgb = torch.full(SIZE, 2.0), torch.full((3, *SIZE), 0.5)
@@ -30,9 +28,7 @@ def test_a_prediction_that_drifts_is_put_right_with_and_without_an_image(
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
-def test_one_point_moves_all_by_its_factor_and_nothing_left_leaves_the_prediction(
-    kind: str,
-) -> None:
+def test_one_point_moves_all_by_its_factor_and_nothing_left_moves_nothing(kind: str) -> None:
     gt, rgb, prediction = scene()
     exact = propagate(gt, random_points(gt, 50), rgb, kind=kind)
     assert torch.allclose(exact, gt, rtol=1e-6)
@@ -99,9 +95,7 @@ def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(k
 
 
 @pytest.mark.parametrize(("kind", "rtol"), [("gp", 0.01), ("local", 1e-5)])
-def test_a_large_image_has_at_every_second_pixel_the_depth_of_that_pixel_alone(
-    kind: str, rtol: float
-) -> None:
+def test_every_second_pixel_of_a_large_image_is_as_of_it_alone(kind: str, rtol: float) -> None:
     y, x = torch.meshgrid(torch.arange(641.0), torch.arange(801.0), indexing="ij")
     prediction = 2 + x / 801 + (y / 641).square()
     points = random_points(prediction * (1 + 0.3 * torch.sin(x / 200)), 30)

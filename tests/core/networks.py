@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -213,13 +214,6 @@ def two_branches() -> nn.Module:
     )
 
 
-class Box:
-    """An object that hides a tensor."""
-
-    def __init__(self, tensor: Tensor):
-        self.tensor = tensor
-
-
 def side_effects() -> nn.Module:
     """Parts that give features to a list they are handed; one that hides tensors."""
 
@@ -236,7 +230,7 @@ def side_effects() -> nn.Module:
         return net.head(z * tensors[0] + tensors[1]).abs() + 1
 
     one, two = (Net(append, conv=conv(4, 4)) for _ in range(2))
-    hide = Net(lambda part, x: Box(part.conv(x)), conv=conv(4, 4))
+    hide = Net(lambda part, x: SimpleNamespace(tensor=part.conv(x)), conv=conv(4, 4))
     return Net(run, enter=conv(3, 4), one=one, two=two, cut=conv(4, 4), hide=hide, head=conv(4, 1))
 
 

@@ -74,9 +74,7 @@ def test_beams_without_return_are_dropped_and_counted(scan: np.ndarray, gone: sl
         (1000 * SCAN, InputError, r"--depth-scale 1000 \(now 1\) would make it"),
     ],
 )
-def test_what_is_no_scan_in_metres_is_refused(
-    scan: np.ndarray, error: type[Exception], said: str
-) -> None:
+def test_what_is_no_scan_is_refused(scan: np.ndarray, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         scan_returns("a.npy", scan)
 
@@ -107,9 +105,7 @@ def with_plane(far: float, mixed: int = 0) -> np.ndarray:
         (np.where(MAP > 59.9, 90, MAP), 0),  # few far points, all alike
     ],
 )
-def test_a_far_plane_is_unknown_but_not_surfaces_of_one_depth(
-    depth: np.ndarray, unknown: int
-) -> None:
+def test_a_far_plane_is_unknown_but_no_surface_is(depth: np.ndarray, unknown: int) -> None:
     values, notes = plausible_map(depth.astype(np.float32), FLOAT, "gt", "--gt-scale", None)
     expected = depth.astype(np.float32)
     expected.ravel()[:unknown] = 0
@@ -131,9 +127,7 @@ def test_a_far_plane_is_unknown_but_not_surfaces_of_one_depth(
         (np.full(1, 2.0), [1e30], 0),
     ],
 )
-def test_depths_are_unknown_from_each_limit_on(
-    rest: np.ndarray, far: list[float], unknown: int
-) -> None:
+def test_depths_are_unknown_from_a_limit(rest: np.ndarray, far: list[float], unknown: int) -> None:
     depth = np.append(rest, far)
     found, notes = far_values(depth)
     assert np.flatnonzero(found).tolist() == list(range(len(depth) - unknown, len(depth)))
@@ -167,9 +161,7 @@ def test_plausible_metres_need_no_word(depth: np.ndarray, reading: Reading) -> N
         (4e9, 1.0, "give numbers per metre with --depth-scale (now 1)"),
     ],
 )
-def test_a_scale_that_would_be_plausible_is_proposed(
-    median: float, scale: float, advice: str
-) -> None:
+def test_a_plausible_scale_is_proposed(median: float, scale: float, advice: str) -> None:
     _, (warning,) = divisor(np.full(3, median), Reading("PNG", scale))
     assert warning.startswith("warning: x: median ")
     assert advice in warning
@@ -186,9 +178,7 @@ def test_a_scale_that_would_be_plausible_is_proposed(
         (np.full(20, 700.5), [SCANS]),  # a scan's are nearer than a depth may be
     ],
 )
-def test_a_float_file_in_millimetres_stops_and_the_option_reads_it(
-    depth: np.ndarray, kind: list[Any]
-) -> None:
+def test_millimetres_stop_and_the_option_reads_them(depth: np.ndarray, kind: list[Any]) -> None:
     with pytest.raises(InputError, match=r"--depth-scale \d+ \(now 1\)"):
         divisor(depth, FLOAT, None, *kind)
     assert divisor(depth, FLOAT, 1000.0, *kind)[0] == 1000
@@ -218,9 +208,7 @@ LIST = RNG.uniform(0, 1, (100, 2)) * (639, 479)
         (LIST[:5] + 1000, NoPointsError, "a.csv"),
     ],
 )
-def test_coordinates_that_are_no_pixels_are_refused(
-    xy: np.ndarray, error: type[Exception], said: str
-) -> None:
+def test_what_are_no_pixels_is_refused(xy: np.ndarray, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         check_pixels(Path("a.csv"), xy, (480, 640))
 
@@ -242,9 +230,7 @@ def test_pixels_are_in_the_image_or_said_to_be_outside(xy: np.ndarray, said: lis
 
 @pytest.mark.parametrize("factor", [0.3, 0.66, 0.67, 1.49, 1.51, 7])
 @pytest.mark.parametrize("known", [9, 10])
-def test_two_files_differ_by_a_factor_of_more_than_one_and_a_half(
-    factor: float, known: int
-) -> None:
+def test_files_differ_by_a_factor_of_more_than_one_and_a_half(factor: float, known: int) -> None:
     sparse = np.where(np.arange(2000).reshape(40, 50) < known, MAP, np.float32(0))
     differs = known == 10 and not 1 / 1.5 <= factor <= 1.5
     assert len(check_same_scale(sparse, np.float32(factor) * MAP, {})) == differs

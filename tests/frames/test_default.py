@@ -243,9 +243,7 @@ def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None
         assert torch.allclose(again.predicted[name][one], first.predicted[name][one], rtol=1e-3)
 
 
-def test_an_image_that_does_not_belong_to_its_points_gets_a_warning_with_two_errors(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_image_of_another_scene_is_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
     frame = frame_in_memory(400)
     stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
@@ -370,9 +368,7 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
 
 
 @pytest.mark.parametrize("of_points", [True, False])
-def test_the_loss_without_updates_is_that_of_the_points_where_the_depth_is_finite(
-    of_points: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_loss_is_that_of_finite_depth(of_points: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, build = frame_in_memory(60), Nearest if of_points else Brightness
     sky = torch.where(torch.arange(SIZE[0])[:, None] < 30, torch.inf, 1.5 * depth_of_scene())
     monkeypatch.setattr(build, "forward", lambda *_: sky[None, None])

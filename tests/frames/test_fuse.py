@@ -42,9 +42,7 @@ def test_a_mirrored_frame_has_left_and_right_exchanged_and_mirrored_again_is_the
     assert torch.equal(twice.rgb, frame.rgb)  # type: ignore[arg-type]
 
 
-def test_with_few_points_the_depth_is_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> (
-    None
-):
+def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> None:
     frame = frame_in_memory(count=MIRRORED_BELOW - 1)
     split = split_frame(frame, depth_of_scene(), 0)
     once, twice = seen_twice(frame)
@@ -57,8 +55,6 @@ def test_with_few_points_the_depth_is_the_geometric_mean_of_the_frame_and_the_mi
 
 
 @pytest.mark.parametrize(("count", "weight"), [(MIRRORED_BELOW, 1.0), (20, 0.0)])
-def test_with_many_points_or_without_weight_an_expert_sees_the_frame_alone(
-    count: int, weight: float
-) -> None:
+def test_many_points_or_no_weight_show_an_expert_the_frame_alone(count: int, weight: float) -> None:
     once, twice = seen_twice(frame_in_memory(count), weight)
     assert twice is once

@@ -91,9 +91,7 @@ def test_a_validated_frame_is_refined_again_without_its_validation_points() -> N
 
 
 @pytest.mark.parametrize("weighs_points", [True, False])
-def test_only_a_network_that_weighs_its_points_is_given_the_outliers_too(
-    weighs_points: bool,
-) -> None:
+def test_only_a_network_that_weighs_points_is_given_the_outliers_too(weighs_points: bool) -> None:
     xy, depth = torch.tensor([[0.0, 0.0], [3.0, 1.0], [2.0, 2.0]]), torch.tensor([1.0, 2.0, 30.0])
     points = SparsePoints(xy=xy, depth=depth, size=(4, 4))
     frame = Frame(rgb=None, points=points).without(torch.tensor([False, False, True]))

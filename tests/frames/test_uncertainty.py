@@ -98,9 +98,7 @@ def test_the_deviation_is_the_calibrated_product_of_four_differences(count: int)
 
 @pytest.mark.parametrize("scale", [1e-9, 0.3, 1e9])
 @pytest.mark.parametrize(("total", "count"), [(1, 10), (7, 90), (200, 700)])
-def test_the_calibration_is_that_of_the_ranks_of_the_residuals(
-    scale: float, total: int, count: int
-) -> None:
+def test_the_calibration_is_of_the_ranks_of_residuals(scale: float, total: int, count: int) -> None:
     residual, sigma = np.random.default_rng(total).uniform(0.1, 2, (2, total)) * [[scale], [1]]
     none = torch.tensor([torch.nan, 1.0, torch.inf])
     found = calibration(

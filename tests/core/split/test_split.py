@@ -15,15 +15,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from tests.completion.naive import plain
-from tests.core.networks import (
-    NETWORKS,
-    Counting,
-    Net,
-    UNet,
-    build,
-    conv,
-    image,
-)
+from tests.core.networks import NETWORKS, Counting, Net, UNet, build, conv, image
 
 NO_CUT = {
     "unet": {"encoder.stages", "ups"},
@@ -53,8 +45,10 @@ def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: s
                         assert torch.equal(split.rear(z), whole), layer
             can += 1
         except ModelError as error:
-            if "say which" in str(error):
-                layers += str(error).split(": ")[-1].split(", ")
+            said = str(error)
+            assert "\n" not in said
+            if "say which" in said:
+                layers += said.split(": ")[-1].split(", ")
             else:
                 cannot.add(layer)
     assert cannot == NO_CUT.get(name, set())
@@ -173,19 +167,12 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
         (UNet, ""),
         (UNet, "ups.3"),
         (UNet, "bottleneck["),
-        (UNet, "encoder.stages"),
         (lambda: Net(lambda net, x: net.head(x), head=conv(3, 1), unused=conv(1, 1)), "unused"),
-        (NETWORKS["repeated"], "same"),
         (NETWORKS["repeated"], "same#4"),
         (NETWORKS["nested output"], "cut[wide]"),
-        (NETWORKS["nested output"], "cut"),
-        (NETWORKS["side effects"], "hide"),
-        (NETWORKS["in place"], "flat"),
     ],
 )
-def test_a_layer_that_cannot_be_cut_is_refused_on_one_line_that_names_the_way_out(
-    make: Callable[[], nn.Module], layer: str
-) -> None:
+def test_what_is_no_cut_is_refused_on_one_line(make: Callable[[], nn.Module], layer: str) -> None:
     network = make()
     with pytest.raises(ModelError) as error, torch.no_grad(), Split(network, layer) as split:
         split.rear(split.front(image()))
@@ -269,9 +256,7 @@ def use(split: Split, kind: type[BaseException]) -> None:
 
 @pytest.mark.parametrize("stage", ["front", "first rear", "second rear", "inside", "entering"])
 @pytest.mark.parametrize("kind", [RuntimeError, KeyboardInterrupt])
-def test_the_network_is_as_before_after_an_exception_at_any_stage(
-    stage: str, kind: type[BaseException]
-) -> None:
+def test_the_network_is_as_before_after_exceptions(stage: str, kind: type[BaseException]) -> None:
     network = prepared("updating")
     network.enter = failing(network.enter, 1 if stage == "front" else 0, kind)
     network.head = failing(network.head, {"first rear": 1, "second rear": 2}.get(stage, 0), kind)

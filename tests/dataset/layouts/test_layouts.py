@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from tests.data_sets import (
     SELECTED,
     TREES,
     WIDTH,
+    Maker,
     codes,
     eth3d,
     image,
@@ -37,11 +37,9 @@ from tests.data_sets import (
     tum,
 )
 
-AT_START = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))
-
 
 def at_x(x: float) -> tuple[tuple[float, ...], ...]:
-    return ((1, 0, 0, x), *AT_START[1:])
+    return ((1, 0, 0, x), (0, 1, 0, 0), (0, 0, 1, 0))
 
 
 STATED = {  # codes per metre of sparse depth and ground truth, of one view, of other sizes
@@ -158,9 +156,7 @@ def odometry(root: Path) -> None:
     tree(root, "sequences/00/{image_2/000002.png,velodyne/000002.bin} poses/00.txt")
 
 
-def test_odometry_has_poses_by_frame_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_odometry_has_poses_by_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     odometry(tmp_path)
     rows = [f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in ("0.5", "1", "-1.5e-01")]
     (tmp_path / "poses/00.txt").write_text("".join(rows))
@@ -218,7 +214,7 @@ def inputs_of(files: FrameFiles) -> Frame:
     ],
 )
 def test_a_file_of_a_data_set_that_means_nothing_is_named(
-    make: Callable[[Path], None], file: str, text: str, named: str, tmp_path: Path
+    make: Maker, file: str, text: str, named: str, tmp_path: Path
 ) -> None:
     make(tmp_path)
     (tmp_path / file).write_text(f"{text}\n")
@@ -249,9 +245,7 @@ def test_depth_is_read_in_metres_where_it_is_valid(name: str, tmp_path: Path) ->
         ("colmap/sparse/0", "images/frame_00001.png"),  # as nerfstudio has it
     ],
 )
-def test_a_model_elsewhere_is_sparse_depth_of_its_images(
-    model: str, photo: str, tmp_path: Path
-) -> None:
+def test_a_model_elsewhere_is_depth_of_its_images(model: str, photo: str, tmp_path: Path) -> None:
     for folder in ("images", "images_2"):
         image(tmp_path / photo.replace("images", folder, 1))
     write_text_model(tmp_path / model, names=(photo.removeprefix("images/"),))
@@ -328,9 +322,7 @@ def test_an_unknown_folder_or_layout_is_named(
         ("colmap", "", "images"),
     ],
 )
-def test_what_a_named_layout_lacks_is_named_with_its_place(
-    name: str, place: str, lacks: str, tmp_path: Path
-) -> None:
+def test_what_a_layout_lacks_is_named(name: str, place: str, lacks: str, tmp_path: Path) -> None:
     MAKERS[name][0](tmp_path)
     (found,) = (tmp_path / place).glob(lacks)
     found.rename(found.with_name("elsewhere"))
@@ -341,9 +333,7 @@ def test_what_a_named_layout_lacks_is_named_with_its_place(
 
 
 @pytest.mark.parametrize(("make", "confident"), [(stray_scanner, 0.75), (record3d, 1.0)])
-def test_a_phones_recording_is_a_frame(
-    make: Callable[[Path], None], confident: float, tmp_path: Path
-) -> None:
+def test_a_phones_recording_is_a_frame(make: Maker, confident: float, tmp_path: Path) -> None:
     make(tmp_path)
     frame = inputs_of(read_frames(tmp_path)[2])
     assert len(frame.points) == confident * HEIGHT * WIDTH / 4

@@ -89,9 +89,7 @@ NAMES = {
         ("\n".join(["image,name", *(f"i.png,{name}" for name in NAMES)]), list(NAMES.values())),
     ],
 )
-def test_names_stay_but_for_dots_and_double_slashes(
-    text: str, names: list[str], tmp_path: Path
-) -> None:
+def test_names_stay_but_for_dots_and_slashes(text: str, names: list[str], tmp_path: Path) -> None:
     for file in ("one/x.png", "two/x.png", "y.png", "a\nb.png", "c\u2028d.png"):
         touch(tmp_path / file)
     assert [frame.name for frame in read_frames(manifest(tmp_path, text))] == names
