@@ -23,7 +23,7 @@ NAMES = ("a", "b", "c", "d")
 STEP_M = 0.1
 
 
-class RecordingListener(Listener):
+class Recorder(Listener):
     """Keeps the messages and records of a batch."""
 
     def __init__(
@@ -104,7 +104,7 @@ def refinement(root: Path, **changes: Any) -> RefineRequest:
 
 def batch(
     root: Path,
-    listener: RecordingListener | None = None,
+    listener: Recorder | None = None,
     *,
     refine: dict[str, Any] | None = None,
     **changes: Any,
@@ -112,12 +112,12 @@ def batch(
     """A batch of the folder into its out/."""
     fields: dict[str, Any] = {"source": root, "output": root / "out"}
     request = BatchRequest(refine=refinement(root, **(refine or {})), **fields | changes)
-    return run_batch(request, listener or RecordingListener())
+    return run_batch(request, listener or Recorder())
 
 
-def done(root: Path, listener: RecordingListener | None = None, **changes: Any) -> list[str]:
+def done(root: Path, listener: Recorder | None = None, **changes: Any) -> list[str]:
     """The names of the frames that a batch does."""
-    listener = listener or RecordingListener()
+    listener = listener or Recorder()
     batch(root, listener, **changes)
     return listener.names
 

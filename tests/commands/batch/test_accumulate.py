@@ -20,7 +20,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.scans import read_scan
-from tests.commands.batches import STEP_M, RecordingListener, batch, done, drive_on_disk, results
+from tests.commands.batches import STEP_M, Recorder, batch, done, drive_on_disk, results
 from tests.commands.frames import frame_on_disk
 
 DRIVE = Path(__file__).parents[3] / "samples/drive"
@@ -114,7 +114,7 @@ def test_motion_is_estimated_from_images_and_poses_that_they_contradict_get_a_wa
         shutil.copytree(DRIVE / part, tmp_path / part)
     (tmp_path / "net").mkdir()
     frame_on_disk(tmp_path / "net")
-    poses, listener = tmp_path / "steps.txt", RecordingListener()
+    poses, listener = tmp_path / "steps.txt", Recorder()
     turn = Rotation.from_rotvec([0, turned or 0, 0]).as_matrix()
     step = np.column_stack([turn, [0, 0, 0.3 if turned else 0.6]])
     np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
@@ -131,7 +131,7 @@ def test_motion_is_estimated_from_images_and_poses_that_they_contradict_get_a_wa
 
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=2), RecordingListener()
+    root, listener = drive_on_disk(tmp_path, frames=2), Recorder()
     poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, poses=None)
     shutil.rmtree(root / "calib")

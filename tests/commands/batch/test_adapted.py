@@ -11,7 +11,7 @@ from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames import adapt as adapting
 from tests.commands import batches
-from tests.commands.batches import RecordingListener, drive_on_disk
+from tests.commands.batches import Recorder, drive_on_disk
 
 NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
 
@@ -51,7 +51,7 @@ def test_weights_are_kept_used_for_every_frame_and_found_again_if_they_are_bette
 def test_stopped_without_use_of_points_or_with_a_bad_frame_nothing_is_learnt(drive: Path) -> None:
     network = {"model": "sparse2dense-tiny", "checkpoint": None, "iterations": 0}
     with pytest.raises(KeyboardInterrupt):
-        batches.batch(drive, RecordingListener(lambda: True), adapt=True, refine=network)
+        batches.batch(drive, Recorder(lambda: True), adapt=True, refine=network)
     with pytest.raises(UsageError, match="--adapt needs a network that takes points"):
         batches.batch(drive, adapt=True, refine={"model": "fcrn-tiny", "checkpoint": None})
     (drive / "rgb/drive_000.png").write_bytes(b"")

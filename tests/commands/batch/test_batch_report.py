@@ -13,7 +13,7 @@ from PIL import Image
 
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import OutputError
-from tests.commands.batches import NAMES, RecordingListener, batch, done, pairs_on_disk
+from tests.commands.batches import NAMES, Recorder, batch, done, pairs_on_disk
 from tests.commands.report_pages import everything, frames_of, page_data
 
 
@@ -51,7 +51,7 @@ def test_the_page_links_panels_of_the_records_and_shows_errors(root: Path, repor
 
 def test_a_report_has_what_all_runs_gave_and_draws_what_changed(root: Path, report: Path) -> None:
     answers = iter([False, True, True, True])
-    batch(root, RecordingListener(lambda: next(answers)), html=report)
+    batch(root, Recorder(lambda: next(answers)), html=report)
     assert list(frames_of(report)) == ["a"]
     assert dict(page_data(report)["facts"])["frames"] == "1 done, 3 pending"
     batch(root, html=report, shard=(1, 2))  # a and c

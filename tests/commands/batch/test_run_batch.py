@@ -25,7 +25,7 @@ from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import plain
 from tests.commands.batches import (
     NAMES,
-    RecordingListener,
+    Recorder,
     add_frame,
     batch,
     done,
@@ -62,7 +62,7 @@ def test_a_second_run_does_nothing_and_a_batch_equals_single_refinements(root: P
     os.utime(root / "rgb/a.png", (1, 1))  # that a file was touched or moved does not matter
     os.utime(root / "out/b_depth.png", (1, 1))
     moved = root.rename(root.with_name("moved"))
-    together, listener = results(moved / "out"), RecordingListener()
+    together, listener = results(moved / "out"), Recorder()
     before = {path: path.stat().st_mtime_ns for path in (moved / "out").glob("[a-d]*")}
     assert done(moved, listener, refine=refine) == []
     assert listener.messages[-1] == "4 frames, all of them done already"
@@ -90,7 +90,7 @@ def test_only_what_is_missing_or_changed_is_done_again_as_by_one_run(root: Path)
         (root / changed).unlink(missing_ok=True)
         if source:
             shutil.copy(root / source, root / changed)
-        listener = RecordingListener()
+        listener = Recorder()
         assert done(root, listener) == ["b"]
         assert f"1 to do (1 {why})" in " ".join(listener.messages)
     # Files of a run with other options do not stay beside new ones.
@@ -125,7 +125,7 @@ def test_other_settings_weights_or_code_in_the_same_file_do_all_again(root: Path
 def test_a_bad_frame_is_reported_counted_skipped_and_done_when_it_is_mended(root: Path) -> None:
     good = (root / "rgb/b.png").read_bytes()
     (root / "rgb/b.png").write_bytes(good[:200])
-    listener = RecordingListener()
+    listener = Recorder()
     counts = batch(root, listener).counts
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
     assert "b.png" in (listener.records[1].message or "")
@@ -225,11 +225,11 @@ def test_a_least_confidence_is_for_frames_with_a_mask_and_none_of_their_own(root
 
 def test_a_stopped_batch_goes_on_without_what_a_kill_left(root: Path) -> None:
     stops = iter([False, False, True, True])
-    assert batch(root, RecordingListener(lambda: next(stops))).counts["pending"] == 2
+    assert batch(root, Recorder(lambda: next(stops))).counts["pending"] == 2
     (root / "out" / "deep").mkdir()
     for folder in ("out", "out/deep"):
         (root / folder / ".0123456789ab").write_bytes(b"half")
-    listener = RecordingListener()
+    listener = Recorder()
     assert done(root, listener) == ["c", "d"]
     assert "removed 2 half-written files of a run that was killed" in listener.messages
     assert not list(root.rglob(".0123456789ab"))
@@ -248,7 +248,7 @@ def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root:
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     for number in range(7):
         shutil.copy(root / "rgb/a.png", root / f"rgb/x{number}.png")
-    listener, refine = RecordingListener(), {"holdout": 0.2, "baselines": True}
+    listener, refine = Recorder(), {"holdout": 0.2, "baselines": True}
     batch(root, listener, limit=2, refine=refine)
     result = batch(root, refine=refine)
     content = summary(root)

@@ -22,14 +22,7 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, OutputError, StorageError, UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.atomic import remove_leftovers
-from tests.commands.batches import (
-    RecordingListener,
-    add_frame,
-    batch,
-    done,
-    pairs_on_disk,
-    results,
-)
+from tests.commands.batches import Recorder, add_frame, batch, done, pairs_on_disk, results
 from tests.io.test_atomic import no_room_on_disk
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
@@ -68,7 +61,7 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
         if len(listener.records) == 2:
             cluster.remove_node(lost, allow_graceful=False)
 
-    listener = RecordingListener(on_frame=lose)
+    listener = Recorder(on_frame=lose)
     result = batch(root, listener, ray=cluster.address)
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.5")
     cluster.wait_for_nodes(timeout=120)  # until the lost one counts as dead
@@ -85,7 +78,7 @@ def test_a_frame_that_kills_its_worker_is_named_others_done(cluster: Any, tmp_pa
     add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
     model, start = root / "net" / "my_net.py", "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
-    listener = RecordingListener()
+    listener = Recorder()
     batch(root, listener, ray=cluster.address)
     records = {record.name: record for record in listener.records}
     assert len(records) == len(listener.records) == 7
@@ -102,7 +95,7 @@ def test_a_mistake_of_all_frames_or_the_user_ends_a_batch(cluster: Any, root: Pa
     with pytest.raises(ModelError, match="nowhere"):
         batch(root, ray=cluster.address, refine={"layer": "nowhere"})
     assert not results(root / "out")
-    listener = RecordingListener(lambda: bool(listener.records))
+    listener = Recorder(lambda: bool(listener.records))
     batch(root, listener, ray=cluster.address)
     assert 1 <= len(listener.records) < len(NAMES)
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
@@ -207,7 +200,7 @@ def test_a_disk_that_is_full_stops_it_and_with_room_it_goes_on(tmp_path: Path) -
 
 def test_a_second_run_on_a_folder_is_refused_other_shards_are_not(tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", ("a", "b"))
-    inner = RecordingListener()
+    inner = Recorder()
 
     def run_others() -> None:
         for shard in ((1, 2), None):
@@ -215,7 +208,7 @@ def test_a_second_run_on_a_folder_is_refused_other_shards_are_not(tmp_path: Path
                 batch(root, shard=shard)
         batch(root, inner, shard=(2, 2))
 
-    outer = RecordingListener(on_frame=run_others)
+    outer = Recorder(on_frame=run_others)
     counts = batch(root, outer, shard=(1, 2)).counts
     assert (outer.names, inner.names) == (["a"], ["b"])
     assert counts["done"] == 2
