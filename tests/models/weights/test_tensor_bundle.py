@@ -81,10 +81,7 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_or_refused_if_it_is_cut(tmp_pa
         "half": torch.tensor([[1.5]], dtype=torch.float16),
         "kind": torch.tensor([True, False]),
     }
-    assert tensors.keys() == expected.keys()
-    for name, tensor in expected.items():
-        assert tensors[name].dtype == tensor.dtype
-        assert torch.equal(tensors[name], tensor)
+    torch.testing.assert_close(tensors, expected, rtol=0, atol=0)
     for length in range(len(whole)):
         index.write_bytes(whole[:length])
         refused(index)
