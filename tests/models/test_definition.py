@@ -78,6 +78,5 @@ def test_an_image_of_a_graph_has_three_channels_first_or_last(
 def test_a_field_that_makes_no_sense_is_refused_by_its_name(
     make: Callable[..., object], field: str, value: object
 ) -> None:
-    with pytest.raises(ModelError, match=f" {field}=") as error:
+    with pytest.raises(ModelError, match=rf"\A.* {field}=.*\Z"):
         make(**{field: value})
-    assert "\n" not in str(error.value)

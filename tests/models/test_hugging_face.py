@@ -112,9 +112,8 @@ def test_incomplete_folders_are_refused_with_a_remedy(folder: Path) -> None:
 def test_settings_that_are_no_numbers_are_refused_in_one_line(
     change: dict[str, Any], folder: Path
 ) -> None:
-    with pytest.raises(ModelError, match=r"preprocessor_config\.json: ") as error:
+    with pytest.raises(ModelError, match=r"\A.*preprocessor_config\.json: .*\Z"):
         prepared(folder, change)
-    assert "\n" not in str(error.value)
 
 
 # ------------------------------------------------------------------ with weights

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -194,10 +195,8 @@ HOSTILE: dict[str, tuple[str, bytes | Change, str]] = {
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_what_could_do_more_than_compute_is_refused_in_one_line(archive: Path, kind: str) -> None:
     entry, change, message = HOSTILE[kind]
-    with little(), pytest.raises(ModelError) as error:
+    with little(), pytest.raises(ModelError, match=rf"\A.*{re.escape(message)}.*\Z"):
         find_definition(str(rewritten(archive, {entry: change})))
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -> None:
