@@ -112,7 +112,7 @@ BAD: list[tuple[dict[str, Any], type[PnpDepthError], str]] = [
     ({"layer": "midle"}, ModelError, "did you mean middle"),
     ({"image": None}, PnpDepthError, "takes an rgb image"),
     ({"gt": "small.npy"}, InputError, "ground truth .* is 62×10 but the image is 62×46"),
-    ({"gt": "codes.png"}, InputError, "--depth-scale .* 1000 "),  # 256 is assumed, but 1000 is in use
+    ({"gt": "codes.png"}, InputError, "--depth-scale .* 1000 "),  # 256 is assumed
     ({"sparse": None}, InputError, "has no sparse depth; add it, or sample the ground truth"),
     ({"sparse": "far.csv"}, NoPointsError, "none of its 1 points lies in the image"),
     ({"view_3d": True}, UsageError, r"--html-3d needs the camera, .* give --calib"),
