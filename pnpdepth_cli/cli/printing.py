@@ -13,15 +13,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from pnpdepth_cli.cli.terminal import printable, say
+from pnpdepth_cli.commands import tables
 from pnpdepth_cli.commands.requests import check_outputs
-from pnpdepth_cli.commands.tables import (
-    Table,
-    count_of,
-    mean_weights_text,
-    means_tables,
-    refinement_tables,
-    write_text,
-)
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.stages import GT
@@ -56,11 +49,11 @@ def write_tables(texts: Mapping[Path | None, str]) -> bool:
         if path == _STDOUT:
             click.echo(text.encode("utf-8", "backslashreplace"), nl=False)
         elif path is not None:
-            write_text(path, text)
+            tables.write_text(path, text)
     return _STDOUT in texts
 
 
-def print_table(table: Table, *, err: bool = False) -> None:
+def print_table(table: tables.Table, *, err: bool = False) -> None:
     """Prints a table on stdout or stderr, as wide as needed unless that is a terminal."""
     console = Console(stderr=err, highlight=False)
     if not console.is_terminal:
@@ -89,7 +82,7 @@ def print_refinement(record: FrameRecord) -> None:
     assert record.method is not None
     # Notes and tables of errors.
     print_notes(record.notes)
-    for table in refinement_tables(record):
+    for table in tables.refinement_tables(record):
         print_table(table, err=True)
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
@@ -102,7 +95,7 @@ def print_refinement(record: FrameRecord) -> None:
     if record.method.kind != "default":
         settings = record.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
-        parts.insert(0, f"{count_of(len(record.loss) - 1, 'update')} ({how})")
+        parts.insert(0, f"{tables.count_of(len(record.loss) - 1, 'update')} ({how})")
     say(" · ".join(parts))
     say(f"wrote {'  '.join(record.outputs.values())}")
 
@@ -110,11 +103,11 @@ def print_refinement(record: FrameRecord) -> None:
 def print_batch(summary: BatchSummary) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
     counts = summary.counts
-    for table in means_tables(summary.errors, summary.unit, summary.titles, summary.columns):
+    for table in tables.means_tables(summary.errors, summary.unit, summary.titles, summary.columns):
         print_table(table, err=True)
     print_notes(summary.notes)
     # Counts of frames.
-    parts = [f"{counts['done']:,} of {count_of(counts['frames'], 'frame')} done"]
+    parts = [f"{counts['done']:,} of {tables.count_of(counts['frames'], 'frame')} done"]
     for kind in ("diverged", "failed", "pending", "with_warnings"):
         if counts[kind]:
             parts.append(f"{counts[kind]:,} {kind.replace('_', ' ')}")
@@ -126,10 +119,10 @@ def print_batch(summary: BatchSummary) -> None:
     for note, names in summary.frame_notes.items():
         first = ", ".join([*names[:_NAMED], *["…"] * (len(names) > _NAMED)])
         kind = "warning" if note.startswith("warning") else "note"
-        count = count_of(len(names), "frame")
+        count = tables.count_of(len(names), "frame")
         say(f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}")
     if summary.weights:
-        say(f"mean weights in the result: {mean_weights_text(summary.weights)}")
+        say(f"mean weights in the result: {tables.mean_weights_text(summary.weights)}")
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")
 
 

@@ -16,23 +16,8 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.outliers import far_points, outliers
 from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.frames import fuse
 from pnpdepth_cli.frames.frame import Frame, Prediction, Refined, Validation, is_dense, make_refined
-from pnpdepth_cli.frames.fuse import (
-    FEW_POINTS,
-    FOLDS,
-    LEAST_PART,
-    Expert,
-    ValidatedFrame,
-    add_blind_expert,
-    fit_weights,
-    fusing_network,
-    predict,
-    predictions,
-    scanner_shares,
-    split_frame,
-    weighted_mean,
-    with_mirrored,
-)
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
@@ -55,24 +40,24 @@ def refine_default(networks: Sequence[OpenNetwork], frame: Frame, *, seed: int =
     judge = next((each for each in networks if each.weighs_points), networks[0])
     inliers, judged = without_outliers(judge, frame)
     # A fifth of the inliers are validation points, which every expert predicts from the others.
-    split = split_frame(inliers, judged.before, seed)
-    experts = predictions(networks, split, {judge: judged})
+    split = fuse.split_frame(inliers, judged.before, seed)
+    experts = fuse.predictions(networks, split, {judge: judged})
     # Where the image does not help, an expert that does not see it joins.
-    experts, warnings = add_blind_expert(networks, split, experts)
+    experts, warnings = fuse.add_blind_expert(networks, split, experts)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
-    weights = fit_weights(experts, split)
-    experts = with_mirrored(networks, experts, weights)
-    fused = weighted_mean([(e.dense(split), w) for e in experts if (w := weights[e.name]) > 0])
+    weights = fuse.fit_weights(experts, split)
+    experts = fuse.with_mirrored(networks, experts, weights)
+    fused = fuse.weighted_mean([(e.dense(split), w) for e in experts if (w := weights[e.name]) > 0])
     # Points far from the depth of a network that weighs them are outliers, too.
     if judge.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.before, inliers.points))
     # The residual at the inliers is propagated to every pixel.
     depth = _propagate(fused, inliers, split)
     # On scan lines, a completion network of that scanner has most of the result.
-    shares = scanner_shares(experts, split, weights)
+    shares = fuse.scanner_shares(experts, split, weights)
     depth = _with_shares(depth, {e.name: e.dense(split) for e in experts if e.of_scanner}, shares)
     weights = {name: (1 - sum(shares.values())) * w for name, w in weights.items()} | shares
-    fusing, own = fusing_network(networks), experts[0].whole
+    fusing, own = fuse.fusing_network(networks), experts[0].whole
     alone = next((e for e in experts[1:] if fusing is not None and e.name == fusing.name), None)
     assert own is not None
     return make_refined(
@@ -101,17 +86,17 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> tuple[Frame, Predictio
     # A network that weighs its points is given the outliers too, once they are known.
     again = bool(suspected.any()) and judge.weighs_points
     consistent = replace(frame, points=points.select(~suspected))
-    judged = predict(judge, consistent, updates=not again)
+    judged = fuse.predict(judge, consistent, updates=not again)
     outlying = outliers(judged.before, points, frame.rgb)
-    if len(points) >= FEW_POINTS:
+    if len(points) >= fuse.FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     if again or not torch.equal(outlying, suspected):
-        judged = predict(judge, inliers)
+        judged = fuse.predict(judge, inliers)
     return inliers, judged
 
 
-def _propagate(depth: Tensor, frame: Frame, split: ValidatedFrame) -> Tensor:
+def _propagate(depth: Tensor, frame: Frame, split: fuse.ValidatedFrame) -> Tensor:
     """Depth (H, W) with its residual at the points propagated."""
     return propagate(depth, frame.points, frame.rgb, kind=split.propagation)
 
@@ -119,11 +104,11 @@ def _propagate(depth: Tensor, frame: Frame, split: ValidatedFrame) -> Tensor:
 def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, float]) -> Tensor:
     """Depth (…) with the own depths of completion networks, whose shares are by name."""
     rest = (depth, 1 - sum(shares.values()))
-    return weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
+    return fuse.weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
 
 
 def _stages(
-    own: Expert, alone: Expert | None, frame: Frame, split: ValidatedFrame
+    own: fuse.Expert, alone: fuse.Expert | None, frame: Frame, split: fuse.ValidatedFrame
 ) -> dict[str, Tensor]:
     """The user's network after each step of its own, and the network that takes a prior alone."""
     assert own.whole is not None
@@ -136,9 +121,9 @@ def _stages(
 
 
 def _validation(
-    experts: Sequence[Expert],
-    alone: Expert | None,
-    split: ValidatedFrame,
+    experts: Sequence[fuse.Expert],
+    alone: fuse.Expert | None,
+    split: fuse.ValidatedFrame,
     shares: Mapping[str, float],
 ) -> Validation | None:
     """The stages and the result at the validation points; None without any.
@@ -148,10 +133,10 @@ def _validation(
     own, points = experts[0], split.points
     if not len(points):
         return None
-    part, result = torch.arange(len(points)) % FOLDS, torch.empty(len(points))
-    for fold in range(FOLDS):
-        weights = fit_weights(experts, split, part != fold)
-        fused = weighted_mean([(each.at, weights[each.name]) for each in experts])
+    part, result = torch.arange(len(points)) % fuse.FOLDS, torch.empty(len(points))
+    for fold in range(fuse.FOLDS):
+        weights = fuse.fit_weights(experts, split, part != fold)
+        fused = fuse.weighted_mean([(each.at, weights[each.name]) for each in experts])
         result[part == fold] = fused[part == fold]
     given = split.kept.points
     if split.kept.outliers is not None:
@@ -179,9 +164,9 @@ def _validation(
 def _notes(
     frame: Frame,
     inliers: Frame,
-    split: ValidatedFrame,
-    experts: Sequence[Expert],
-    alone: Expert | None,
+    split: fuse.ValidatedFrame,
+    experts: Sequence[fuse.Expert],
+    alone: fuse.Expert | None,
     weights: Mapping[str, float],
 ) -> tuple[str, ...]:
     """Which points were left out, and which of the user's networks have no part in the result."""
@@ -193,7 +178,7 @@ def _notes(
         )
     for own in experts:
         of_user = sum(weights[each.name] for each in experts if each.user is own.user)
-        if own.user is None or own.name != own.user.name or of_user >= LEAST_PART:
+        if own.user is None or own.name != own.user.name or of_user >= fuse.LEAST_PART:
             continue
         why = "its depth does not help to predict the points from each other"
         if len(split.points) and alone is not None:

@@ -22,13 +22,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.errors import InputError, ModelError
-from pnpdepth_cli.models.definition import (
-    UNTUNED_DEFAULTS,
-    Fixed,
-    ModelDefinition,
-    Near,
-    Normalisation,
-)
+from pnpdepth_cli.models import definition
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
 
 _MOST_JSON_BYTES = 1 << 24
@@ -59,10 +53,10 @@ class _Processing(msgspec.Struct, frozen=True):
     image_mean: tuple[_Number, _Number, _Number] | None = None
     image_std: tuple[_Positive, _Positive, _Positive] | None = None
 
-    def size_policy(self, of: int) -> Fixed | Near | None:
+    def size_policy(self, of: int) -> definition.Fixed | definition.Near | None:
         """How images are resized, to multiples of a number at least; None if it is not said."""
         if not self.do_resize or self.size_divisor is not None:
-            return Near(of=max(of, _pixels(self.size_divisor)))
+            return definition.Near(of=max(of, _pixels(self.size_divisor)))
         sides = self.size if isinstance(self.size, dict) else {"shortest_edge": self.size}
         height, width = (
             sides.get(side) or sides.get("shortest_edge") for side in ("height", "width")
@@ -70,18 +64,18 @@ class _Processing(msgspec.Struct, frozen=True):
         if height is None or width is None:
             return None
         if not self.keep_aspect_ratio:
-            return Fixed(height, width)
+            return definition.Fixed(height, width)
         multiple = max(of, _pixels(self.ensure_multiple_of))
-        return Near(of=multiple, height=height, width=width)
+        return definition.Near(of=multiple, height=height, width=width)
 
-    def normalisation(self) -> Normalisation:
+    def normalisation(self) -> definition.Normalisation:
         """The same of an image in 0…1."""
         # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
         unit = self.rescale_factor * 255 if self.do_rescale else 255.0
         asked = self.image_mean is not None if self.do_normalize is None else self.do_normalize
         m0, m1, m2 = (self.image_mean or (0.5, 0.5, 0.5)) if asked else (0.0, 0.0, 0.0)
         s0, s1, s2 = (self.image_std or (0.5, 0.5, 0.5)) if asked else (1.0, 1.0, 1.0)
-        return Normalisation(
+        return definition.Normalisation(
             mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
         )
 
@@ -103,7 +97,7 @@ _FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
 """What the networks of a model type predict, and what sides of images are multiples of."""
 
 
-def hf_definition(folder: Path) -> ModelDefinition:
+def hf_definition(folder: Path) -> definition.ModelDefinition:
     """Returns the definition of a depth network in a Hugging Face folder.
 
     Args:
@@ -135,7 +129,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         way_out = "have transformers load the network and write it by save_pretrained"
         raise ModelError(f"{folder} has no {weights.name}; {way_out}")
     # The definition, whose network is built when it is needed.
-    return ModelDefinition(
+    return definition.ModelDefinition(
         name=folder.resolve().name,
         summary=f"Hugging Face {kind}",
         input_kind="rgb",
@@ -147,7 +141,7 @@ def hf_definition(folder: Path) -> ModelDefinition:
         complete=True,
         checkpoint=weights,
         output=lambda output: output.predicted_depth,
-        defaults=UNTUNED_DEFAULTS,
+        defaults=definition.UNTUNED_DEFAULTS,
     )
 
 

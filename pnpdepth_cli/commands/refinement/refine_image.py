@@ -24,15 +24,7 @@ from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineReque
 from pnpdepth_cli.commands.tables import names_of_depths
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.dataset.frame_record import (
-    BatchState,
-    CameraRecord,
-    FrameRecord,
-    MethodRecord,
-    ModelRecord,
-    PointsRecord,
-    Scores,
-)
+from pnpdepth_cli.dataset import frame_record
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
@@ -45,10 +37,10 @@ from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
-Stages = dict[str, Scores]
+Stages = dict[str, frame_record.Scores]
 
 
-def refine_image(request: RefineRequest) -> FrameRecord:
+def refine_image(request: RefineRequest) -> frame_record.FrameRecord:
     """Refines one frame, writes its depth and companions, and returns its record.
 
     Args:
@@ -113,9 +105,9 @@ def write_refined(
     frame: Refined,
     seconds: dict[str, float],
     *,
-    batch: BatchState | None = None,
+    batch: frame_record.BatchState | None = None,
     folder: Path | None = None,
-) -> FrameRecord:
+) -> frame_record.FrameRecord:
     """Scores the refined frame and writes it in place of an earlier result, its record last.
 
     The record is the same from run to run, except `seconds` and `peak_memory_mb`.
@@ -155,7 +147,7 @@ def write_refined(
 
 def _record_of(
     request: RefineRequest, method: Method, frame: Frame, refined: Refined
-) -> FrameRecord:
+) -> frame_record.FrameRecord:
     """The record of a refined frame, without its outputs and times."""
     # What the frame is called, and what the networks say.
     network, files = method.own.network, request.files
@@ -164,7 +156,7 @@ def _record_of(
     of_networks = [note for member in method.members for note in member.network.notes]
     own_used = len(frame.own) - len(refined.held_out)
     # Status, files, method, settings, points and errors, in the order of the record.
-    return FrameRecord(
+    return frame_record.FrameRecord(
         name=files.name or (first.stem if first else ""),
         group=files.group,
         status="diverged" if refined.diverged else "done",
@@ -173,14 +165,14 @@ def _record_of(
         unit=frame.unit,
         inputs=dict(frame.sources),
         neighbours=list(frame.neighbours),
-        camera=CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
-        model=ModelRecord(
+        camera=frame_record.CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
+        model=frame_record.ModelRecord(
             name=network.definition.name,
             spec=request.model,
             checkpoint=str(weights) if weights else None,
             checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
         ),
-        method=MethodRecord(
+        method=frame_record.MethodRecord(
             kind="default" if method.is_default else "fixed",
             reason=method.asked.fixed_by or "default",
             networks=[member.network.definition.name for member in method.members],
@@ -200,7 +192,7 @@ def _record_of(
         registration=asdict(refined.registration) if refined.registration else None,
         alignment=asdict(refined.alignment) if refined.alignment else None,
         size=(frame.size[1], frame.size[0]),
-        points=PointsRecord(
+        points=frame_record.PointsRecord(
             used=len(refined.used),
             held_out=len(refined.held_out),
             nearest=float(frame.own.depth.min()),
