@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pnpdepth_cli.camera import Camera
+    from pnpdepth_cli.points import SparsePoints
+
+    Points = SparsePoints[NDArray[np.float32]]
 
 KITTI_DEVKIT = "kitti-devkit"
 
@@ -51,13 +54,11 @@ class FramePart:
         small = image[1::2, 1::2] if self.halved else _block_means(image, self.blocks)
         return small[top : top + height, left : left + width]
 
-    def in_crop(self, xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
-        """Returns pixel coordinates (N, 2) in that part, from those in the whole image."""
-        import numpy as np
-
-        top, left, _, _ = self._window(size)
-        moved = (np.asarray(xy, np.float64) + 0.5) / self.factor - 0.5
-        return np.asarray(moved - np.array([left, top]), np.float32)
+    def points_in_crop(self, points: Points) -> Points:
+        """Returns the points in that part, from those of the whole image."""
+        xy = (points.xy.astype("f8") + 0.5) / self.factor - 0.5
+        small = replace(points, xy=xy.astype("f4"))
+        return small.cropped(*self._window(points.size))
 
     def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
         """Returns the camera of that part, from that of the whole image of (H, W)."""

@@ -110,7 +110,10 @@ def test_blocks_of_pixels_are_averaged_over_those_with_depth() -> None:
     assert part.apply(depth).tolist() == [[3, 0]]
     image = np.stack([depth] * 3, axis=2)
     assert part.apply(image)[0, :, 0].tolist() == [9 / 4, 0]
-    assert part.in_crop(np.array([[0.5, 0.5], [2, 0]]), (3, 5)).tolist() == [[0, 0], [0.75, -0.25]]
+    xy = np.array([[0.5, 0.5], [2, 0], [4, 0]], np.float32)
+    inside = part.points_in_crop(SparsePoints(xy=xy, depth=xy[:, 0], size=(3, 5)))
+    assert inside.xy.tolist() == [[0, 0], [0.75, -0.25]]
+    assert inside.size == (1, 2)
 
 
 def test_the_points_of_ibims_are_those_that_marigold_dc_draws(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from pnpdepth_cli.io.colmap_model import (
 from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
-from pnpdepth_cli.points import METRES, MODEL_UNITS, SparsePoints
+from pnpdepth_cli.points import METRES, MODEL_UNITS
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
@@ -37,14 +37,10 @@ from pnpdepth_cli.sensors.projection import (
     pixel_index,
 )
 
+# A 16-bit file in model units holds depths up to at least so many times the model's extent.
 _SIZES_IN_RANGE = 8.0
-"""A 16-bit file in model units holds depths up to at least so many times the model's extent."""
-
-_LEAST_TRACK = 3
-"""Points that fewer images observe are dropped: two rays meet anywhere along one of them."""
-
-_MOST_REPROJECTION_PX = 2.0
-"""Points with a larger mean reprojection error are dropped; COLMAP itself keeps up to 4 pixels."""
+_LEAST_TRACK = 3  # images that observe a point: two rays meet anywhere along one of them
+_MOST_REPROJECTION_PX = 2.0  # mean error of a point; COLMAP itself keeps up to 4 pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,16 +87,9 @@ class SparseDepth:
 
     def in_part(self, part: FramePart) -> SparseDepth:
         """Returns the points in a part of the frame. Raises NoPointsError if there is none."""
-        whole = self.points
-        # an array of the image's size that takes no memory, to find the size of the part
-        size = part.apply(np.broadcast_to(np.False_, whole.size)).shape
-        if size == whole.size:
-            return self
-        xy = part.in_crop(whole.xy, whole.size)
-        moved = SparsePoints(xy=xy, depth=whole.depth, size=(size[0], size[1]))
-        points = moved.cropped(0, 0, *moved.size)
+        points = part.points_in_crop(self.points)
         if not len(points):
-            fact = f"none of its {len(whole)} points lies in the image"
+            fact = f"none of its {len(self.points)} points lies in the image"
             raise NoPointsError(f"{self.record.path}: {fact}")
         return replace(self, points=points)
 

@@ -17,6 +17,7 @@ from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
@@ -202,9 +203,10 @@ def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
     record = run(frame, part=part, scan=ScanOptions(calib=calib))
     camera, _ = record.camera.read()
     whole, _ = camera_of_file(calib, None, (60, 80))
-    xy = np.array([[33.0, 41.0], [50.0, 47.0]])
+    xy = np.array([[33, 41], [50, 47]], np.float32)
     rays = unproject(whole, xy, np.ones(2))
-    assert pixels_of(camera, rays) == pytest.approx(part.in_crop(xy, (60, 80)), abs=1e-4)
+    points = part.points_in_crop(SparsePoints(xy=xy, depth=xy[:, 0], size=(60, 80)))
+    assert pixels_of(camera, rays) == pytest.approx(points.xy, abs=1e-4)
 
 
 def test_a_batch_records_the_cameras_of_its_frames(tmp_path: Path) -> None:

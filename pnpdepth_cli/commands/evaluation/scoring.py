@@ -216,12 +216,11 @@ def _given_points(frame: FrameFiles, record: FrameRecord, gt: Depth) -> Mask:
         xy = sample_points(gt, drawn, drawn.seed, image=image).xy
     elif frame.sparse is not None:
         points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
+        if (own := points.size) != size:
+            points = frame.part.points_in_crop(points)
+            if points.size != size:
+                raise unequal_sizes(f"sparse depth {frame.sparse}", own, "the ground truth", size)
         xy = points.xy
-        if points.size != size:
-            xy = frame.part.in_crop(xy, points.size)
-            if frame.part.apply(np.zeros(points.size, bool)).shape != size:
-                what = f"sparse depth {frame.sparse}"
-                raise unequal_sizes(what, points.size, "the ground truth", size)
     else:
         raise InputError(
             f"frame {frame.name} has no sparse depth file to exclude: neither the record beside the"
