@@ -25,8 +25,7 @@ _RADIAL = (0, 1, 4, 5, 6, 7)
 _SAMPLES = 8192
 _NEWTON_STEPS = 12
 _NEWTON_STEP = 1e-7
-_NEWTON_END = 1e-9
-"""Steps below this leave an error that is smaller than rounding."""
+_NEWTON_END = 1e-9  # a smaller step leaves an error that is smaller than rounding
 
 
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
@@ -111,7 +110,6 @@ def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
     return plane
 
 
-@functools.lru_cache(maxsize=64)
 def largest_radius(lens: str, coefficients: Coefficients) -> float:
     """Returns the tangent of the angle to the axis up to which the distortion is monotonic."""
     radius, seen = _radial_curve(lens, coefficients)
@@ -130,6 +128,7 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
     return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
 
 
+@functools.lru_cache(maxsize=64)
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
     """Radius before and after the lens, without its tangential parts."""
     if lens == "fisheye":
