@@ -29,10 +29,10 @@ from pnpdepth_cli.io.rgb import (
     read_video_frame,
     sizes_of,
 )
+from pnpdepth_cli.sensors.projection import Points, as_depth_image
 
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
-_ASPECT_TOLERANCE = 0.02
-"""Relative difference of aspect ratios of images of one view."""
+_ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios of images of one view
 
 
 def record_of(source: ImageSource, reading: Reading | None = None) -> FileRecord:
@@ -127,11 +127,9 @@ def move_depth(
     """
     check_same_view(str(path), depth.shape[:2], size)
     rows, columns = np.nonzero(depth)
-    row = ((rows + 0.5) * size[0] / depth.shape[0]).astype(np.intp)
-    column = ((columns + 0.5) * size[1] / depth.shape[1]).astype(np.intp)
-    moved = np.full(size, np.inf, np.float32)
-    np.minimum.at(moved, (row, column), depth[rows, columns])
-    return np.where(np.isinf(moved), np.float32(0), moved)
+    xy = np.column_stack([columns, rows]).astype(np.float32)
+    points = Points(xy=xy, depth=depth[rows, columns], size=(depth.shape[0], depth.shape[1]))
+    return as_depth_image(points.resized(*size))
 
 
 def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
