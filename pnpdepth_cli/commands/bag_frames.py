@@ -48,17 +48,10 @@ RECORD = "frames.json"
 _NOT_IN_RECORD = ("output", "overwrite")
 _FOLDERS = ("rgb", "sparse")
 _COMPARED_FRAMES = 5
-_LONGEST_GAP_S = 0.5
-"""Longest time between two poses that one is interpolated from."""
-
-_DELAYS = 20
-"""Number of messages of each topic whose delay is measured, from the first."""
-
-_SLOWEST_S = 1.0
-"""A larger difference of delays is that of two clocks."""
-
-_SAME_K = 0.05
-"""Relative difference of intrinsics of one camera, which a driver may have calibrated twice."""
+_LONGEST_GAP_S = 0.5  # longest time between two poses that one is interpolated from
+_DELAYS = 20  # messages of each topic, from the first, whose delay is measured
+_SLOWEST_S = 1.0  # a larger difference of delays is that of two clocks
+_SAME_K = 0.05  # relative difference of intrinsics of one camera that was calibrated twice
 
 Say = Callable[[str], None]
 

@@ -20,8 +20,7 @@ from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
 from pnpdepth_cli.sensors import point_cloud
 
-_IN_MEMORY = 12
-"""Depth maps of neighbouring views that are kept, with their points."""
+_IN_MEMORY = 12  # depth maps of neighbouring views that are kept, with their points
 
 
 def write_depth_cloud(

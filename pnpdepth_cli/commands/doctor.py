@@ -14,8 +14,7 @@ import torch
 
 import pnpdepth_cli
 
-_DEVELOPERS = ("test", "docs", "train")
-"""Extras that no command needs."""
+_DEVELOPERS = ("test", "docs", "train")  # extras that no command needs
 
 
 def examine() -> dict[str, list[str]]:

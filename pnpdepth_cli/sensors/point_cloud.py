@@ -23,15 +23,9 @@ _EDGE = 0.05
 down to a grazing angle of about 5 degrees."""
 
 _NEIGHBOURS = 8
-_WIDEST_DEG = 60.0
-"""Widest angle between the axes of two cameras that see the same surfaces."""
-
-_RETURN_PX = 2.0
-_RETURN_DEPTH = 0.03
-"""Largest differences of a pixel and of its depth, as a fraction, that agree."""
-
-_PART_PIXELS = 1 << 20
-"""Pixels whose points and normals are in memory at once."""
+_WIDEST_DEG = 60.0  # widest angle between the axes of two cameras that see the same surfaces
+_RETURN_PX, _RETURN_DEPTH = 2.0, 0.03  # differences of a pixel and, as a fraction, of its depth
+_PART_PIXELS = 1 << 20  # whose points and normals are in memory at once
 
 
 class PointCloud(NamedTuple):

@@ -43,8 +43,7 @@ from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory, rotation_of
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
 _ODOMETRY, _METADATA = "odometry.csv", "metadata.json"
-_LONGEST_POSE_GAP_S = 0.1
-"""Longest gap between poses that are interpolated; motion capture takes them at 100 Hz."""
+_LONGEST_POSE_GAP_S = 0.1  # between poses; motion capture takes them at 100 Hz
 
 Timed = tuple[float, Path]
 

@@ -25,8 +25,7 @@ from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
-_RAW = ("", "raw/", "kitti_raw/")
-"""Folders of the raw data's dates."""
+_RAW = ("", "raw/", "kitti_raw/")  # folders of the raw data's dates
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
 _OF_MAPS = FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True)
