@@ -20,6 +20,7 @@ from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
+from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import Reading
@@ -132,6 +133,8 @@ def read_scan_points(
 def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path]:
     """The calibration, with a pose of the scanner, and its path."""
     named = options.calib
+    if named is None and path in model_files(path.parent):
+        raise UsageError(f"{path} is of a COLMAP model; name its folder, {path.parent}")
     if named is None:
         raise UsageError(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"

@@ -114,9 +114,9 @@ def depth_from_stored(
     assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
     divisor = scale or own or assumed
     source += f" ÷ {divisor:.12g}"
-    if own is not None and divisor == own:
+    if scale is None and own is not None:
         source += " (from the file)"
-    elif own is not None:
+    elif own not in (None, divisor):
         source += f" (not {own:.12g}, as the file says)"
     saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
     if saturated.any():

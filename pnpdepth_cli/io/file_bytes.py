@@ -289,18 +289,23 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     Raises:
         InputError: A line is not made of as many numbers as the first.
     """
-    numbered = [(number, _WORD.findall(text)) for number, text in numbered_lines(data)]
-    header = [word.strip('"').lower() for word in numbered[0][1]] if numbered else []
+    numbered = list(numbered_lines(data))
+    header = [w.strip('"').lower() for w in _WORD.findall(numbered[0][1])] if numbered else []
     header = header if header[:3] in _HEADERS else []
     rows = list[list[float]]()
-    for number, words in numbered[bool(header) :]:
+    for number, text in numbered[bool(header) :]:
+        words = _WORD.findall(text)
         count = len(rows[0]) if rows else max(3, len(words))
+        if ";" in text and "," in text:
+            fact = f"{text[:80]!r} has decimal commas; write points"
+            raise InputError(f"{path}, line {number}: {fact}")
         try:
             numbers = list(map(float, words))
         except ValueError:
             numbers = []
         if len(numbers) != count:
             fact = f"{' '.join(words)[:80]!r} is not {count} numbers"
+            fact += "" if rows or header else ", nor the header x y depth or x y z"
             raise InputError(f"{path}, line {number}: {fact}")
         rows.append(numbers)
     return np.array(rows or np.empty((0, 3)), np.float64), header

@@ -19,6 +19,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
+from tests.colmap_models import write_binary_model
 from tests.commands.frames import CALIBRATION, HEIGHT, WIDTH, scan_on_disk
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
@@ -105,6 +106,9 @@ def test_extrinsics_complete_a_calibration_in_one_direction(tmp_path: Path) -> N
     scene.calib.write_text(CALIBRATION.splitlines()[0])
     np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, shift]))
     np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ shift]))
+    write_binary_model(tmp_path / "model")
+    with pytest.raises(UsageError, match=f"name its folder, {tmp_path / 'model'}"):
+        read_scan_points(tmp_path / "model/points3D.bin", ScanOptions(), (HEIGHT, WIDTH))
     alone = ScanOptions(calib=scene.calib)
     with pytest.raises(UsageError, match="--extrinsics"):
         read_scan_points(scene.scan, alone, (HEIGHT, WIDTH))

@@ -138,6 +138,9 @@ def test_odd_metadata_and_databases_that_compute_are_refused(hostile: str, tmp_p
             read_all(file)
     with pytest.raises(InputError):
         read_all(bag)
+    (bag / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match=f"{bag} has no metadata"):
+        read_all(bag)
 
 
 def test_an_image_has_the_camera_info_beside_it_or_the_only_one() -> None:

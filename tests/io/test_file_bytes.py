@@ -45,7 +45,12 @@ def test_what_is_no_json_object_is_refused(tmp_path: Path, content: bytes) -> No
 
 @pytest.mark.parametrize(
     ("text", "line"),
-    [("x,y,depth\n1,2,3\n1,b,3\n", 3), ("# c\n\n1 2 3\n1 2 3 4\n", 4), ("1 2\n1 2 3\n", 1)],
+    [
+        ("x,y,depth\n1,2,3\n1,b,3\n", 3),
+        ("# c\n\n1 2 3\n1 2 3 4\n", 4),
+        ("1 2\n1 2 3\n", 1),
+        ("x;y;depth\n1,5;2,5;3,0", 2),
+    ],
 )
 def test_a_row_that_is_not_of_as_many_numbers_is_named_by_its_line(text: str, line: int) -> None:
     with pytest.raises(InputError, match=rf"points\.csv, line {line}\b"):

@@ -54,11 +54,14 @@ def test_exif_rotation_is_honoured(tmp_path: Path, kind: str, orientation: int) 
     assert np.allclose(values, UPRIGHT * 50, atol=1.5)
 
 
-@pytest.mark.parametrize("kind", [b"avif", b"heic", b"", b"hello, world", b"\x93NUMPY\x01\x00"])
+@pytest.mark.parametrize(
+    "kind", [b"avif", b"heic", b"isom", b"", b"hello, world", b"\x93NUMPY\x01\x00"]
+)
 def test_what_is_no_image_is_refused(tmp_path: Path, kind: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"\0\0\0\x18ftyp" + kind + b"\0\0\0\0" if len(kind) == 4 else kind)
-    with pytest.raises(InputError, match=str(path)):
+    said = f"{path} is a video" if kind == b"isom" else str(path)
+    with pytest.raises(InputError, match=said):
         read_rgb(path)
 
 

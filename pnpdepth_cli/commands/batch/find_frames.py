@@ -95,10 +95,10 @@ def find_frames(request: BatchRequest) -> BatchFrames:
             f" layouts are {', '.join(LAYOUTS)}"
         )
     if request.reading.sample is None and all(frame.sparse is None for frame in frames):
-        raise UsageError(
-            f"{source} looks like {layout!r}, which has no sparse depth; --sample 500"
-            " draws so many points from the ground truth"
-        )
+        way_out = "--sample 500 draws so many points from the ground truth"
+        if all(frame.gt is None for frame in frames):
+            way_out = "nor has it ground truth to draw points from; add one of them"
+        raise UsageError(f"{source} looks like {layout!r}, which has no sparse depth; {way_out}")
     masked = any(frame.sparse_mask is not None for frame in frames)
     if request.refine.files.min_confidence is not None and not masked:
         raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")

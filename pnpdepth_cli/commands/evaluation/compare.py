@@ -262,7 +262,7 @@ def _read_run(text: str) -> Run:
         scored = [frame for frame in records if frame.status != "failed" and GT in frame.errors]
         scores = [frame.errors[GT][stage] for frame in scored]
         if not scores:
-            raise ValueError("no frame has scores")
+            raise InputError(f"{path}: no frame has scores; refine or evaluate with ground truth")
         measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,

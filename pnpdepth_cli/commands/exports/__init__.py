@@ -173,7 +173,7 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
     if image is None:
         raise InputError(f"{result.depth} lacks its image; run this in the folder of `refine`")
     if export.needs_pose and pose is None:
-        raise InputError(f"{result.depth} lacks a pose in its record; refine with --poses")
+        raise InputError(f"{result.depth} lacks a pose in its record; `batch` with --poses")
     # The scale and the name of the record must be usable.
     (width, height), sparse = record.size or (0, 0), record.inputs.get("sparse")
     scale = (sparse and sparse.unit_scale) or 1.0

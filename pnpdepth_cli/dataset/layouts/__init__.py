@@ -180,6 +180,10 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
         layouts = {p: next((n for n in names if LAYOUTS[n].matches(p)), None) for p in folders}
         if found := {path: name for path, name in layouts.items() if name is not None}:
             return found
+    if root.is_file():
+        raise InputError(
+            f"{root} is one file; give a folder, a CSV list of frames or a bag, or refine one image"
+        )
     if len(names) == 1 and (lacked := LAYOUTS[names[0]].lacks(root)):
         raise InputError("{} has no {}, which {} needs; add it".format(*lacked, names[0]))
     raise InputError(

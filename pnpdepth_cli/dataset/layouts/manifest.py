@@ -49,9 +49,10 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
+            but = "" if first[frame.name.casefold()].name == frame.name else ", but for capitals"
             raise InputError(
-                f"{root}, line {number}: a second frame {one_line(frame.name)!r}, but for capitals;"
-                " give it a name of its own"
+                f"{root}, line {number}: a second frame {one_line(frame.name)!r}{but}; give it a"
+                " name of its own"
             )
     return [*broken, *named]
 
@@ -64,6 +65,11 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise InputError(f"{path} is not a text file; give CSV") from error
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
+        header = [name.strip() for name in reader.fieldnames or ()]
+        for name in filter(None, header):
+            if name not in _COLUMNS or header.count(name) > 1:
+                why = "comes twice" if name in _COLUMNS else f"is not one of {', '.join(_COLUMNS)}"
+                raise InputError(f"{path}, line {reader.line_num}: column {name!r} {why}")
         for row in reader:
             texts = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None}
             yield reader.line_num, {k: v for k, v in texts.items() if v}
@@ -73,8 +79,8 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
     """The frame of a line; ValueError and our errors say what is wrong with it."""
-    if unknown := sorted(row.keys() - {*_COLUMNS}):
-        raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(_COLUMNS)}")
+    if not row.keys() <= {*_COLUMNS}:
+        raise ValueError("has more cells than the header")
     if "image" not in row and "sparse" not in row:
         raise ValueError("has neither image nor sparse; give one")
     if (flag := row.get("gt_size_ok", "no")).lower() not in _FLAGS:

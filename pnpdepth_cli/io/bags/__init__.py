@@ -185,6 +185,9 @@ def _check_bag(path: Path) -> None:
     files = [path]
     if path.is_dir():
         files, metadata = sorted(path.glob("*.db3")), path / "metadata.yaml"
+        if not metadata.is_file():
+            fact = "has no metadata.yaml, so it is no ROS 2 bag"
+            raise InputError(f"{path} {fact}; give the bag's own folder or file")
         match parse_yaml(metadata, read_bytes(metadata).decode("utf-8", "replace")):
             case {"rosbag2_bagfile_information": dict(information)}:
                 if str(information.get("compression_mode", "")).lower() not in ("", "none"):

@@ -299,6 +299,7 @@ def test_the_parent_of_data_sets_of_one_layout_has_their_frames(tmp_path: Path) 
         (".", None, InputError, "kitti-object"),
         (".", "kitti-object", InputError, "kitti-object"),
         (".", "kitti-objects", UsageError, "kitti-object"),
+        ("image_2/0.png", None, InputError, "is one file"),
         ("phone.r3d", None, InputError, r"LZFSE.*'EXR \+ RGB'"),
     ],
 )

@@ -47,11 +47,12 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("image,depth\ni.png,s.png\n", "'depth' is not one of"),
+        ("image,depth\ni.png,s.png\n", "line 1: column 'depth' is not one of"),
+        ("image,gt,gt\ni.png,s.png,s.png\n", "line 1: column 'gt'"),
         ("image,camera\ni.png,left\n", "line 2"),
-        ("image\ni.png\ni.png\n", "line 3: a second frame 'i'"),
+        ("image\ni.png\ni.png\n", "line 3: a second frame 'i'; "),
         ("image,gt\n,i.png\n", "neither image nor sparse"),
-        ("image\ni.png,more\n", "more than the header has"),
+        ("image\ni.png,more\n", "line 2"),
         ("image,gt_size_ok\ni.png,maybe\n", "gt_size_ok is 'maybe', not true or false"),
         ("image\n" + "x" * 200_000 + "\n", "field larger than field limit"),
         ("image\ni\0.png\n", "no file can have this name"),
