@@ -177,8 +177,6 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 
 # Files and sensors
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
-PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
-"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.simulation`."""
 
 SENSORS = (
     *("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e"),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import UsageError
+
+PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
+"""Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.simulation`."""
 
 
 def what_applies(entries: Iterable[tuple[str, object]]) -> dict[str, object]:
@@ -19,11 +21,13 @@ class SamplePattern:
     """Which of the pixels with known depth are sampled."""
 
     kind: str = "uniform"
-    """One of `choices.PATTERNS`."""
+    """One of `PATTERNS`."""
     count: int | None = None
     """Number of points, or of lines for `lines`; None with a fraction."""
     fraction: float | None = None
     """Fraction of the known pixels, 0 to 1; None with a count."""
+    seed: int | None = None
+    """Random seed. None in what is asked for: that of the method."""
 
     def __post_init__(self) -> None:
         count, fraction = self.count, self.fraction
@@ -42,13 +46,6 @@ class SamplePattern:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampling(SamplePattern):
-    """How points were sampled from ground truth."""
-
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
 class FileRecord:
     """A file of a frame, and how it was read. What does not apply is None or empty."""
 
@@ -63,7 +60,7 @@ class FileRecord:
     """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of points that were dropped, by the reason."""
-    sampled: Sampling | None = None
+    sampled: SamplePattern | None = None
     """How points were sampled from the file, which is of ground truth."""
     mask: str | None = None
     """Path of the mask, or confidence, that was applied."""

@@ -122,7 +122,8 @@ def sample_depth(
     if pattern.kind == "features" and len(points) < wanted:
         notes.append(f"warning: the image has {len(points):,} of the {wanted:,} points asked for")
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{pattern.kind}, seed {seed}'))}")
-    settings = {"command": "sample", "pattern": asdict(pattern), "seed": seed}
+    drawn = {"kind": pattern.kind, "count": pattern.count, "fraction": pattern.fraction}
+    settings = {"command": "sample", "pattern": drawn, "seed": seed}
     return _write(files, points, settings, inputs, notes)
 
 

@@ -197,8 +197,6 @@ class ReadOptions:
     """Which points of the ground truth are the sparse depth. None: the frame's own sparse depth."""
     foreground: ForegroundFilter | None = None
     """Which points of a depth map are removed. None: the program's own choice."""
-    sample_seed: int | None = None
-    """Random seed of `sample`. None: that of the method."""
 
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
-from pnpdepth_cli.file_record import FileRecord, Sampling
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
@@ -181,7 +181,7 @@ def _sample_sparse(
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
-    seed = seed if options.sample_seed is None else options.sample_seed
+    seed = seed if options.sample.seed is None else options.sample.seed
     gt, image = files.part.apply(truth.values), None if rgb is None else files.part.apply(rgb)
     try:
         points = sample_points(gt, options.sample, seed, image=image)
@@ -189,11 +189,10 @@ def _sample_sparse(
         raise InputError(f"{files.gt}: {error}") from error
     how = f"{options.sample.kind} of the ground truth, seed {seed}"
     reading = Reading(how, truth.reading.scale)
-    sampling = Sampling(**asdict(options.sample), seed=seed)
     return sparse_depth.SparseDepth(
         points=points,
         reading=reading,
-        record=FileRecord(path=str(files.gt), sampled=sampling),
+        record=FileRecord(path=str(files.gt), sampled=replace(options.sample, seed=seed)),
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 

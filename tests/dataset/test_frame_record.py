@@ -19,7 +19,7 @@ from pnpdepth_cli.dataset.frame_record import (
     PointsRecord,
 )
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.file_record import FigureRecord, FileRecord, Sampling
+from pnpdepth_cli.file_record import FigureRecord, FileRecord, SamplePattern
 from pnpdepth_cli.io.file_bytes import Fingerprint
 
 CAMERA = Camera(
@@ -45,7 +45,7 @@ RECORD = FrameRecord(
             scale=256.0,
             assumed=True,
             dropped={"too far": 3},
-            sampled=Sampling(kind="uniform", count=30, seed=7),
+            sampled=SamplePattern(kind="uniform", count=30, seed=7),
         ),
     },
     neighbours=[FileRecord(path="b.png", poses="poses.txt", motion=POSE.tolist())],

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.choices import PATTERNS
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
-from pnpdepth_cli.file_record import SamplePattern
+from pnpdepth_cli.file_record import PATTERNS, SamplePattern
 from pnpdepth_cli.sensors.projection import Points
 from pnpdepth_cli.sensors.simulation import LIDARS, lidar_of, sample_points, simulate_lidar
 

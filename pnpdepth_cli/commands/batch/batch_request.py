@@ -172,6 +172,6 @@ class BatchRequest:
         protocol = find_protocol(self.protocol)
         reading = replace(reading, foreground=protocol.foreground)
         if reading.sample is None and protocol.sample is not None:
-            sample = parse_sample(protocol.sample)
-            reading = replace(reading, sample=sample, sample_seed=protocol.seed)
+            sample = replace(parse_sample(protocol.sample), seed=protocol.seed)
+            reading = replace(reading, sample=sample)
         return reading

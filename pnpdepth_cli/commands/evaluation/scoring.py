@@ -213,7 +213,7 @@ def _given_points(frame: FrameFiles, record: FrameRecord, gt: Depth) -> Mask:
         image = None
         if drawn.kind == "features" and frame.image is not None:
             image = frame.part.apply(read_image(frame.image))
-        xy = sample_points(gt, drawn, drawn.seed, image=image).xy
+        xy = sample_points(gt, drawn, drawn.seed or 0, image=image).xy
     elif frame.sparse is not None:
         points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
         if (own := points.size) != size:

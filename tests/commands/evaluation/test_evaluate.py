@@ -19,7 +19,7 @@ from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, mean
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.file_record import FileRecord, SamplePattern, Sampling
+from pnpdepth_cli.file_record import FileRecord, SamplePattern
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.projection import as_depth_image
@@ -245,7 +245,7 @@ def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Pa
     points = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
     frame(tmp_path, np.where(points > 0, gt, gt + 1), gt)
     path, record = str(depth_file(tmp_path / "points.npy", points)), tmp_path / "out" / "a.json"
-    drawn = FileRecord(path=path, sampled=Sampling(kind="uniform", count=30, seed=7))
+    drawn = FileRecord(path=path, sampled=SamplePattern(kind="uniform", count=30, seed=7))
     for source, size, given in (
         (FileRecord(path=path), None, 30),
         (FileRecord(path=path, calibration="calib.txt"), None, None),  # a scan
