@@ -22,7 +22,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # two workers and what they start have a thread each, unless OMP_NUM_THREADS asks for more
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
 
-_SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SLOW_FIXTURES = {"chrome", "shared_data"}
 """A test that uses one of them belongs to the second tier."""
 
@@ -44,7 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture
 def shared_data() -> Path:
     """The folder with real frames and weights, named by PNPDEPTH_TEST_DATA; skips without it."""
-    folder = Path(os.environ.get("PNPDEPTH_TEST_DATA", _SHARED_DATA))
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("PNPDEPTH_TEST_DATA", beside))
     if not folder.is_dir():
         pytest.skip(f"needs real frames in {folder}; name their folder in PNPDEPTH_TEST_DATA")
     return folder

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 import json
 import re
@@ -46,9 +45,8 @@ NOT_ON_THE_PAGE = {"BatchState", "FigureRecord"}
 def description(text: str | None) -> Iterator[str]:
     """The first sentence of a docstring, without the options' defaults."""
     first = " ".join((text or "").split("\n\n")[0].split()).split(" [default")[0]
-    first = re.split(r"(?<=\.) (?=[A-Z])", first)[0]
-    if first:
-        yield from textwrap.indent(textwrap.fill(f'"""{first}"""', WIDTH - 4), "    ").splitlines()
+    if first := re.split(r"(?<=\.) (?=[A-Z])", first)[0]:
+        yield from ("    " + line for line in textwrap.wrap(f'"""{first}"""', WIDTH - 4))
 
 
 def call_lines(head: str, node: ast.FunctionDef, returns: str) -> Iterator[str]:
@@ -110,13 +108,11 @@ def class_lines(node: ast.ClassDef, *, of_record: bool = False) -> Iterator[str]
 def signatures() -> str:
     """All public names but the errors, as Markdown."""
     text = ""
-    for value in (getattr(pnpdepth_cli, name) for name in pnpdepth_cli.__all__[1:]):
-        source = inspect.getsource(importlib.import_module(value.__module__))
-        for node in ast.parse(source).body:
-            if getattr(node, "name", "") != value.__name__ or "Error" in value.__name__:
-                continue
+    for name in pnpdepth_cli.__all__[1:]:
+        if "Error" not in name:
+            (node,) = ast.parse(inspect.getsource(getattr(pnpdepth_cli, name))).body
             lines = class_lines if isinstance(node, ast.ClassDef) else function_lines
-            text += f"### {value.__name__}\n\n```python\n" + "\n".join(lines(node)) + "\n```\n\n"
+            text += f"### {name}\n\n```python\n" + "\n".join(lines(node)) + "\n```\n\n"
     return text
 
 

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -71,15 +72,6 @@ def run(arguments: list[str], folder: Path, *path: str) -> str:
     return done.stdout
 
 
-def expanded(arguments: list[str], folder: Path) -> list[str]:
-    """The arguments, those with a * as the shell hands them over."""
-    found = list[str]()
-    for each in arguments:
-        paths = sorted(folder.glob(each.rstrip("/"))) if "*" in each else []
-        found += [path.relative_to(folder).as_posix() for path in paths] or [each]
-    return found
-
-
 WITH_COMMANDS = [page for page in PAGES if shown_commands(page) and page != RECONSTRUCTION]
 
 
@@ -92,8 +84,10 @@ def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
         if arguments[0] == "python":
             run(arguments[1:], folder)
             continue
+        # those with a * as the shell hands them over
+        paths = [map(str, sorted(folder.glob(a))) if "*" in a else [a] for a in arguments]
         overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []
-        run(["-m", "pnpdepth_cli", *expanded(arguments, folder), *overwrite], folder)
+        run(["-m", "pnpdepth_cli", *chain(*paths), *overwrite], folder)
 
 
 @pytest.mark.slow

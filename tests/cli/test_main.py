@@ -150,11 +150,6 @@ def onnx(path: Path) -> None:
     write_network(path)
 
 
-def read_bag(path: Path) -> None:
-    with open_bag(path):
-        pass
-
-
 def depth(path: Path) -> None:
     write_depth(path, np.ones((4, 5), np.float32))
 
@@ -167,7 +162,7 @@ def depth(path: Path) -> None:
         ("d.exr", "OpenEXR.File", depth, read_depth),
         ("d.npy", "numpy.lib.format.read_magic", depth, read_depth),
         ("d.npz", "zipfile.ZipFile", depth, read_depth),
-        ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, read_bag),
+        ("d.mcap", "rosbags.rosbag2.Reader.open", write_bag, lambda p: open_bag(p).__enter__()),
         ("n.onnx", "onnx.load", onnx, lambda path: load_network(str(path), None)),
         ("w.pt", "zipfile.ZipFile", partial(torch.save, {"w": torch.ones(2)}), read_checkpoint),
     ],

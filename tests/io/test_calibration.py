@@ -99,29 +99,28 @@ PROJECTIONS = {
 }
 
 
-def kitti_files(folder: Path, kind: str) -> Path:
-    """The calibration of this data set; the folder, or the only file."""
-    plain = {f"P{n}:": projection for n, projection in PROJECTIONS.items()}
-    sized = {f"P_rect_0{n}:": projection for n, projection in PROJECTIONS.items()}
-    sized |= {"R_rect_00:": RECTIFY, "S_rect_00:": [1408, 376], "S_rect_02:": [1408, 376]}
-    back = np.linalg.inv(np.vstack([TO_CAMERA, [0, 0, 0, 1]]))[:3]
-    files: dict[str, dict[str, Any]] = {
-        "object": {"calib.txt": {**plain, "R0_rect:": RECTIFY, "Tr_velo_to_cam:": TO_CAMERA}},
-        "tracking": {"calib.txt": {**plain, "R_rect": RECTIFY, "Tr_velo_cam": TO_CAMERA}},
-        "odometry": {"calib.txt": {**plain, "Tr:": RECTIFY @ TO_CAMERA}},  # already rectified
-        "raw": {"calib_cam_to_cam.txt": sized, "calib_velo_to_cam.txt": {"R:": TURN, "T:": SHIFT}},
-        "360": {"perspective.txt": sized, "calib_cam_to_velo.txt": {"": back}},
-    }[kind]
-    for file, values in files.items():
-        lines = ["calib_time: 03-Apr-2018 18:47:03"] * (values is sized)
-        lines += [" ".join([name, *map(str, np.ravel(v).tolist())]) for name, v in values.items()]
-        (folder / file).write_text("\n".join(lines) + "\n")
-    return folder / file if len(files) == 1 else folder
+P_PLAIN = {f"P{n}:": projection for n, projection in PROJECTIONS.items()}
+SIZED = {f"P_rect_0{n}:": projection for n, projection in PROJECTIONS.items()}
+SIZED |= {"R_rect_00:": RECTIFY, "S_rect_00:": [1408, 376], "S_rect_02:": [1408, 376]}
+BACK = np.linalg.inv(np.vstack([TO_CAMERA, [0, 0, 0, 1]]))[:3]
+KITTIS: dict[str, dict[str, dict[str, Any]]] = {
+    "object": {"calib.txt": {**P_PLAIN, "R0_rect:": RECTIFY, "Tr_velo_to_cam:": TO_CAMERA}},
+    "tracking": {"calib.txt": {**P_PLAIN, "R_rect": RECTIFY, "Tr_velo_cam": TO_CAMERA}},
+    "odometry": {"calib.txt": {**P_PLAIN, "Tr:": RECTIFY @ TO_CAMERA}},  # already rectified
+    "raw": {"calib_cam_to_cam.txt": SIZED, "calib_velo_to_cam.txt": {"R:": TURN, "T:": SHIFT}},
+    "360": {"perspective.txt": SIZED, "calib_cam_to_velo.txt": {"": BACK}},
+}
+"""The values of the files of a data set."""
 
 
-@pytest.mark.parametrize("kind", ["object", "tracking", "odometry", "raw", "360"])
+@pytest.mark.parametrize("kind", KITTIS)
 def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Path) -> None:
-    path, point = kitti_files(tmp_path, kind), np.array([12.0, -3.0, 0.5])
+    for file, values in KITTIS[kind].items():
+        lines = ["calib_time: 03-Apr-2018 18:47:03"] * (values is SIZED)
+        lines += [" ".join([name, *map(str, np.ravel(v).tolist())]) for name, v in values.items()]
+        (tmp_path / file).write_text("\n".join(lines) + "\n")
+    path = tmp_path / file if len(KITTIS[kind]) == 1 else tmp_path
+    point = np.array([12.0, -3.0, 0.5])
     for number, projection in PROJECTIONS.items():
         u, v, w = projection @ [*(RECTIFY @ TO_CAMERA @ [*point, 1]), 1]
         got = read_calibration(path, number)

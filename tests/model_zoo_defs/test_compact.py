@@ -13,6 +13,7 @@ from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.models.network import load_network
 
 definition = definitions["compact"]
+HEIGHT, WIDTH = 96, 128
 
 
 @pytest.fixture(scope="module")
@@ -28,30 +29,14 @@ def network() -> Compact:
     return net
 
 
-def frame(height: int, width: int, count: int) -> tuple[Tensor, Tensor]:
+def frame(count: int) -> tuple[Tensor, Tensor]:
+    """An image, and so many points."""
     generator = torch.Generator().manual_seed(0)
-    rgb = torch.randn(1, 3, height, width, generator=generator)
-    sparse = torch.zeros(height * width)
-    at = torch.randperm(height * width, generator=generator)[:count]
+    rgb = torch.randn(1, 3, HEIGHT, WIDTH, generator=generator)
+    sparse = torch.zeros(HEIGHT * WIDTH)
+    at = torch.randperm(HEIGHT * WIDTH, generator=generator)[:count]
     sparse[at] = 1.0 + 4.0 * torch.rand(len(at), generator=generator)
-    return rgb, sparse.view(1, 1, height, width)
-
-
-@pytest.mark.parametrize("points", [0, 1, 5, 500, 20_000, "row", "one depth"])
-def test_depth_is_positive_and_repeatable_wherever_the_points_lie(
-    network: Compact, points: int | str
-) -> None:
-    rgb, sparse = frame(128, 160, points if isinstance(points, int) else 0)
-    if points == "row":
-        sparse[..., 40, :] = torch.linspace(1, 5, 160)
-    elif points == "one depth":
-        sparse[..., ::7, ::7] = 2.0
-    with torch.no_grad():
-        depth = network(rgb, sparse)
-        assert torch.equal(network(rgb, sparse), depth)
-    assert depth.shape == (1, 1, 128, 160)
-    assert bool(torch.isfinite(depth).all())
-    assert bool((depth > 0).all())
+    return rgb, sparse.view(1, 1, HEIGHT, WIDTH)
 
 
 def prior_of(sparse: Tensor) -> Tensor:
@@ -64,7 +49,7 @@ def prior_of(sparse: Tensor) -> Tensor:
 def test_depth_scales_with_its_inputs_and_a_prior_that_is_unknown_everywhere_changes_nothing(
     network: Compact,
 ) -> None:
-    rgb, sparse = frame(96, 128, 300)
+    rgb, sparse = frame(300)
     prior, unknown = prior_of(sparse), torch.zeros_like(sparse)
     with torch.no_grad():
         pairs = (
@@ -78,20 +63,23 @@ def test_depth_scales_with_its_inputs_and_a_prior_that_is_unknown_everywhere_cha
 
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("layer", definition.layers)
-def test_rear_of_front_is_the_network_bit_for_bit_and_errors_reach_every_layer(
+def test_wherever_points_lie_rear_of_front_is_the_network_and_errors_reach_every_layer(
     network: Compact, layer: str, with_prior: bool
 ) -> None:
     assert definition.static_graph
+    row, same = torch.zeros(2, 1, 1, HEIGHT, WIDTH)
+    row[..., 40, :], same[..., ::7, ::7] = torch.linspace(1, 5, WIDTH), 2.0
+    rgb, some = frame(200)
     with Split(network, layer, static_graph=True) as split:
-        # from no point at all to nearly every cell seen
-        for count in (60, 0, 1, 3000, 200):
-            rgb, sparse = frame(96, 128, count)
+        for sparse in (*(frame(count)[1] for count in (60, 0, 1, 20_000)), row, same, some):
             inputs = [rgb, sparse, *([prior_of(sparse)] if with_prior else [])]
             z = split.front(*inputs).requires_grad_(True)
             depth = split.rear(z)
             with torch.no_grad():
                 assert torch.equal(depth, network(*inputs))
-        gradient = gradient_at(z, (depth - sparse)[sparse > 0].abs().mean())
+            assert depth.shape == sparse.shape
+            assert bool((torch.isfinite(depth) & (depth > 0)).all())
+        gradient = gradient_at(z, (depth - some)[some > 0].abs().mean())
     assert gradient is not None
     assert float((gradient != 0).float().mean()) > 0.3
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import nn
 
+from pnpdepth_cli.api import load_network
 from pnpdepth_cli.core.refine import refine
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition
+from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
-from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.settings import ClosedSettings
 
@@ -26,34 +25,26 @@ CUTS = {
 }
 
 
-def built(definition: ModelDefinition) -> Network:
-    """The network with random weights and random statistics of its normalisations."""
-    torch.manual_seed(0)
-    module = definition.build().eval().requires_grad_(False)
-    for layer in module.modules():
-        if isinstance(layer, nn.BatchNorm2d):
-            assert layer.running_mean is not None
-            assert layer.running_var is not None
-            layer.running_mean.normal_(std=0.1)
-            layer.running_var.uniform_(0.5, 1.5)
-    return Network(
-        definition=definition, module=module, device=torch.device("cpu"), checkpoint=None
-    )
-
-
 @pytest.mark.parametrize("name", CUTS)
 def test_every_layer_can_be_cut_at_and_z_is_where_the_paper_has_it(name: str) -> None:
-    network = built(find_definition(name))
-    size = network.definition.size
+    torch.manual_seed(0)
+    definition = find_definition(name)
+    network = load_network(definition.build(), definition=definition)
+    for kind, statistic in network.module.named_buffers():
+        if kind.endswith("running_mean"):
+            statistic.normal_(std=0.1)
+        elif kind.endswith("running_var"):
+            statistic.uniform_(0.5, 1.5)
+    size = definition.size
     height, width = 64, 96
     if isinstance(size, Fixed) and name != "fcrn-tiny":
         height, width = size.height, size.width
     arguments = network.synthetic_arguments(FrameMap.fit(Fixed(height, width), height, width))
     _, points, _ = synthetic_frame((height, width))
-    assert network.definition.default_layer == CUTS[name][0]
+    assert definition.default_layer == CUTS[name][0]
     aligned = "auto" if name == "sfmlearner-tiny" else "none"
-    assert network.definition.default_alignment == aligned
-    for layer in network.definition.layers:
+    assert definition.default_alignment == aligned
+    for layer in definition.layers:
         with torch.no_grad(), Split(network.module, layer) as split:
             z = split.front(*arguments)
             assert torch.equal(split.rear(z), network.module(*arguments))

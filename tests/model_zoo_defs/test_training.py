@@ -62,12 +62,10 @@ def test_a_run_of_compact_learns_and_going_on_gives_the_same_bytes(
     assert train.train(replace(broken, resume=True)).read_bytes() == weights
 
 
-def toy() -> nn.Module:
-    """Depth in metres from an image, by one layer."""
-    return nn.Sequential(nn.BatchNorm2d(3), nn.Conv2d(3, 1, 3, padding=1))
-
-
-TOY = ModelDefinition(name="toy-tiny", input_kind="rgb", size=Multiple(1), build=toy)
+TOY = ModelDefinition(
+    name="toy-tiny", input_kind="rgb", size=Multiple(1),
+    build=lambda: nn.Sequential(nn.BatchNorm2d(3), nn.Conv2d(3, 1, 3, padding=1)),
+)  # fmt: skip
 RECIPE = recipes.Recipe(
     loss=recipes.log_error, batch=2, lr=0.3, half_precision=False, flat={"1": 0.5},
     stages=(
