@@ -128,9 +128,7 @@ def test_a_benchmark_is_importable(file: Path) -> None:
     importlib.import_module(f"benchmarks.{file.stem}")
 
 
-def test_few_functions_lie_between_the_command_and_equation_3(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_functions_wrap_equation_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stacks, backward = [], torch.Tensor.backward
 
     def watched(tensor: torch.Tensor) -> None:

@@ -36,9 +36,7 @@ def test_our_own_errors_ends_and_exhausted_memory_pass_through(error: BaseExcept
     assert raised.value is error
 
 
-def test_the_line_of_a_file_is_named_however_the_file_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_line_of_an_error_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "raises.py"
     file.write_text("def f():\n    return 1 / 0\n\n\nf()\n")
     with pytest.raises(ZeroDivisionError) as error:

@@ -55,9 +55,7 @@ def test_the_public_names_are_these() -> None:
         _ = pnp.nothing
 
 
-def test_arrays_are_refined_as_the_command_refines_files(
-    network: pnp.Network, frame: Frame, tmp_path: Path
-) -> None:
+def test_arrays_are_refined_like_files(network: pnp.Network, frame: Frame, tmp_path: Path) -> None:
     refined = pnp.refine(network, *frame)
     for shown in (refined, refined.used, refined.validation):
         assert re.fullmatch(r"\w+\([\w×,. ]+\)", repr(shown))
@@ -70,9 +68,7 @@ def test_arrays_are_refined_as_the_command_refines_files(
     assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
 
 
-def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
-    network: pnp.Network, frame: Frame
-) -> None:
+def test_a_refiner_takes_maps_rows_and_points_alike(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     y, x = np.nonzero(sparse)
     rows = np.stack([x, y, sparse[y, x]], axis=1)
@@ -86,9 +82,7 @@ def test_a_refiner_stays_open_and_takes_maps_rows_and_points_alike(
     assert not any("forward" in module.__dict__ for module in network.module.modules())
 
 
-def test_threads_share_a_refiner_but_two_refiners_no_network(
-    network: pnp.Network, frame: Frame
-) -> None:
+def test_threads_share_one_refiner_but_two_no_network(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     fewer = np.where(np.arange(sparse.shape[1]) % 2, sparse, 0)
     with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
@@ -104,9 +98,7 @@ def test_threads_share_a_refiner_but_two_refiners_no_network(
     )
 
 
-def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(
-    network: pnp.Network, frame: Frame
-) -> None:
+def test_integers_are_scaled_by_their_type_or_unit(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     settings = pnp.Settings(iterations=0, align="scale")
     image, codes = np.round(rgb * 255).astype(np.uint8), np.round(sparse * 1000).astype(np.uint16)
@@ -124,9 +116,7 @@ def test_integers_are_scaled_images_by_their_type_and_depth_by_its_unit(
     # the last one is too far for metres in the median
     [np.full((4, 4), 3, np.uint16), np.array([[1, 2, 3], [0, 1, 2]]), np.full((4, 4), 3471.0)],
 )
-def test_depth_that_may_be_in_another_unit_needs_one(
-    depth: NDArray[Any], network: pnp.Network
-) -> None:
+def test_depth_of_a_doubtful_unit_needs_one(depth: NDArray[Any], network: pnp.Network) -> None:
     with pytest.raises(pnp.InputError, match="the sparse depth"):
         pnp.refine(network, BLACK, depth)
     with pytest.raises(pnp.UsageError, match="unit must be one of m, mm, got 'cm'"):

@@ -110,9 +110,7 @@ def test_the_links_of_a_page_lead_somewhere(page: Path) -> None:
         assert target.startswith("http") or (page.parent / target).exists(), target
 
 
-def test_the_notebook_runs_and_its_result_is_better_than_the_network(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_notebook_runs_and_betters_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib").use("agg")
     monkeypatch.chdir(ROOT / "samples")
     names: dict[str, Any] = {}

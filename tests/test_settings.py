@@ -58,9 +58,7 @@ def test_any_setting_of_the_method_fixes_it() -> None:
         *(("method", "foo"), ("schedule", "foo"), ("align", ["auto"]), ("layer", 3), ("seed", -1)),
     ],
 )
-def test_a_value_that_refinement_could_not_use_is_refused_by_its_name(
-    field: str, value: Any
-) -> None:
+def test_a_value_that_refinement_cannot_use_is_refused_by_name(field: str, value: Any) -> None:
     with pytest.raises(UsageError, match=f"^{field} must be .*, got "):
         Settings(**{field: value})
 

@@ -36,9 +36,7 @@ COMMANDS = {str(each.name): each for each in commands_of(cli)}
 
 
 @pytest.mark.parametrize("name", ["refine", "batch", "eval"])
-def test_every_option_has_one_group_of_the_longer_help_and_those_that_matter_are_common(
-    name: str,
-) -> None:
+def test_every_option_has_one_group_of_the_longer_help_and_few_are_common(name: str) -> None:
     # The help is printed before anything is checked.
     arguments = [name, "missing.png", "--help-all"]
     result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")

@@ -122,9 +122,7 @@ def test_every_combination_is_the_batch_with_these_options(root: Path) -> None:
     assert Path("out/lr=1%,iterations=2/a_depth.png").read_bytes() != depth
 
 
-def test_the_default_method_the_number_of_points_networks_and_switches_can_be_varied(
-    root: Path,
-) -> None:
+def test_method_number_of_points_networks_and_switches_can_be_varied(root: Path) -> None:
     batch = ["batch", "drive", "-o", "out", "--limit", "1"]
     assert run([*batch, *NETWORK, "--vary", "method=fused,paper", "--vary", "sample=20,10%"]) == 0
     fixed = {name: each["fixed_by"] for name, each in summaries().items()}

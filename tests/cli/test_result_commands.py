@@ -35,9 +35,7 @@ def frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_json_is_the_whole_result_with_every_option(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_holds_what_all_options_give(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = "--protocol garg --max-depth 10 --scale-by median --delta 1.06 --json"
     assert code_of(f"eval out gt {options}") == 0
     record = json.loads(capsys.readouterr().out)

@@ -58,9 +58,7 @@ def test_refine_writes_its_files_and_lowers_the_error(
     assert mae == pytest.approx([before, after], rel=0.02)
 
 
-def test_depth_that_no_points_support_is_said_and_written_as_zero_if_asked(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_unsupported_depth_is_said_and_zero_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
     scan = f"{STREET}/rgb.png --sparse {STREET}/000000.bin --calib {STREET}/calib.txt"
     scan += " --iterations 1"
     line = f"refine {scan} --gt {STREET}/gt.png --uncertainty"
@@ -84,9 +82,7 @@ def test_depth_that_no_points_support_is_said_and_written_as_zero_if_asked(
     assert plain["points"]["used"] == pytest.approx(16007, abs=5)
 
 
-def test_a_batch_is_done_once_and_its_results_are_scored_and_compared(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_batch_is_done_once_then_scored_and_compared(capsys: pytest.CaptureFixture[str]) -> None:
     line = f"batch {SAMPLES}/frames.csv -o out --model fcrn-tiny --method paper"
     output(capsys, line)
     frames = json.loads(Path("out/summary.json").read_text())["frames"]

@@ -70,9 +70,7 @@ def solved(network: Adnn, sparse: Array, iterations: int) -> Array:
 
 @pytest.mark.parametrize("iterations", [0, 1, 10])
 @pytest.mark.parametrize("size", [(16, 24), (17, 11)])
-def test_depth_is_that_of_the_same_iterations_with_dense_matrices(
-    size: tuple[int, int], iterations: int
-) -> None:
+def test_depth_is_that_of_dense_matrices(size: tuple[int, int], iterations: int) -> None:
     torch.manual_seed(0)
     network = Adnn(filters=(3, 4, 5), iterations=iterations).double()
     for bias in network.biases:

@@ -46,7 +46,7 @@ def prior_of(sparse: Tensor) -> Tensor:
     return prior
 
 
-def test_depth_scales_with_its_inputs_and_a_prior_that_is_unknown_everywhere_changes_nothing(
+def test_depth_scales_with_its_inputs_and_an_unknown_prior_changes_nothing(
     network: Compact,
 ) -> None:
     rgb, sparse = frame(300)

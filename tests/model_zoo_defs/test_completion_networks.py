@@ -20,9 +20,7 @@ from pnpdepth_cli.models.network import load_network
 
 
 @pytest.mark.parametrize(("network", "fraction"), [(NConv, 0.3), (Pncnn, 1.0)])
-def test_a_constant_depth_stays_in_the_whole_network(
-    network: type[nn.Module], fraction: float
-) -> None:
+def test_a_constant_depth_stays_in_a_network(network: type[nn.Module], fraction: float) -> None:
     known = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0)) < fraction
     with torch.no_grad():
         depth = network().eval()(7.0 * known)

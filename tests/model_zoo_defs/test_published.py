@@ -99,9 +99,7 @@ def test_a_network_has_the_published_names_and_shapes(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "height", "width"), COMPUTED)
-def test_a_network_computes_what_its_published_tensors_say(
-    name: str, height: int, width: int
-) -> None:
+def test_a_network_computes_what_published_tensors_say(name: str, height: int, width: int) -> None:
     network = NARROW[name]().eval()
     state = by_formula(network.state_dict())
     if name == "sparseconv":  # whose sums are means only with weights above 0

@@ -42,9 +42,7 @@ def learned(folder: Path) -> bool:
     return bool(log["loss"][1] < log["loss"][0])
 
 
-def test_a_run_of_compact_learns_and_going_on_gives_the_same_bytes(
-    shards: Path, tmp_path: Path
-) -> None:
+def test_compact_learns_and_going_on_gives_the_same_bytes(shards: Path, tmp_path: Path) -> None:
     whole = train.Settings(
         data=(shards,), val=shards, val_frames=1, out=tmp_path / "whole", steps=8, batch=2,
         size=(32, 64), save_every=4, pretrained=False, workers=0, lr=1e-2,
