@@ -24,8 +24,6 @@ from pnpdepth_cli.io.rgb import read_rgb
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "indoor"
 Frame = tuple[NDArray[np.float32], NDArray[np.float32]]
-
-
 PART = slice(0, 128), slice(0, 160)
 BLACK = np.zeros((4, 4, 3))
 

@@ -25,7 +25,6 @@ from tests.bags import write_bag
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 GT = SAMPLES / "indoor" / "gt.png"
-POSIX = pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
 NETWORK = "--model drive/net/my_net.py --checkpoint drive/net/my_net.safetensors"
 COMMANDS = {
     "refine": f"drive/rgb/a.png --sparse drive/sparse/a.png -o out {NETWORK}",
@@ -78,17 +77,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     assert not any(Path(name).exists() for name in outputs)
 
 
-def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """The finished line of bash, in which `pnpdepth` is this tree's."""
-    script = f'pnpdepth() {{ {sys.executable} -m pnpdepth_cli "$@"; }}\nset -o pipefail\n{line}\n'
-    environment = os.environ | {"PYTHONPATH": str(SAMPLES.parent)}
-    return subprocess.run(
-        ["bash", "-c", script], cwd=folder, env=environment,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-
-
-@POSIX
+@pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
 @pytest.mark.parametrize(
     ("line", "code", "errors"),
     [
@@ -104,22 +93,28 @@ def test_what_a_shell_does_to_the_command_is_no_error_or_one_line(
     line: str, code: int, errors: int, tmp_path: Path
 ) -> None:
     depth(tmp_path / "a.npy")
-    done = shell(line, tmp_path)
+    script = f'pnpdepth() {{ {sys.executable} -m pnpdepth_cli "$@"; }}\nset -o pipefail\n{line}\n'
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(SAMPLES.parent)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert (done.returncode, done.stderr.count("\n")) == (code, errors), done.stderr
 
 
-@POSIX
-def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(tmp_path: Path) -> None:
-    for folder in ("pred", "gt"):
-        (tmp_path / folder).mkdir()
-        for name in "ab":
-            write_depth(tmp_path / folder / f"{name}.exr", np.full((40, 30), 2.0, np.float32))
-    cut = tmp_path / "pred/b.exr"
+def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folders = tmp_path / "pred", tmp_path / "gt"
+    for folder in folders:
+        folder.mkdir()
+        for name in ("a.exr", "b.exr"):
+            write_depth(folder / name, np.full((40, 30), 2.0, np.float32))
+    cut = folders[0] / "b.exr"
     cut.write_bytes(cut.read_bytes()[:-8])
-    done = shell("pnpdepth eval pred gt --json", tmp_path)
-    assert done.returncode == 7, done.stderr
-    assert json.loads(done.stdout)["counts"]["scored"] == 1
-    assert "Warning: Exception raised" not in done.stderr  # OpenEXR's own
+    assert run(["eval", *map(str, folders), "--json"]) == 7
+    out, err = capfd.readouterr()
+    assert json.loads(out)["counts"]["scored"] == 1
+    assert "Warning: Exception raised" not in err  # OpenEXR's own
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,6 @@ from tests.bags import write_bag
 pytest.importorskip("rosbags")
 
 BOMB = 64 << 20
-
-
 PIXELS = {name: name.rstrip("8") for name in ("rgb8", "bgr8", "rgba8", "bgra8")}
 PIXELS |= {"8UC3": "bgr", "mono8": "g", "8UC1": "g"}
 PIXELS |= {f"bayer_{name}8": name for name in ("rggb", "bggr", "gbrg", "grbg")}

@@ -9,7 +9,6 @@ import pytest
 
 pytest.importorskip("embreex", reason="embreex is not installed (extra [train])")
 
-
 from model_zoo_defs.training.rendering import render, shapes
 from model_zoo_defs.training.rendering.materials import Palette
 from model_zoo_defs.training.rendering.shading import seen
