@@ -184,13 +184,12 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
     if stopped or len(summaries) < len(requests):
         raise click.exceptions.Exit(INTERRUPTED)
     counts = sum((Counter(summary.counts) for summary in summaries), Counter[str]())
-    bad = [f"{counts[kind]:,} {kind}" for kind in ("failed", "diverged") if counts[kind]]
-    if bad:
+    if bad := counts["chosen_not_done"]:
         from pnpdepth_cli.commands.tables import count_of
 
         raise FramesFailedError(
-            f"{' and '.join(bad)} of {count_of(counts['frames'], 'frame')}; the reasons are in"
-            f" {values['output']}{'/*' if vary else ''}/summary.csv"
+            f"{bad:,} of {count_of(counts['chosen'], 'frame')} failed or diverged; the reasons are"
+            f" in {values['output']}{'/*' if vary else ''}/summary.csv"
         )
 
 

@@ -52,7 +52,8 @@ def write_depth_cloud(
     make_folder(request.output.parent)
     merged = parts if request.voxel is None else [point_cloud.merge_in_voxels(parts, request.voxel)]
     points = write_cloud(request.output, merged)
-    colours = "coloured" if coloured else "without colours (no image is known)"
+    lost = next((frame.lost_image for frame in frames if not frame.image), "")
+    colours = "coloured" if coloured else f"without colours ({lost})"
     return f"{points:,} points, {colours}", notes
 
 

@@ -39,6 +39,14 @@ class ResultFrame:
         image = None if entry is None else source_of(entry.path)
         return image if image is not None and file_of(image).is_file() else None
 
+    @property
+    def lost_image(self) -> str:
+        """Why there is no image. Paths of a record start where the command ran."""
+        entry = self.record.inputs.get("image")
+        if entry is None:
+            return "no image is known"
+        return f"{entry.path} is not found from {Path.cwd()}; run this in the folder of `refine`"
+
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
         """The camera that the record holds, and its pose. Raises InputError if damaged."""

@@ -42,6 +42,7 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     err = capsys.readouterr().err
     assert "\nfailed: b\\nb\\x1b: drive/rgb/b\\nb\\x1b.png is empty" in err
     assert "out/summary.csv" in err.splitlines()[-1]
+    assert [run(arguments("--frames", name)) for name in ("a", "b*")] == [0, 7]  # of this run
     assert "\x1b" not in err
 
 

@@ -68,6 +68,8 @@ def test_image_camera_and_pose_come_from_the_record_unless_they_are_given(tmp_pa
     assert points_of(tmp_path / "b.ply")[0] == pytest.approx(corner, rel=1e-5)
     row = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")[1][:27]
     assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
+    (tmp_path / "b.png").unlink()
+    assert f"b.png is not found from {Path.cwd()}" in written(path, tmp_path / "lost.ply")[1]
 
 
 def test_pixels_that_are_far_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:

@@ -195,7 +195,7 @@ class BatchSummary:
     """What decides the results."""
     counts: dict[str, int]
     """Frames: all, done, diverged, failed, pending, with warnings, and worse than linear
-    interpolation of those that are compared with it."""
+    interpolation of those that are compared with it; those that the last run chose."""
     unit: str
     columns: Sequence[str] | None
     """Measures of the tables. None: all."""
@@ -224,6 +224,7 @@ def write_summary(
     # Counts of frames.
     results = [record for record in records if record.status != "failed"]
     statuses = Counter[str](record.status for record in records)
+    chosen = {frame.name for frame in found.chosen}
     worse = [w for record in results if (w := record.worse_than_linear) is not None]
     counts = {
         "frames": len(found.frames),
@@ -232,6 +233,8 @@ def write_summary(
         "compared": len(worse),
         "worse": sum(worse),
         "pending": len(found.frames) - len(records),
+        "chosen": len(chosen),
+        "chosen_not_done": sum(r.status != "done" for r in records if r.name in chosen),
     }
     # Weights of the networks.
     weights = {}

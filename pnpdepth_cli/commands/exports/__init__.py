@@ -171,9 +171,9 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
             " --calib"
         )
     if image is None:
-        raise InputError(f"{result.depth} lacks its image; run this in the folder of `refine`")
+        raise InputError(f"{result.depth} lacks its image: {result.lost_image}")
     if export.needs_pose and pose is None:
-        raise InputError(f"{result.depth} lacks a pose in its record; `batch` with --poses")
+        raise InputError(f"{result.depth} lacks a pose in its record; `batch --poses` gives it")
     # The scale and the name of the record must be usable.
     (width, height), sparse = record.size or (0, 0), record.inputs.get("sparse")
     scale = (sparse and sparse.unit_scale) or 1.0
