@@ -13,16 +13,9 @@ from typing import NoReturn
 
 import click
 
-from pnpdepth_cli import __version__
+from pnpdepth_cli import __version__, errors
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.cli.terminal import INTERRUPTED, printable, say
-from pnpdepth_cli.errors import (
-    DeviceError,
-    InputError,
-    OutputError,
-    PnpDepthError,
-    is_out_of_memory,
-)
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 input file · 4 network,
@@ -101,7 +94,7 @@ def run(arguments: list[str]) -> int:
     except click.ClickException as error:
         error.show()
         return error.exit_code
-    except PnpDepthError as error:
+    except errors.PnpDepthError as error:
         return _end(error, error.exit_code)
     except SystemExit:  # after a completion, or of a reader that stopped: `pnpdepth models | head`
         return 0
@@ -111,10 +104,10 @@ def run(arguments: list[str]) -> int:
         reason = error.strerror or str(error)
         full = error.errno in _OUTPUT_ERRORS
         named = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-        return _end(named + reason, (OutputError if full else InputError).exit_code)
+        return _end(named + reason, (errors.OutputError if full else errors.InputError).exit_code)
     except Exception as error:
-        if is_out_of_memory(error):
-            return _end("memory is exhausted; use a smaller image", DeviceError.exit_code)
+        if errors.is_out_of_memory(error):
+            return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)
         traceback.print_exception(error)
         fact = f"internal error ({type(error).__name__}: {error})"
         return _end(f"{fact}; it is a bug of this program, please report it", 1)

@@ -268,15 +268,10 @@ class Sensors:
 
     images: str
     points: str
-    is_depth: bool
-    """Whether the points are depth images."""
+    is_map: bool = False
+    """Whether the points are depth images of the images' own camera."""
     depth_camera: Camera | None = None
-    """Camera of the depth images. None: that of the images, or the points are clouds."""
-
-    @property
-    def is_map(self) -> bool:
-        """Whether the points are depth images of the images' own camera."""
-        return self.is_depth and self.depth_camera is None
+    """Camera of depth images of another camera. None: of the images' own, or clouds."""
 
 
 def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
@@ -293,13 +288,13 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
         points = choose_topic(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
-        return Sensors(images=images, points=points, is_depth=False)
+        return Sensors(images=images, points=points)
     # Depth images with the colours' frame_id are preferred.
     frame = messages.frame_of(first[images])
     registered = {n: depths[n] for n in depths if messages.frame_of(first[n]) == frame}
     usable = depths if set(wanted) & set(depths) else registered or depths
     points = choose_topic(bag, wanted, usable, "depth images")
-    same = Sensors(images=images, points=points, is_depth=True)
+    same = Sensors(images=images, points=points, is_map=True)
     # They may be of a camera of their own.
     found = messages.camera_of_bag(bag, images), messages.camera_of_bag(bag, points)
     of_images, of_depth = (None if each is None else each[0].camera for each in found)
@@ -312,7 +307,7 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
         alike = points in registered and of_images.size == of_depth.size and close
         if alike or of_images.source == of_depth.source:
             return same
-    return replace(same, depth_camera=of_depth)
+    return Sensors(images=images, points=points, depth_camera=of_depth)
 
 
 def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32], dict[str, int]]:
@@ -322,7 +317,7 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         NoPointsError: Nothing was measured.
     """
     topic = sensors.points
-    if not sensors.is_depth:
+    if not sensors.is_map and sensors.depth_camera is None:
         cloud = messages.cloud_points(message, topic)
     else:
         depth = messages.depth_image(message, topic)

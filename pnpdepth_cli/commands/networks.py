@@ -10,14 +10,9 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from pnpdepth_cli import errors
 from pnpdepth_cli.core.influence import influential_field
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.errors import (
-    ModelError,
-    UsageError,
-    out_of_memory_is_a_device_error,
-    wrap_user_errors,
-)
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -35,7 +30,7 @@ def list_models() -> list[dict[str, object]]:
 
 def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting needs no memory.
-    with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
+    with errors.wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
     defaults, path = definition.defaults.closed(), definition.checkpoint
     stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
@@ -88,7 +83,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
     if image is not None:
         rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()[None]
     frame = FrameMap.fit(definition.size, *(DEFAULT_SIZE if rgb is None else rgb.shape[-2:]))
-    with out_of_memory_is_a_device_error(network.device):
+    with errors.out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
         if "rgb" in definition.input_kind and definition.normalisation is None:
@@ -121,7 +116,7 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
             if not torch.equal(raw.detach(), whole.nan_to_num()):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())
-    except ModelError as error:
+    except errors.ModelError as error:
         return str(error)
     reached = gradient is not None and bool(gradient.isfinite().all())
     return "ok" if reached else "no finite gradient comes back from the prediction"
@@ -170,11 +165,11 @@ def list_layers(
     submodules = [name for name, _ in network.module.named_modules() if name]
     names = submodules if every else list(network.definition.layers)
     if not names:
-        raise UsageError(
+        raise errors.UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
     frame, measured = FrameMap.fit(network.definition.size, *DEFAULT_SIZE), []
-    with out_of_memory_is_a_device_error(network.device):
+    with errors.out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
@@ -194,7 +189,7 @@ def _measure(
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
             in_z, in_output = influential_field(split, z, network.known_of)
-    except ModelError as error:
+    except errors.ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(
         name=name,

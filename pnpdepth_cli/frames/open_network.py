@@ -14,16 +14,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli import errors
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Run, intercepted
-from pnpdepth_cli.errors import (
-    DivergedError,
-    NoPointsError,
-    out_of_memory_is_a_device_error,
-    wrap_user_errors,
-)
 from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import AlignedDepth, Network
@@ -108,11 +103,11 @@ class OpenNetwork:
             PnpDepthError: The refinement fails.
         """
         network, settings, diverged = self.network, self.settings, None
-        with out_of_memory_is_a_device_error(network.device):
+        with errors.out_of_memory_is_a_device_error(network.device):
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
-                raise NoPointsError(
+                raise errors.NoPointsError(
                     f"none of the {len(frame.points)} sparse points lies inside the part of the"
                     f" image that network {self.name!r} sees (rows and columns"
                     f" {prepared.map.crop})"
@@ -134,7 +129,7 @@ class OpenNetwork:
                     if at_full_size:
                         before, after = reader(at_full_size[0]), reader(at_full_size[-1])
                         result = replace(result, before=before, after=after)
-            except DivergedError as error:
+            except errors.DivergedError as error:
                 # A refinement that diverges ends with its last good depth.
                 if error.last_good is None:
                     raise
@@ -160,7 +155,7 @@ class OpenNetwork:
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
         """The depth without updates: one pass of the whole network, which need not be cut."""
-        with torch.no_grad(), wrap_user_errors("the network's forward"):
+        with torch.no_grad(), errors.wrap_user_errors("the network's forward"):
             output = self.network.module(*prepared.arguments)
         depth = reader(output).detach()
         at_points = prepared.points.sample(depth)
