@@ -24,6 +24,9 @@ else:
 
     A = TypeVar("A")
 
+Size = tuple[int, int]
+"""(height, width) of an image or a frame in pixels."""
+
 METRES, MODEL_UNITS = "m", "model units"
 """Units of depth: metres, and those of a COLMAP model whose scale is not known."""
 
@@ -140,12 +143,10 @@ class SparsePoints(Generic[A]):
 
 
 @overload
-def in_frame(xy: Tensor, size: tuple[int, int], *, closed: bool = ...) -> Tensor: ...
+def in_frame(xy: Tensor, size: Size, *, closed: bool = ...) -> Tensor: ...
 @overload
-def in_frame(
-    xy: NDArray[np.floating], size: tuple[int, int], *, closed: bool = ...
-) -> NDArray[np.bool_]: ...
-def in_frame(xy: Any, size: tuple[int, int], *, closed: bool = False) -> Any:
+def in_frame(xy: NDArray[np.floating], size: Size, *, closed: bool = ...) -> NDArray[np.bool_]: ...
+def in_frame(xy: Any, size: Size, *, closed: bool = False) -> Any:
     """Returns (N,) true where the nearest pixel lies in the frame; false for NaN.
 
     Args:

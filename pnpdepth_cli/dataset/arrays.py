@@ -29,6 +29,7 @@ from pnpdepth_cli.io.rgb import (
     read_video_frame,
     sizes_of,
 )
+from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 
 _OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
@@ -100,7 +101,7 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
     return depth
 
 
-def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> None:
+def check_same_view(what: str, own: tuple[int, ...], size: Size) -> None:
     """Raises InputError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
     if abs(own[1] * size[0] / (own[0] * size[1]) - 1) > _ASPECT_TOLERANCE:
         turned = abs(own[0] * size[0] / (own[1] * size[1]) - 1) <= _ASPECT_TOLERANCE
@@ -110,14 +111,12 @@ def check_same_view(what: str, own: tuple[int, ...], size: tuple[int, int]) -> N
         )
 
 
-def moved_note(own: tuple[int, ...], size: tuple[int, int]) -> str:
+def moved_note(own: tuple[int, ...], size: Size) -> str:
     """Returns a line for a person on points of a map (H, W) in an image of another size (H, W)."""
     return f"points of {own[1]}×{own[0]} are moved to the image of {size[1]}×{size[0]}"
 
 
-def move_depth(
-    path: Path, depth: NDArray[np.float32], size: tuple[int, int]
-) -> NDArray[np.float32]:
+def move_depth(path: Path, depth: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
     """Returns the known depths (H, W) at the pixels of an image of the same view; the nearest wins.
 
     No depth is interpolated: in an image that is larger, `size` (H, W), most pixels stay unknown.
@@ -148,7 +147,7 @@ def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
 
 
 def camera_of_file(
-    path: Path, number: int | None, size: tuple[int, int], image: Path | None = None
+    path: Path, number: int | None, size: Size, image: Path | None = None
 ) -> tuple[Camera, list[str]]:
     """Returns the camera of a calibration file for an image (H, W) of this file, and warnings.
 
@@ -160,9 +159,7 @@ def camera_of_file(
     return replace(camera, source=f"{path}: {camera.source}"), notes
 
 
-def check_size(
-    path: Path, camera: Camera, size: tuple[int, int], image: Path | None = None
-) -> list[str]:
+def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None) -> list[str]:
     """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
 
     Raises:
@@ -186,9 +183,7 @@ def check_size(
     return []
 
 
-def camera_of_exif(
-    image: ImageSource | None, size: tuple[int, int], lacking: str
-) -> tuple[Camera, list[str]]:
+def camera_of_exif(image: ImageSource | None, size: Size, lacking: str) -> tuple[Camera, list[str]]:
     """Returns the camera of EXIF, without distortion, and a line for a person.
 
     Raises:

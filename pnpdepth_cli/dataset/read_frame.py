@@ -26,7 +26,7 @@ from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.points import METRES, SparsePoints
+from pnpdepth_cli.points import METRES, Size, SparsePoints
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.settings import Settings
@@ -137,7 +137,7 @@ def _read_pixels(
 
 
 def _read_ground_truth(
-    files: FrameFiles, options: ReadOptions, source: Path, size: tuple[int, int] | None
+    files: FrameFiles, options: ReadOptions, source: Path, size: Size | None
 ) -> tuple[DepthFile, FileRecord, list[str]]:
     """The ground truth of an image (H, W): a projected scan, or a depth map."""
     scale, of_scan = options.depth_scale or files.gt_scale, options.scan.over(files)
@@ -198,7 +198,7 @@ def _sample_sparse(
 
 
 def _read_sparse(
-    files: FrameFiles, options: ReadOptions, size: tuple[int, int] | None
+    files: FrameFiles, options: ReadOptions, size: Size | None
 ) -> sparse_depth.SparseDepth:
     """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
     path, image, scan = files.sparse, files.image_file, options.scan.over(files)
@@ -230,11 +230,7 @@ def _read_sparse(
 
 
 def _camera_of(
-    files: FrameFiles,
-    options: ReadOptions,
-    known: Camera | None,
-    size: tuple[int, int],
-    is_needed: bool,
+    files: FrameFiles, options: ReadOptions, known: Camera | None, size: Size, is_needed: bool
 ) -> tuple[Camera | None, list[str]]:
     """The camera of a frame's part, None if unknown; it is from EXIF only where it is needed."""
     image, scan = files.image_file, options.scan.over(files)
@@ -247,7 +243,7 @@ def _camera_of(
     return None if known is None else files.part.camera_in_crop(known, size), notes
 
 
-def _points_of(files: FrameFiles, options: ReadOptions, size: tuple[int, int], seed: int) -> Points:
+def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
         return _read_sparse(files, options, size).points

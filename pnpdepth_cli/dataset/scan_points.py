@@ -27,7 +27,7 @@ from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.points import Size, in_frame
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import (
     Points,
@@ -58,7 +58,7 @@ _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is rul
 def read_scan_points(
     path: Path,
     options: ScanOptions,
-    size: tuple[int, int] | None,
+    size: Size | None,
     image: Path | None = None,
     *,
     scale: float | None = None,
@@ -214,7 +214,7 @@ def _agreements(
 
 
 def check_direction(
-    scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: tuple[int, int]
+    scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
 ) -> list[str]:
     """Returns a warning if the inverse of the scanner's pose fits the image (H, W) better.
 
@@ -239,7 +239,7 @@ def check_direction(
     return [f"warning: {text}"]
 
 
-def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: tuple[int, int]) -> list[str]:
+def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: Size) -> list[str]:
     """A warning if many points (N, 3) straight ahead of the camera are outside the image."""
     off_axis = np.hypot(seen[:, 0], seen[:, 1])
     ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]

@@ -24,7 +24,7 @@ from pnpdepth_cli.io.colmap_model import (
 from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
-from pnpdepth_cli.points import METRES, MODEL_UNITS
+from pnpdepth_cli.points import METRES, MODEL_UNITS, Size
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
@@ -95,7 +95,7 @@ class SparseDepth:
 
 
 def read_map_points(
-    path: Path, options: ReadOptions, size: tuple[int, int] | None, scale: float | None
+    path: Path, options: ReadOptions, size: Size | None, scale: float | None
 ) -> SparseDepth:
     """Returns the points of a depth map or a list that the camera sees.
 
@@ -169,7 +169,7 @@ def depth_of_distances(sparse: SparseDepth, scan: ScanOptions, image: Path | Non
 
 
 def read_colmap_points(
-    path: Path, image: Path, size: tuple[int, int], *, unit_scale: float | None = None
+    path: Path, image: Path, size: Size, *, unit_scale: float | None = None
 ) -> SparseDepth:
     """Returns the points that COLMAP matched in an image, projected into it.
 

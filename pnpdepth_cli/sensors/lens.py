@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Floats
+from pnpdepth_cli.points import Size
 
 Coefficients = tuple[float, ...]
 
@@ -49,7 +50,7 @@ def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
     return undistort(plane, camera.lens, camera.distortion) if camera.has_lens else plane
 
 
-def rays_of_image(camera: Camera, size: tuple[int, int]) -> Floats:
+def rays_of_image(camera: Camera, size: Size) -> Floats:
     """Returns the directions at the pixels of an image, (H, W, 2) x / z and y / z; read only.
 
     Those of the last camera are kept, as the frames of a sequence mostly have one.
@@ -60,7 +61,7 @@ def rays_of_image(camera: Camera, size: tuple[int, int]) -> Floats:
 
 @functools.lru_cache(maxsize=1)
 def _rays_of_image(
-    intrinsics: tuple[float, ...], lens: str, distortion: Coefficients, size: tuple[int, int]
+    intrinsics: tuple[float, ...], lens: str, distortion: Coefficients, size: Size
 ) -> Floats:
     """The rays of a camera that is given by what can be a key."""
     camera = Camera(intrinsics=np.reshape(intrinsics, (3, 3)), lens=lens, distortion=distortion)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.camera import Camera, Extrinsics, Floats
 from pnpdepth_cli.errors import NoPointsError
-from pnpdepth_cli.points import SparsePoints, in_frame
+from pnpdepth_cli.points import Size, SparsePoints, in_frame
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import pixels_of
 
@@ -64,7 +64,7 @@ def as_depth_image(points: Points) -> NDArray[np.float32]:
     return np.where(np.isinf(flat), np.float32(0), flat).reshape(points.size)
 
 
-def pixel_index(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp]:
+def pixel_index(xy: NDArray[np.floating], size: Size) -> NDArray[np.intp]:
     """Returns the (N,) row-major indices of the pixels of points inside the image."""
     column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
     index: NDArray[np.intp] = row * size[1] + column
@@ -82,9 +82,7 @@ class DropCounter:
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
         return mask
 
-    def keep_seen(
-        self, xyz: Floats, camera: Camera, size: tuple[int, int]
-    ) -> tuple[Floats, Floats]:
+    def keep_seen(self, xyz: Floats, camera: Camera, size: Size) -> tuple[Floats, Floats]:
         """Keeps the points that are the nearest of their pixel; returns them, and their pixels."""
         xy = pixels_of(camera, xyz)
         inside = self.keep(in_frame(xy, size), "outside the image")
@@ -96,7 +94,7 @@ class DropCounter:
         self.keep(nearest, "behind another in their pixel")
         return xyz[nearest], xy[nearest]
 
-    def points(self, xyz: Floats, xy: Floats, size: tuple[int, int]) -> Points:
+    def points(self, xyz: Floats, xy: Floats, size: Size) -> Points:
         """Returns what is left, `xyz` in the camera's coordinates, as points of an image (H, W)."""
         pixels, depth = xy.astype(np.float32), xyz[:, 2].astype(np.float32)
         return Points(xy=pixels, depth=depth, size=size, dropped=self.dropped)
@@ -114,7 +112,7 @@ def project_velodyne(
     points: NDArray[np.floating],
     camera: Camera,
     scanner: Extrinsics,
-    size: tuple[int, int],
+    size: Size,
     *,
     keep_occluded: bool = False,
 ) -> Points:
@@ -150,7 +148,7 @@ def project_velodyne(
     return drops.points(seen, xy, size)
 
 
-def points_in_image(xyz: Floats, camera: Camera, size: tuple[int, int]) -> tuple[Floats, Floats]:
+def points_in_image(xyz: Floats, camera: Camera, size: Size) -> tuple[Floats, Floats]:
     """Returns the points (M, 3) in the camera's coordinates that it sees, and their pixels (M, 2).
 
     The size (H, W) is the image's.
@@ -194,7 +192,7 @@ def near_jumps(points: Points) -> Mask:
 
 
 def hidden_points(
-    xy: Floats, depth: Floats, size: tuple[int, int], *, focal_px: float, scanner: Floats
+    xy: Floats, depth: Floats, size: Size, *, focal_px: float, scanner: Floats
 ) -> Mask:
     """Returns (N,) true for the points that are occluded by something nearer.
 
@@ -243,7 +241,7 @@ def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats
         return np.where(passed[:, None], at / near[:, None], xy)
 
 
-def hidden_among(xy: Floats, depth: Floats, size: tuple[int, int]) -> Mask:
+def hidden_among(xy: Floats, depth: Floats, size: Size) -> Mask:
     """Returns (N,) true for points that are occluded from the camera by something nearer.
 
     Foreground is looked for within twice the median distance from a point to the nearest other. It

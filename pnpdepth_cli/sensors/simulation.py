@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.errors import NoPointsError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import SamplePattern
+from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.projection import DropCounter, Points, pixel_index
 
 Pixels = NDArray[np.intp]
@@ -215,7 +216,7 @@ def sample_points(
     )
 
 
-def _grid(fraction: float, size: tuple[int, int]) -> Pixels:
+def _grid(fraction: float, size: Size) -> Pixels:
     """The nodes of a square grid that are this fraction of all pixels."""
     spacing: float = max(1.0, fraction**-0.5)
     rows, columns = (

@@ -157,9 +157,7 @@ def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
 
 
 COLMAP = Layout(
-    matches=_colmap_models,
-    frames=_of_colmap,
-    needs=("images", "sparse/0|sparse|colmap/sparse/0"),
+    matches=_colmap_models, frames=_of_colmap, needs=("images", "sparse/0|sparse|colmap/sparse/0")
 )
 
 
