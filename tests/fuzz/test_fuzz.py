@@ -32,6 +32,7 @@ from pnpdepth_cli.cli.main import main
 from pnpdepth_cli.io.depth import write_depth
 from tests.bags import write_bag
 from tests.colmap_models import write_binary_model, write_text_model
+from tests.data_sets import HEIGHT, WIDTH, image
 from tests.io.test_calibration import FOUR, KALIBR, KITTI, POSES, ROS, opencv_file
 from tests.io.test_scans import FILES
 from tests.models.onnx.onnx_files import write_network
@@ -40,13 +41,11 @@ from tests.models.weights.test_tensor_bundle import written
 
 INPUTS = int(os.environ.get("PNPDEPTH_FUZZ_INPUTS", "400"))
 SEED = int(os.environ.get("PNPDEPTH_FUZZ_SEED", "0"))
-HANGS_S = 240
 INTEGERS = (0, 1, -1, 2**7, 2**15 - 1, 2**16, 2**31 - 1, -(2**31), 2**32 - 1, 2**62)
 WORDS = ("", "nan", "inf", "-1", "0", "1e308", "9" * 30, "../..", "=1+1", "☃", "[" * 500, "null")
 FORBIDDEN = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect")
 CHANGES = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.remove": 1, "os.mkdir": 1}
 """Audit events that change files, and how many paths each has."""
-HEIGHT, WIDTH = 24, 32
 OUT = "-o out.png --overwrite"
 LISTING = "-o batch --limit 1 --shard 2/2"
 """Of a batch that lists its frames and refines none."""
@@ -137,8 +136,7 @@ def _data_sets(depth: np.ndarray) -> dict[str, str]:
     images = ("photos/images/a.png", "photos/images/b.png", "photos/images/c.png")
     images += ("binary/images/dir/1.png", "binary/images/dir/2.png")
     for name in images:
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_bytes(Path("rgb.png").read_bytes())
+        image(Path(name))
     models = [path for root in ("photos", "binary") for path in Path(root, "sparse/0").iterdir()]
     return {
         "frames.csv": f"batch frames.csv {LISTING}",
@@ -213,7 +211,7 @@ def test_no_damaged_file_causes_a_traceback_a_hang_or_much_memory(
         file, command = list(commands.items())[number % len(commands)]
         whole = Path(file).read_bytes()
         Path(file).write_bytes(damaged(whole, np.random.default_rng((SEED, number))))
-        faulthandler.dump_traceback_later(HANGS_S, exit=True)
+        faulthandler.dump_traceback_later(240, exit=True)
         with little(megabytes=1500):
             code = exit_code(command)
         faulthandler.cancel_dump_traceback_later()

@@ -13,7 +13,6 @@ from pnpdepth_cli.io.colmap_model import MODELS, name_in_model, read_model
 from pnpdepth_cli.sensors.lens import pixels_of
 from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
 
-PARTS = ("cameras", "images", "points3D")
 COLUMNS = ["number", "xyz", "error", "track"]
 
 
@@ -44,7 +43,7 @@ def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:
     assert model.images["b.png"].pose.translation.tolist() == [0.1, 0, 0]
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
 def test_a_binary_file_cut_short_or_whose_counts_lie_is_one_line(part: str, tmp_path: Path) -> None:
     write_binary_model(tmp_path)
     file = tmp_path / f"{part}.bin"

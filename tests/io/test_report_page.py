@@ -26,8 +26,6 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
-SOFTWARE = "--enable-unsafe-swiftshader"
-"""WebGL without a graphics card."""
 BACKGROUND = (0x1B, 0x1D, 0x21)
 STRANGE = "<img src=x onerror=document.title='run'>\n\"ü'"
 
@@ -40,8 +38,9 @@ def chrome() -> Iterator[webdriver.Chrome]:
         pytest.skip("needs chromium and chromedriver (Debian: apt install chromium-driver)")
     options = webdriver.ChromeOptions()
     options.binary_location = program
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", SOFTWARE):
-        options.add_argument(argument)
+    for argument in ("headless=new", "no-sandbox", "disable-dev-shm-usage"):
+        options.add_argument(f"--{argument}")
+    options.add_argument("--enable-unsafe-swiftshader")  # WebGL without a graphics card
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     yield browser

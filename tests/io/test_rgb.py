@@ -16,7 +16,6 @@ from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
-BLOCKS = np.kron(COLOURS, np.ones((6, 6, 1), np.uint8))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -79,7 +78,7 @@ def test_a_heic_photo_is_read_upright(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF"])
 def test_every_truncation_of_an_image_is_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.img"
-    Image.fromarray(BLOCKS).save(path, kind)
+    Image.fromarray(np.kron(COLOURS, np.ones((6, 6, 1), np.uint8))).save(path, kind)
     content = path.read_bytes()
     for length in [*range(0, len(content), 41), len(content) - 2, len(content) - 1]:
         path.write_bytes(content[:length])
