@@ -309,7 +309,7 @@ def _systems(field: ResidualField, near: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def _covariance(a: Tensor, b: Tensor) -> Tensor:
-    """exp(−|a − b|) (B, Q, k) float32 of a (B, Q, F) and b (B, k, F)."""
+    """exp(−|a − b|) (B, Q, k) float32 of a (B, Q, F) and b (B, k, F), in B blocks."""
     middle = b.mean(dim=1, keepdim=True)  # small numbers, so that the squares cancel well
     a, b = a - middle, b - middle
     squares = torch.baddbmm(b.square().sum(dim=2)[:, None, :], a, b.transpose(1, 2), alpha=-2)

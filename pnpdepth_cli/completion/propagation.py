@@ -107,7 +107,7 @@ def local_lines(
 def _lines_at(
     nodes: Tensor, points: SparsePoints, residual: Tensor, z: Tensor, inlier_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same, (M,), around nodes (M, 2)."""
+    """Shift and slope, (M,) each, of the lines around nodes (M, 2); see `local_lines`."""
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
     weight = distance.clamp_min(_AT_A_POINT).pow(-POWER) * (inlier_weight[near] + _OUTLIER_WEIGHT)
     weight = weight / weight.sum(dim=1, keepdim=True)

@@ -137,7 +137,7 @@ class Expert:
     weight: float = 0.0  # prior weight; with 0 it has no part
     at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
     updated: Tensor  # (M,) the same, the residual not propagated
-    whole: Prediction | None = None  # from all points. None of linear interpolation
+    whole: Prediction | None = None  # from all points. None: linear interpolation
     kept: Prediction | None = None  # from the others; the same as `whole` without validation
     user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
     frame: Frame | None = None  # what was given to a network that takes a prior

@@ -303,34 +303,34 @@ def describe_range(
     return f"{count}, {extent} {unit} ({source}{hint})"
 
 
-def scale_warning(what: str, ratio: float, kinds: Mapping[str, Reading | None]) -> str | None:
+def scale_warning(what: str, ratio: float, readings: Mapping[str, Reading | None]) -> str | None:
     """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
 
     Args:
         what: The depths, in the plural.
         ratio: Median of depth / ground truth; NaN if nothing can be compared.
-        kinds: The file of the depths, then that of the ground truth, by the option of its scale.
+        readings: How the depths were read, then the ground truth, by the option of the scale.
 
     Raises:
-        InputError: If the scale of one of them was assumed.
+        InputError: There is such a multiple, and one of the scales was assumed.
     """
     quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
     near = (q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE)
     if (factor := next(near, None)) is None:
         return None
-    sides = zip(kinds.items(), (factor, 1 / factor), strict=True)
-    integer = [(option, kind, by) for (option, kind), by in sides if kind and kind.scale]
+    sides = zip(readings.items(), (factor, 1 / factor), strict=True)
+    integer = [(option, read, by) for (option, read), by in sides if read and read.scale]
     unstated = [side for side in integer if "(from the file)" not in side[1].source]
     advice = " or ".join(
-        f"{option} {(kind.scale or 1) * by:.6g} (now {kind.scale:g})"
-        for option, kind, by in unstated or integer
+        f"{option} {(read.scale or 1) * by:.6g} (now {read.scale:g})"
+        for option, read, by in unstated or integer
     )
     about = f"{factor:.4g}" if factor >= 1 else f"1/{1 / factor:.4g}"
     fact = (
         f"{what} are {ratio:.4g} times the ground truth (median), about {about}: a scale is"
         f" probably wrong; {f'{advice} would remove it' if advice else 'float files hold metres'}"
     )
-    if assumed := [f"{option} {kind.scale:g}" for option, kind, _ in integer if kind.assumed]:
+    if assumed := [f"{option} {read.scale:g}" for option, read, _ in integer if read.assumed]:
         raise InputError(f"{fact}, {' '.join(assumed)} keeps it")
     return f"warning: {fact}"
 

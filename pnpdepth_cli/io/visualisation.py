@@ -316,7 +316,7 @@ def improvement(
 def gain(before: Array, after: Array, truth: Array) -> NDArray[np.float64]:
     """Returns by how much |depth - truth| fell; NaN where the truth or the depth after is unknown.
 
-    A depth that is not finite counts as an error of 1e9.
+    Infinite depth, and NaN before, count as an error of 1e9.
     """
     known = np.isfinite(truth) & (truth > 0) & (after > 0)
     errors = (np.abs(depth.astype(np.float64) - truth) for depth in (before, after))

@@ -121,7 +121,7 @@ def _tensor(content: bytearray, meta: _Json) -> Tensor:
 
 
 def _function(target: str) -> Callable[..., object]:
-    """The operator of this name, and nothing else."""
+    """The operator named torch.ops.LIBRARY.NAME.OVERLOAD, and nothing else."""
     found = _OPERATOR.fullmatch(target)
     if found is not None and not _TOUCHES_FILES.search(found[2]):
         called: Any = torch.ops

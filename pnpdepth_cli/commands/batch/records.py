@@ -146,7 +146,7 @@ class Records:
 
 
 def _settings_of(request: RefineRequest) -> dict[str, object]:
-    """The settings that decide a frame's result, in JSON's own types."""
+    """The settings, but no files, that decide a frame's result, in JSON's own types."""
     values = dict[str, object]()
     for name, value in vars(request).items():
         values |= vars(value) if name in GROUPS else {name: value}
