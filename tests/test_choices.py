@@ -16,9 +16,7 @@ from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.sensors.simulation import LIDARS
 
 
-def test_names_come_from_the_folder_and_from_entry_points_and_are_loaded_from_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_and_entry_points_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Two entry points of another package.
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()

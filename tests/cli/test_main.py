@@ -89,9 +89,7 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
         ("test -e /dev/full || exit 2; pnpdepth --help >/dev/full", 2, 1),
     ],
 )
-def test_what_a_shell_does_to_the_command_is_no_error_or_one_line(
-    line: str, code: int, errors: int, tmp_path: Path
-) -> None:
+def test_a_shell_causes_one_line_at_most(line: str, code: int, errors: int, tmp_path: Path) -> None:
     depth(tmp_path / "a.npy")
     script = f'pnpdepth() {{ {sys.executable} -m pnpdepth_cli "$@"; }}\nset -o pipefail\n{line}\n'
     done = subprocess.run(

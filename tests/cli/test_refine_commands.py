@@ -46,9 +46,7 @@ def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
     assert "\x1b" not in err
 
 
-def test_ray_without_an_address_is_this_machine_and_nothing_to_do_needs_neither_it_nor_torch(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_to_do_needs_no_ray_or_torch(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert [run(arguments(*more)) for more in ((), ("--ray",))] == [0, 0]
     assert run(arguments("--ray", "--seed", "1")) == 2
@@ -134,7 +132,7 @@ def test_method_number_of_points_networks_and_switches_can_be_varied(root: Path)
     assert run([*batch, "--iterations", "0", *varied]) == 0
 
 
-def test_a_second_run_does_only_what_is_missing_and_failed_frames_stop_no_combination(
+def test_a_second_run_does_only_what_is_left(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (root / "rgb/b.png").write_bytes(b"")

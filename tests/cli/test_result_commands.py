@@ -61,9 +61,7 @@ def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path
     assert np.load("gt/e.npy").shape == (6, 8)
 
 
-def test_columns_choose_measures_and_latex_has_no_thousands_separators(
-    frames: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_columns_choose_measures_in_latex(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path in frames.glob("*/*.npy"):
         np.save(path, 10 * np.load(path))
     assert code_of("eval out gt --protocol kitti --columns delta1,rmse") == 0

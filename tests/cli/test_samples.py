@@ -117,9 +117,7 @@ def test_a_batch_is_done_once_then_scored_and_compared(capsys: pytest.CaptureFix
     ],
     ids=["project", "sample", "simulate"],
 )
-def test_sparse_depth_is_made_and_its_points_are_counted(
-    line: str, count: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_made_points_are_counted(line: str, count: int, capsys: pytest.CaptureFixture[str]) -> None:
     output(capsys, f"{line} -o sparse.png")
     record = json.loads(Path("sparse.json").read_text())
     assert record["points"]["count"] == pytest.approx(count, rel=1e-3)

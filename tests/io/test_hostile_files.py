@@ -149,9 +149,7 @@ READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha25
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_a_device_a_pipe_and_a_sparse_file_of_terabytes_are_refused_unread(
-    read: Callable[[Path], object], tmp_path: Path
-) -> None:
+def test_no_device_pipe_or_terabyte_is_read(read: Callable[[Path], object], tmp_path: Path) -> None:
     pipe, huge = tmp_path / "pipe.bin", tmp_path / "huge.bin"
     os.mkfifo(pipe)
     huge.touch()

@@ -74,9 +74,7 @@ RECIPE = recipes.Recipe(
 
 
 @pytest.mark.parametrize("lanes", [1, 2])
-def test_a_run_of_a_tiny_edition_learns_and_going_on_gives_the_same_bytes(
-    lanes: int, shards: Path, tmp_path: Path
-) -> None:
+def test_an_edition_learns_and_goes_on_as_it_was(lanes: int, shards: Path, tmp_path: Path) -> None:
     whole = tiny.Settings(
         network="toy-tiny", data=(shards,), val=(shards,), out=tmp_path / "whole", steps=8,
         save_every=4, lanes=lanes,
