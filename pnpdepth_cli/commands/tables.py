@@ -14,23 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from pnpdepth_cli import stages
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.measures import MEASURES, Measure, choose_measures
-from pnpdepth_cli.stages import (
-    AFTER,
-    ALONE,
-    BASES,
-    BEFORE,
-    GT,
-    HELD_OUT,
-    LINEAR,
-    PROPAGATED,
-    UPDATED,
-    USED,
-)
 
 Style = Literal["", "bold", "dim", "good", "bad"]
 Cell = tuple[str, Style]
@@ -40,12 +29,12 @@ Errors = Mapping[str, Mapping[str, Scores]]
 
 _LINEAR = "linear interpolation of all points"
 _ROWS = {
-    BEFORE: "{name}, aligned with the points",
-    UPDATED: "{name}, z updated",
-    PROPAGATED: "{name}, residual propagated",
-    ALONE: "{fusing} alone",
-    AFTER: "fused ({weights})",
-    LINEAR: _LINEAR,
+    stages.BEFORE: "{name}, aligned with the points",
+    stages.UPDATED: "{name}, z updated",
+    stages.PROPAGATED: "{name}, residual propagated",
+    stages.ALONE: "{fusing} alone",
+    stages.AFTER: "fused ({weights})",
+    stages.LINEAR: _LINEAR,
 }
 """What the row of a stage of the default method is called."""
 _LATEX = str.maketrans(
@@ -138,8 +127,8 @@ def write_text(path: Path, text: str) -> None:
 
 def bases_of(errors: Errors) -> list[str]:
     """Returns what errors are shown on: ground truth and held-out points, else the best."""
-    found = [basis for basis in BASES if errors.get(basis)]
-    return [basis for basis in found if basis in (GT, HELD_OUT)] or found[:1]
+    found = [basis for basis in stages.BASES if errors.get(basis)]
+    return [basis for basis in found if basis in (stages.GT, stages.HELD_OUT)] or found[:1]
 
 
 def means_tables(
@@ -160,26 +149,26 @@ def refinement_tables(record: FrameRecord) -> list[Table]:
     of_one = sum(weight > 0 for weight in record.weights.values()) == 1
     tables = []
     for basis in bases_of(record.errors):
-        stages = dict(record.errors[basis])
+        by_stage = dict(record.errors[basis])
         # The result is no stage of its own where one expert, the network, has all the weight.
-        if of_one and PROPAGATED in stages and ALONE not in stages:
-            del stages[AFTER]
-        tables.append(_table(title, basis, stages, record.unit, stage_titles(record)))
+        if of_one and stages.PROPAGATED in by_stage and stages.ALONE not in by_stage:
+            del by_stage[stages.AFTER]
+        tables.append(_table(title, basis, by_stage, record.unit, stage_titles(record)))
     return tables
 
 
 def _table(
     about: str,
     basis: str,
-    stages: Mapping[str, Scores],
+    by_stage: Mapping[str, Scores],
     unit: str,
     titles: Mapping[str, str],
     keys: Sequence[str] | None = None,
 ) -> Table:
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
-    shown = [stage for stage in titles if stage in stages]
-    last = AFTER if AFTER in stages else PROPAGATED
-    scores, linear = stages[last], stages.get(LINEAR, {}).get("mae")
+    shown = [stage for stage in titles if stage in by_stage]
+    last = stages.AFTER if stages.AFTER in by_stage else stages.PROPAGATED
+    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {}).get("mae")
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
@@ -188,17 +177,17 @@ def _table(
         count = f"{scores['frames']:,} frames"
     elif "coverage" in scores:
         count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
-    remark = ", where a change proves nothing" * (basis == USED)
+    remark = ", where a change proves nothing" * (basis == stages.USED)
     # The rows.
     rows = []
     for stage in shown:
-        own = stages[stage]
+        own = by_stage[stage]
         style: Style = "bold" if stage == last else ""
         texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
-        against = "" if stage == LINEAR else change(linear, own.get("mae"))
+        against = "" if stage == stages.LINEAR else change(linear, own.get("mae"))
         rows.append([*((text, style) for text in (titles[stage], *texts)), against])
     return Table(
-        title=f"{about}: errors {BASES[basis]}{remark}, {count}",
+        title=f"{about}: errors {stages.BASES[basis]}{remark}, {count}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],
         rows=rows,
     )
@@ -217,7 +206,7 @@ def stage_titles(record: FrameRecord) -> dict[str, str]:
     made = f"{count_of(len(record.loss) - 1, 'update')} of z"  # fewer than asked if it diverged
     steps = [made] if settings["iterations"] else []
     steps += ["residual propagated"] if settings["propagate"] != "none" else []
-    return {BEFORE: before, AFTER: ", ".join([name, *steps]), LINEAR: _LINEAR}
+    return {stages.BEFORE: before, stages.AFTER: ", ".join([name, *steps]), stages.LINEAR: _LINEAR}
 
 
 def names_of_depths(record: FrameRecord) -> tuple[str, str]:
@@ -225,7 +214,8 @@ def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     assert record.method is not None
     titles, name = stage_titles(record), record.method.networks[0]
     alone = all(weight == 0 for expert, weight in record.weights.items() if expert != name)
-    return titles[BEFORE], titles[PROPAGATED if alone and PROPAGATED in titles else AFTER]
+    last = stages.PROPAGATED if alone and stages.PROPAGATED in titles else stages.AFTER
+    return titles[stages.BEFORE], titles[last]
 
 
 def weights_text(weights: Mapping[str, float]) -> str:

@@ -13,14 +13,9 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.io import file_bytes
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
-from pnpdepth_cli.io.file_bytes import (
-    check_value_count,
-    fingerprint,
-    read_bytes,
-    size_of_regular_file,
-)
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import (
     read_exr_colour,
@@ -38,7 +33,7 @@ _ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios of images of on
 
 def record_of(source: ImageSource, reading: Reading | None = None) -> FileRecord:
     """Returns what a record keeps of a file, and of how it was read."""
-    record = FileRecord(path=str(source), sha256=fingerprint(file_of(source)).sha256)
+    record = FileRecord(path=str(source), sha256=file_bytes.fingerprint(file_of(source)).sha256)
     if reading is None:
         return record
     return replace(record, read_as=reading.source, scale=reading.scale, assumed=reading.assumed)
@@ -75,7 +70,7 @@ def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
         InputError: The file holds no such numbers.
     """
     if path.suffix.lower() == ".exr":
-        return np.asarray(read_exr_colour(path, read_bytes(path)).max(axis=2))
+        return np.asarray(read_exr_colour(path, file_bytes.read_bytes(path)).max(axis=2))
     if path.suffix.lower() in IMAGE_SUFFIXES:
         image = read_rgb(path)
         return np.asarray(np.rint(image.values.max(axis=2) * image.white))
@@ -139,9 +134,9 @@ def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
     if path.suffix.lower() != ".jpg" or not isinstance(image, Path):
         return None
     _, size = sizes_of(image)
-    if size_of_regular_file(path) != 4 * math.prod(size):
+    if file_bytes.size_of_regular_file(path) != 4 * math.prod(size):
         return None
-    check_value_count(path, math.prod(size), value_bytes=4)
+    file_bytes.check_value_count(path, math.prod(size), value_bytes=4)
     values = known_metres(np.fromfile(path, "<f4").reshape(size))
     return DepthFile(values=values, reading=Reading("float32 without a header"))
 

@@ -7,14 +7,9 @@ from dataclasses import replace
 
 import torch
 
+from pnpdepth_cli import errors
 from pnpdepth_cli.choices import SPACES
 from pnpdepth_cli.completion.alignment import align
-from pnpdepth_cli.errors import (
-    ModelError,
-    NoPointsError,
-    UsageError,
-    out_of_memory_is_a_device_error,
-)
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
 from pnpdepth_cli.models.cut_layers import default_layer
@@ -68,7 +63,7 @@ def resolve_definition(
         ModelError: The network's own check fails.
     """
     definition, notes = network.definition, list(network.notes)
-    with out_of_memory_is_a_device_error(network.device):
+    with errors.out_of_memory_is_a_device_error(network.device):
         if definition.normalisation is None and frame.rgb is not None:
             network, note = _with_best_input_range(network, [frame, *more_frames()])
             notes.append(note)
@@ -94,13 +89,13 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """
     wanted = layer if layer is not None else definition.default_layer
     if wanted is None:
-        raise UsageError(f"network {definition.name!r} has no default layer; name a layer")
+        raise errors.UsageError(f"network {definition.name!r} has no default layer; name a layer")
     try:
         fraction = float(wanted)
     except ValueError:
         return wanted
     if not 0 <= fraction <= 1 or not definition.layers:
-        raise UsageError(
+        raise errors.UsageError(
             f"layer {wanted!r}: a number is a fraction between 0 and 1 of the layers that the"
             f" definition of {definition.name!r} lists ({len(definition.layers)} of them)"
         )
@@ -158,9 +153,9 @@ def resolve_member(
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
     candidates = {name: with_input_range(network, name) for name in NORMALISATIONS}
-    errors = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
-    chosen, rival = choose_input_range(errors)
-    listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
+    misfits = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
+    chosen, rival = choose_input_range(misfits)
+    listed = ", ".join(f"{name} {error:.1%}" for name, error in misfits.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
     unsure, hint = "", "`normalise` changes it"
@@ -171,19 +166,19 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     return candidates[chosen], note
 
 
-def choose_input_range(errors: Mapping[str, float]) -> tuple[str, str | None]:
+def choose_input_range(misfits: Mapping[str, float]) -> tuple[str, str | None]:
     """Returns the input range of a network that states none, and a rival where that is unsure.
 
     The range 0…1 stays unless another one fits far better. Which of them fits a single frame best
     is mostly chance.
 
     Args:
-        errors: Relative error after alignment by the names of `NORMALISATIONS`.
+        misfits: Relative error after alignment by the names of `NORMALISATIONS`.
     """
-    best = min(errors, key=lambda name: errors[name])
-    chosen = best if errors[best] < _CLEARLY_BETTER * errors["unit"] else "unit"
-    rival = min((name for name in errors if name != chosen), key=lambda name: errors[name])
-    unsure = errors[chosen] > _CLEARLY_BETTER * errors[rival]
+    best = min(misfits, key=lambda name: misfits[name])
+    chosen = best if misfits[best] < _CLEARLY_BETTER * misfits["unit"] else "unit"
+    rival = min((name for name in misfits if name != chosen), key=lambda name: misfits[name])
+    unsure = misfits[chosen] > _CLEARLY_BETTER * misfits[rival]
     return chosen, rival if unsure else None
 
 
@@ -192,7 +187,7 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
 
     Frames without points in the network's view are left out; infinite where the network fails.
     """
-    stated, errors = network.definition.output_kind, list[float]()
+    stated, misfits = network.definition.output_kind, list[float]()
     spaces = (stated,) if stated in SPACES else ("depth", "inverse")
     for frame in frames:
         try:
@@ -202,9 +197,9 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
             lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
-            errors.append(align(at_points, points, spaces, "auto").error + lost)
-        except NoPointsError:
+            misfits.append(align(at_points, points, spaces, "auto").error + lost)
+        except errors.NoPointsError:
             continue
-        except ModelError:
+        except errors.ModelError:
             return float("inf")
-    return sum(errors) / len(errors) if errors else float("inf")
+    return sum(misfits) / len(misfits) if misfits else float("inf")
