@@ -57,7 +57,6 @@ def naive_refine(
 
     with torch.no_grad():
         depth_with_z()
-    assert z is not None
     losses = []
     for _ in range(settings.iterations):
         z = z.detach().requires_grad_(True)
@@ -65,7 +64,6 @@ def naive_refine(
             loss = loss_of(points.sample(depth_with_z()), points.depth)
             loss.backward()
         losses.append(float(loss.detach()))
-        assert z.grad is not None
         z = z.detach() - float(settings.lr) * update(z.grad)
     with torch.no_grad():
         depth = depth_with_z()

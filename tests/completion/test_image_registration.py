@@ -10,19 +10,12 @@ from scipy.spatial import Delaunay
 
 from pnpdepth_cli.completion.gaussian_process import cielab
 from pnpdepth_cli.completion.image_registration import (
-    Evidence,
     ImageRegistration,
     estimate_registration,
     evidence,
 )
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.unregistered import SIZE, UNREGISTERED, frame
-
-
-def evidence_of(seed: int, registration: ImageRegistration | None, count: int = 500) -> Evidence:
-    known = evidence(*frame(seed, registration, count))
-    assert known is not None
-    return known
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -41,9 +34,8 @@ def evidence_of(seed: int, registration: ImageRegistration | None, count: int = 
 def test_zoom_and_shift_between_the_cameras_are_found(
     seed: int, registration: ImageRegistration, frames: int, off_px: float
 ) -> None:
-    known = [evidence_of(seed + number, registration) for number in range(frames)]
+    known = [evidence(*frame(seed + number, registration)) for number in range(frames)]
     found = estimate_registration(known)
-    assert isinstance(found, ImageRegistration)
     assert found.zoom == pytest.approx(registration.zoom, abs=0.012)
     shift = (registration.right, registration.down)
     assert (found.right, found.down) == pytest.approx(shift, abs=off_px)
@@ -60,7 +52,7 @@ NEARLY = ImageRegistration(zoom=1.0, right=2.0, down=0.0)
 def test_a_registered_image_stays_and_few_points_of_one_frame_move_none(
     seed: int, registration: ImageRegistration | None, count: int
 ) -> None:
-    assert estimate_registration([evidence_of(seed, registration, count)]) is None
+    assert estimate_registration([evidence(*frame(seed, registration, count))]) is None
 
 
 @pytest.mark.parametrize("gap_px", [5, 8])
@@ -71,8 +63,7 @@ def test_a_registered_image_stays_where_points_beside_jumps_are_missing(gap_px: 
 
 
 def test_frames_with_few_points_show_together_what_each_does_not() -> None:
-    found = estimate_registration([evidence_of(seed, UNREGISTERED, 80) for seed in range(8)])
-    assert isinstance(found, ImageRegistration)
+    found = estimate_registration([evidence(*frame(seed, UNREGISTERED, 80)) for seed in range(8)])
     assert found.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.02)
 
 
@@ -122,7 +113,6 @@ def test_the_evidence_is_how_edges_and_changes_of_depth_stand_out_from_the_rest(
     moved = np.random.default_rng(3).uniform(-0.3, 0.3, (count, 2)).astype(np.float32)
     points = replace(points, xy=points.xy + torch.from_numpy(moved))
     known = evidence(rgb, points)
-    assert known is not None
     # Edges of the lightness and colour, over those within 8 pixels, less those within 6.
     lab = cielab(torch.from_numpy(rgb).permute(2, 0, 1)).double().numpy() / 100
     smooth = [ndimage.gaussian_filter(one, 1.0, mode="mirror") for one in lab]
@@ -155,13 +145,12 @@ def test_the_evidence_is_how_edges_and_changes_of_depth_stand_out_from_the_rest(
     # A frame of twice the size is reduced to the same.
     twice = SparsePoints(xy=2 * points.xy + 0.5, depth=points.depth, size=(480, 640))
     larger = evidence(rgb.repeat(2, axis=0).repeat(2, axis=1), twice)
-    assert larger is not None
     assert np.allclose(larger.between, known.between, atol=1e-3)
     assert np.allclose(larger.edges, known.edges, atol=1e-3)
 
 
 def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_posterior() -> None:
-    known = evidence_of(0, UNREGISTERED)
+    known = evidence(*frame(0, UNREGISTERED))
     likelihood = known.log_likelihood(1.1)
     assert likelihood.shape == (2 * 12 + 1, 2 * 16 + 1)  # shifts of 5 % of the sides
     height, width = known.edges.shape
@@ -183,6 +172,5 @@ def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_
     posterior /= posterior.sum()
     mean = [(posterior * each).sum() for each in (zooms[:, None, None], right, down)]
     found = estimate_registration([known])
-    assert isinstance(found, ImageRegistration)
     assert found.zoom == round(mean[0], 4)
     assert (found.right, found.down) == (round(mean[1], 2), round(mean[2], 2))

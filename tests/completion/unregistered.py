@@ -14,8 +14,14 @@ SIZE = (240, 320)
 UNREGISTERED = ImageRegistration(zoom=0.9, right=-5.0, down=3.0)
 
 
-def boxes(seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Image (H, W, 3) and depth (H, W) of forty boxes in front of a wall, larger than `SIZE`."""
+def frame(
+    seed: int, registration: ImageRegistration | None = None, count: int = 500, gap_px: int = 0
+) -> tuple[NDArray[np.float32], SparsePoints]:
+    """Image and random points of a frame with this registration; None: it is registered.
+
+    It shows forty boxes in front of a wall. No point is within `gap_px` of a jump of depth, as on
+    phones, which are unsure of those.
+    """
     rng = np.random.default_rng(seed)
     height, width = (2 * side for side in SIZE)
     depth = np.full((height, width), 6.0, np.float32)
@@ -25,17 +31,7 @@ def boxes(seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         bottom, right = top + int(rng.integers(30, 120)), left + int(rng.integers(30, 120))
         depth[top:bottom, left:right] = distance
         rgb[top:bottom, left:right] = rng.uniform(0, 1, 3)
-    return rgb + rng.normal(0, 0.02, rgb.shape).astype(np.float32), depth
-
-
-def frame(
-    seed: int, registration: ImageRegistration | None = None, count: int = 500, gap_px: int = 0
-) -> tuple[NDArray[np.float32], SparsePoints]:
-    """Image and random points of a frame with this registration; None: it is registered.
-
-    No point is within `gap_px` of a jump of depth, as on phones, which are unsure of those.
-    """
-    rgb, depth = boxes(seed)
+    rgb += rng.normal(0, 0.02, rgb.shape).astype(np.float32)
     inner = tuple(slice(side // 2, side // 2 + side) for side in SIZE)
     if registration is not None:  # as the other camera sees the scene: moved by the inverse
         zoom = 1 / registration.zoom

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
@@ -76,6 +76,11 @@ def member(
     )
     settings = settings or ClosedSettings(iterations=0, align="none")
     return OpenNetwork(network, "layer", settings)
+
+
+def compact() -> OpenNetwork:
+    """`compact` without updates of z."""
+    return OpenNetwork(load_network("compact", None), "decoder.s8", ClosedSettings(iterations=0))
 
 
 @contextmanager

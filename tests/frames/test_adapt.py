@@ -24,7 +24,6 @@ Pair = tuple[NDArray[np.float32], pnp.SparsePoints]
 
 def pair(seed: int, count: int = 60) -> Pair:
     frame = frame_in_memory(count, seed)
-    assert frame.rgb is not None
     return np.ascontiguousarray(frame.rgb.permute(1, 2, 0).numpy()), frame.points
 
 

@@ -35,6 +35,7 @@ from tests.frames.scenes import (
     SIZE,
     Brightness,
     Nearest,
+    compact,
     depth_of_scene,
     frame_in_memory,
     member,
@@ -66,17 +67,6 @@ def refined(frame: Frame, *members: OpenNetwork, seed: int = 0) -> Refined:
         return refine_default(networks, frame, seed=seed)
 
 
-def with_gt(frame: Frame) -> Frame:
-    """The frame with its ground truth, so that the stages are kept."""
-    return replace(frame, gt=depth_of_scene().numpy())
-
-
-def compact() -> OpenNetwork:
-    """`compact` without updates of z."""
-    network = load_network("compact", None)
-    return OpenNetwork(network, "decoder.s8", ClosedSettings(iterations=0))
-
-
 def scan_frame() -> Frame:
     """The scene with a scanner's lines."""
     y, x = np.mgrid[2 : SIZE[0] : 8, 0 : SIZE[1] : 2]
@@ -101,8 +91,8 @@ def split_of(depth: Tensor) -> ValidatedFrame:
 
 @pytest.mark.parametrize(("of_scanner", "kind"), [(False, "gp"), (True, "local")])
 def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kind: str) -> None:
-    frame = with_gt(scan_frame() if of_scanner else frame_in_memory(60))
-    result = refined(frame, member(Brightness, settings=UPDATES))
+    frame, gt = scan_frame() if of_scanner else frame_in_memory(60), depth_of_scene().numpy()
+    result = refined(replace(frame, gt=gt), member(Brightness, settings=UPDATES))  # with stages
     assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
     expected = propagate(updated, result.used, frame.rgb, kind=kind)
@@ -110,7 +100,7 @@ def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kin
     assert np.array_equal(result.after, result.stages["propagated"])
     assert np.array_equal(result.before, result.stages["before"])
     assert result.weights == {"brightness": 1.0}
-    errors = [float(np.abs(d - depth_of_scene().numpy()).mean()) for d in result.stages.values()]
+    errors = [np.abs(depth - gt).mean() for depth in result.stages.values()]
     assert errors[-1] < errors[0]
 
 
@@ -140,7 +130,6 @@ def test_a_useless_network_has_no_part_which_is_said() -> None:
     assert np.allclose(useless.after, alone.after, rtol=1e-4)
     (note,) = [note for note in useless.notes if note.startswith("noise has no part")]
     checked = useless.validation
-    assert checked is not None
     for stage in ("propagated", "alone"):
         off = (checked.predicted[stage] - checked.points.depth).abs().numpy()
         assert f"{np.average(off, weights=checked.weights.numpy()):.4f}" in note
@@ -228,15 +217,12 @@ def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None
     frame = frame_in_memory(60)
     members = (member(Brightness, settings=ALIGNED), compact())
     first = refined(frame, *members).validation
-    assert first is not None
     held = (frame.points.xy[:, None] == first.points.xy[None]).all(dim=2).any(dim=1)
     numbers = held.nonzero(as_tuple=True)[0]
     changed = frame.points.depth.clone()
     changed[numbers[0]] *= 1.01
-    again = refined(
-        replace(frame, points=replace(frame.points, depth=changed)), *members
-    ).validation
-    assert again is not None
+    other = replace(frame, points=replace(frame.points, depth=changed))
+    again = refined(other, *members).validation
     assert torch.equal(again.points.xy, first.points.xy)
     one = (again.points.xy == frame.points.xy[numbers[0]]).all(dim=1)
     for name in ("before", "propagated", "alone", "linear", "after"):
@@ -252,7 +238,6 @@ def test_an_image_of_another_scene_is_warned_of(monkeypatch: pytest.MonkeyPatch)
     (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
     assert "80 validation points" in note
     assert "compact without the image" in wrong.weights
-    assert wrong.validation is not None
     assert "alone" not in wrong.validation.predicted  # there is nothing but compact
     stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
     assert "compact without the image" not in stated.weights
@@ -360,7 +345,6 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
         clean, _ = without_outliers(judge, frame)
         frame = replace(frame, points=replace(frame.points, depth=depth))
         inliers, _ = without_outliers(judge, frame)
-    assert inliers.outliers is not None
     assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
     assert clean.outliers is None

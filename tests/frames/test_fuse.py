@@ -10,20 +10,15 @@ import torch
 
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.fuse import MIRRORED_BELOW, Expert, split_frame, with_mirrored
-from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.models.network import load_network
-from pnpdepth_cli.settings import ClosedSettings
-from tests.frames.scenes import depth_of_scene, frame_in_memory, opened
+from tests.frames.scenes import compact, depth_of_scene, frame_in_memory, opened
 
 
 def seen_twice(frame: Frame, weight: float = 1.0) -> tuple[Expert, Expert]:
     """An expert of `compact`, before and after it sees the mirrored frame, if it does."""
-    own = OpenNetwork(load_network("compact", None), "decoder.s8", ClosedSettings(iterations=0))
-    with opened(own) as networks:
-        at = frame.points.depth[:0]
-        expert = Expert(
-            name="compact", at=at, updated=at, whole=networks[0].refine(frame), frame=frame
-        )
+    at = frame.points.depth[:0]
+    with opened(compact()) as networks:
+        whole = networks[0].refine(frame)
+        expert = Expert(name="compact", at=at, updated=at, whole=whole, frame=frame)
         (again,) = with_mirrored(networks, [expert], {"compact": weight})
     return expert, again
 
@@ -33,13 +28,11 @@ def test_a_mirrored_frame_has_left_and_right_exchanged_and_mirrored_again_is_the
     mirrored, width = frame.mirrored(), frame.size[1]
     x, y = frame.points.xy.unbind(1)
     assert torch.equal(mirrored.points.xy, torch.stack([width - 1 - x, y], 1))
-    assert mirrored.rgb is not None
-    assert mirrored.prior is not None
-    assert torch.equal(mirrored.rgb[..., 0], frame.rgb[..., -1])  # type: ignore[index]
+    assert torch.equal(mirrored.rgb[..., 0], frame.rgb[..., -1])
     assert torch.equal(mirrored.points.sample(mirrored.prior), frame.points.depth)
     twice = mirrored.mirrored()
     assert torch.equal(twice.points.xy, frame.points.xy)
-    assert torch.equal(twice.rgb, frame.rgb)  # type: ignore[arg-type]
+    assert torch.equal(twice.rgb, frame.rgb)
 
 
 def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> None:
@@ -47,8 +40,6 @@ def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() 
     split = split_frame(frame, depth_of_scene(), 0)
     once, twice = seen_twice(frame)
     turned, _ = seen_twice(frame.mirrored())
-    assert once.whole is not None
-    assert turned.whole is not None
     left, right = once.whole.after.numpy(), turned.whole.after.numpy()[:, ::-1]
     assert np.abs(left - right).max() > 1e-3
     np.testing.assert_allclose(twice.dense(split), np.sqrt(left * right), rtol=1e-4)

@@ -78,7 +78,6 @@ def test_a_validated_frame_is_refined_again_without_its_validation_points() -> N
     frame, settings = frame_in_memory(60), replace(SETTINGS, propagate="local")
     with opened(member(Brightness, settings=settings)) as (network,):
         checked = refine_fixed(network, frame, validated=True).validation
-        assert checked is not None
         assert (len(checked.points), len(checked.kept)) == (12, 48)
         again = refine_fixed(network, replace(frame, points=checked.kept))
         assert refine_fixed(network, frame_in_memory(4), validated=True).validation is None

@@ -154,7 +154,6 @@ def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
         assert not any(parameter.requires_grad for parameter in network.parameters())
         z.requires_grad_(True)
         split.rear(z).sum().backward()
-        assert z.grad is not None
         assert bool((z.grad != 0).any())
     assert all(parameter.grad is None for parameter in network.parameters())
 
