@@ -146,18 +146,6 @@ def test_nothing_of_a_image_stays_in_memory_after_the_split_closes() -> None:
     del split
 
 
-def test_only_z_requires_gradient_and_no_parameter_gets_one() -> None:
-    network, x = build("midas"), image()
-    with Split(network, "unit1") as split:
-        z = split.front(x)
-        assert not z.requires_grad
-        assert not any(parameter.requires_grad for parameter in network.parameters())
-        z.requires_grad_(True)
-        split.rear(z).sum().backward()
-        assert bool((z.grad != 0).any())
-    assert all(parameter.grad is None for parameter in network.parameters())
-
-
 @pytest.mark.parametrize(
     ("make", "layer"),
     [
@@ -239,8 +227,9 @@ def test_the_network_is_as_before_when_the_split_closes(name: str) -> None:
     network, x = prepared(name), image()
     before = state_of(network)
     with Split(network, LAYERS[name]) as split:
-        z = split.front(x).requires_grad_(True)
-        split.rear(z).sum().backward()
+        z = split.front(x)
+        assert not z.requires_grad
+        split.rear(z.requires_grad_(True)).sum().backward()
         split.rear(z.detach() + 1)
         assert before != state_of(network)
     assert before == state_of(network)
@@ -280,14 +269,3 @@ def failing(inner: nn.Module, n: int, kind: type[BaseException]) -> nn.Module:
         return y
 
     return Net(run, counted=counted)
-
-
-def test_the_networks_own_hooks_run_in_every_pass() -> None:
-    network, x = build("midas").eval(), image()
-    calls = Counting(nn.Identity())
-    network.backbone[1].register_forward_hook(lambda module, inputs, output: calls(None))
-    with Split(network, "unit1") as split, torch.no_grad():
-        z = split.front(x)
-        for _ in range(3):
-            assert torch.equal(split.rear(z), plain(network, x))
-    assert calls.calls == 1 + 3 + 3  # front, rear, plain
