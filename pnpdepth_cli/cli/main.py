@@ -22,8 +22,7 @@ Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 in
 layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
 130 interrupted. Networks in .py files are code and are run."""
 
-_LONGEST = 2000
-"""Most characters of a message; a longer one loses its middle."""
+_LONGEST = 2000  # most characters of a message; a longer one loses its middle
 
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""

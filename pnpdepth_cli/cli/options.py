@@ -17,8 +17,7 @@ from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
 FILE = click.Path(path_type=Path)
-_WITHOUT = (None, False, 0, math.inf)
-"""Defaults that are no value to show."""
+_WITHOUT = (None, False, 0, math.inf)  # defaults that are no value to show
 _NAME_COLUMN = 22
 _HELP = ("--help", "--help-all")
 _SHOW_ALL = "pnpdepth.help_all"

@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     from pnpdepth_cli.commands.make_sparse import Written
 
 _STDOUT = Path("-")
-_WIDE = 1000
-"""Columns of what is no terminal."""
-_NAMED = 3
-"""Names of frames that are listed with a warning or note."""
+_WIDE = 1000  # columns of what is no terminal
+_NAMED = 3  # names of frames that are listed with a warning or note
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 

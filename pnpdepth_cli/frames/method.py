@@ -30,8 +30,7 @@ from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""
-_TRIED = 3
-"""After so many frames that tell nothing of the registration, no more are read."""
+_TRIED = 3  # after so many frames that tell nothing of the registration, no more are read
 
 
 def check_combination(asked: Settings, networks: int) -> None:

@@ -50,8 +50,7 @@ _FIELD = re.compile(r"^[ \t]*([A-Za-z_]\w*)(?:[ \t]*:|[ \t]+(?=[-+.\d]))", re.MU
 """A name at the beginning of a line; KITTI's tracking set has names without a colon."""
 _COMMENT = re.compile(r"#.*|^---[ \t]*$", re.MULTILINE)
 
-_LARGEST = 1e9
-"""Largest number of a calibration, in pixels or metres; beyond it, products overflow."""
+_LARGEST = 1e9  # largest number of a calibration, in pixels or metres; beyond it, products overflow
 
 Floats = NDArray[np.float64]
 

@@ -25,8 +25,7 @@ from pnpdepth_cli.budget import check_claim
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 
-_LONGEST_TEXT = 1 << 20
-"""Bytes of a calibration or a pose; one has a few thousand."""
+_LONGEST_TEXT = 1 << 20  # bytes of a calibration or a pose; one has a few thousand
 _LONGEST_YAML = 1 << 17
 """Characters, parsed in 2 s at most; a calibration has a few thousand, a bag a line per topic."""
 

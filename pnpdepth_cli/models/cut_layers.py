@@ -33,8 +33,7 @@ LEAST_FRACTION = 0.5
 """Fraction of the image's shorter side that a field should span in any case. Both are the best of
 several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to LiDAR."""
 
-_SIMILAR_ASPECT = 1.3
-"""A feature map's aspect ratio is at most this factor away from the image's."""
+_SIMILAR_ASPECT = 1.3  # a feature map's aspect ratio is at most this factor away from the image's
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:

@@ -32,12 +32,10 @@ from pnpdepth_cli.points import SparsePoints
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
 
-_OFF = 1.5
-"""A prediction that is this factor off the points at the median gets a word of warning."""
+_OFF = 1.5  # a prediction that is this factor off the points at the median gets a word of warning
 _NO_BETTER = 0.98
 """Misfit over that of a constant from which on a network is said to know nothing of the scene."""
-_ENOUGH = 20
-"""Fewer points do not say so."""
+_ENOUGH = 20  # fewer points do not say so
 _MOST_LOST = 0.5
 """Fraction of the points that may lie where the prediction is unknown, without a warning."""
 _SUGGESTION_SIDE = 128  # pixels of the synthetic frame that suggests layers

@@ -20,8 +20,7 @@ Coefficients = tuple[float, ...]
 
 _WIDEST_PLANE, _WIDEST_ANGLE = 10.0, 1.569
 """Where a lens is checked: the tangent of the angle to the axis, and that of a fisheye, radians."""
-_RADIAL = (0, 1, 4, 5, 6, 7)
-"""Which coefficients of a radial-tangential lens are radial."""
+_RADIAL = (0, 1, 4, 5, 6, 7)  # which coefficients of a radial-tangential lens are radial
 
 _SAMPLES = 8192
 _NEWTON_STEPS = 12

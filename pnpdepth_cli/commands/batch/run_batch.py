@@ -17,10 +17,8 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
-_MAX_LISTED = 5
-"""Files named in messages; the rest is counted, and summary.json lists all."""
-_READERS = 8
-"""Threads that read records, whose time on network storage is waiting."""
+_MAX_LISTED = 5  # files named in messages; the rest is counted, and summary.json lists all
+_READERS = 8  # threads that read records, whose time on network storage is waiting
 
 
 def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:

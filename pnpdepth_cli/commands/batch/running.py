@@ -41,10 +41,8 @@ DECIDING = 16
 _CONNECT_S = 5.0
 _FRAMES_OF_A_CALL = 8
 """Frames that are read and written beside the network; fewer where that leaves workers idle."""
-_TRIES = 3
-"""How often a frame is tried whose worker dies."""
-_DEATHS = 2 * _TRIES
-"""So many deaths before any frame is refined end the batch."""
+_TRIES = 3  # how often a frame is tried whose worker dies
+_DEATHS = 2 * _TRIES  # so many deaths before any frame is refined end the batch
 
 
 def refine_all(

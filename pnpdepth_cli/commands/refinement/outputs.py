@@ -29,8 +29,7 @@ from pnpdepth_cli.sensors.point_cloud import kept_pixels
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
-_MUCH = 0.1
-"""Part of an image outside of the points from which it is said."""
+_MUCH = 0.1  # part of an image outside of the points from which it is said
 
 LARGEST_VIEW = 200_000
 """Most points of a 3D view, but for what its borders round."""

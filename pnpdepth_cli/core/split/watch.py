@@ -201,8 +201,7 @@ class _EscapeMode(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-_NO_STORAGE = 0
-"""The mark of sparse tensors, which have no storage."""
+_NO_STORAGE = 0  # the mark of sparse tensors, which have no storage
 
 
 def _storage(tensor: Tensor) -> int:

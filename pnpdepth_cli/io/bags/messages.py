@@ -31,8 +31,7 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Data types of sensor_msgs/PointField."""
 
-_MOST_WAITING = 64
-"""Images or scans that wait for a partner; further ones push the oldest out."""
+_MOST_WAITING = 64  # images or scans that wait for a partner; further ones push the oldest out
 
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
