@@ -27,13 +27,11 @@ SLOW_FIXTURES = {"chrome", "shared_data"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds --rounding."""
     text = "change the results of torch's products as another processor could"
     parser.addoption("--rounding", action="store_true", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Enters the mode of --rounding for the whole session."""
     if config.getoption("--rounding"):
         from tests.rounding import enter_in_every_thread
 
@@ -59,7 +57,6 @@ def frame(tmp_path: Path) -> FrameOnDisk:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the tests of the second tier that their fixtures tell."""
     for item in items:
         if SLOW_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)

@@ -130,7 +130,6 @@ def fields() -> str:
 
 
 def pages() -> dict[Path, str]:
-    """What the files have to hold."""
     schema = msgspec.json.schema(frame_record.FrameRecord)
     texts = {DOCS / "record.schema.json": json.dumps(schema, indent=1, sort_keys=True) + "\n"}
     for name, made in (("python-api.md", signatures()), ("record.md", fields())):

@@ -30,7 +30,6 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def output(capsys: pytest.CaptureFixture[str], line: str) -> str:
-    """What the command prints on stdout."""
     assert run(line.split()) == 0
     return capsys.readouterr().out
 

@@ -82,7 +82,6 @@ def write(folder: Path, text: str) -> Path:
 
 
 def opencv_file(coefficients: list[float], **others: int) -> str:
-    """What OpenCV writes."""
     file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for name, value in {"image_width": 640, "image_height": 480, **others}.items():
         file.write(name, value)

@@ -13,7 +13,6 @@ from pnpdepth_cli.io.visualisation import UNKNOWN, depth_scale, improvement, pre
 
 
 def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
-    """The panels of a figure by title."""
     with Image.open(path) as image:
         pixels = np.asarray(image)
     assert content.size == pixels.shape[1::-1]
