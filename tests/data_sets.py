@@ -46,9 +46,9 @@ TREES = {
         ["training_000000", "training_000001"],
     ),
     "kitti-odometry": (
-        "sequences/{00,03}/image_2/000000.png sequences/{00,03}/velodyne/000000.bin"
+        "sequences/{00,03}/image_2/00000{0,2}.png sequences/{00,03}/velodyne/00000{0,2}.bin"
         " sequences/{00,03}/calib.txt",
-        ["00_000000", "03_000000"],
+        ["00_000000", "00_000002", "03_000000", "03_000002"],
     ),
     "kitti-depth": (
         f"image/{SELECTED.format('image')}.png intrinsics/{SELECTED.format('image')}.txt"

@@ -24,17 +24,13 @@ from tests.data_sets import (
     SELECTED,
     TREES,
     WIDTH,
-    Maker,
     codes,
-    eth3d,
     image,
     mask,
     read_frames,
-    record3d,
     stray_scanner,
     touch,
     tree,
-    tum,
 )
 
 
@@ -151,16 +147,11 @@ def test_kittis_depth_without_the_raw_images_says_where_it_looked(tmp_path: Path
         read_frames(tmp_path)
 
 
-def odometry(root: Path) -> None:
-    tree(root, TREES["kitti-odometry"][0])
-    tree(root, "sequences/00/{image_2/000002.png,velodyne/000002.bin} poses/00.txt")
-
-
 def test_odometry_has_poses_by_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    odometry(tmp_path)
+    tree(tmp_path, f"{TREES['kitti-odometry'][0]} poses/00.txt")
     rows = [f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in ("0.5", "1", "-1.5e-01")]
     (tmp_path / "poses/00.txt").write_text("".join(rows))
-    assert [frame.pose for frame in read_frames(tmp_path)] == [at_x(0.5), at_x(-0.15), None]
+    assert [frame.pose for frame in read_frames(tmp_path)] == [at_x(0.5), at_x(-0.15), None, None]
     monkeypatch.chdir(tmp_path / "sequences/00")
     assert [f.pose for f in read_frames(Path())] == [at_x(0.5), at_x(-0.15)]
 
@@ -198,25 +189,26 @@ def inputs_of(files: FrameFiles) -> Frame:
 
 
 @pytest.mark.parametrize(
-    ("make", "file", "text", "named"),
+    ("name", "file", "text", "named"),
     [
-        (odometry, "poses/00.txt", "", r"00\.txt"),
-        (odometry, "poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0", r"000002\.png"),
-        (tum, "rgb.txt", "nan rgb/a.png", "line 1"),
-        (tum, "depth.txt", "soon depth/1.png", "line 1"),
-        (tum, "rgb.txt", "1.0", "line 1"),
-        (tum, "rgb.txt", "1.0 rgb/a\0.png", r"rgb/a\\x00\.png"),
-        (tum, "associations.txt", "0 rgb/0.png 0", "line 1"),
-        (tum, "associations.txt", "0 rgb/0.png 0 rgb/1.png", "line 1"),
-        (eth3d, "office/ground_truth_depth/dslr_images/DSC_0219.JPG", "0" * 12, r"DSC_0219\.JPG"),
-        (stray_scanner, "odometry.csv", "header\n0, 0, x, 0, 0, 0, 0, 0, 1", r"odometry\.csv"),
-        (stray_scanner, "rgb.mp4", "#EXTM3U\nhttp://localhost/video.ts\n", r"rgb\.mp4"),
+        ("kitti-odometry", "poses/00.txt", "", r"00\.txt"),
+        ("kitti-odometry", "poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0", r"000002\.png"),
+        ("tum", "rgb.txt", "nan rgb/a.png", "line 1"),
+        ("tum", "depth.txt", "soon depth/1.png", "line 1"),
+        ("tum", "rgb.txt", "1.0", "line 1"),
+        ("tum", "rgb.txt", "1.0 rgb/a\0.png", r"rgb/a\\x00\.png"),
+        ("tum", "associations.txt", "0 rgb/0.png 0", "line 1"),
+        ("tum", "associations.txt", "0 rgb/0.png 0 rgb/1.png", "line 1"),
+        ("eth3d", "office/ground_truth_depth/dslr_images/DSC_0219.JPG", "0" * 12, r"DSC_0219\.JPG"),
+        ("stray-scanner", "odometry.csv", "header\n0, 0, x, 0, 0, 0, 0, 0, 1", r"odometry\.csv"),
+        ("stray-scanner", "rgb.mp4", "#EXTM3U\nhttp://localhost/video.ts\n", r"rgb\.mp4"),
     ],
 )
 def test_a_file_of_a_data_set_that_means_nothing_is_named(
-    make: Maker, file: str, text: str, named: str, tmp_path: Path
+    name: str, file: str, text: str, named: str, tmp_path: Path
 ) -> None:
-    make(tmp_path)
+    MAKERS[name][0](tmp_path)
+    touch(tmp_path / file)
     (tmp_path / file).write_text(f"{text}\n")
     with pytest.raises(InputError, match=named):
         inputs_of(read_frames(tmp_path)[0])
@@ -333,9 +325,9 @@ def test_what_a_layout_lacks_is_named(name: str, place: str, lacks: str, tmp_pat
     assert lacks in str(error.value)
 
 
-@pytest.mark.parametrize(("make", "confident"), [(stray_scanner, 0.75), (record3d, 1.0)])
-def test_a_phones_recording_is_a_frame(make: Maker, confident: float, tmp_path: Path) -> None:
-    make(tmp_path)
+@pytest.mark.parametrize(("name", "confident"), [("stray-scanner", 0.75), ("record3d", 1.0)])
+def test_a_phones_recording_is_a_frame(name: str, confident: float, tmp_path: Path) -> None:
+    MAKERS[name][0](tmp_path)
     frame = inputs_of(read_frames(tmp_path)[2])
     assert len(frame.points) == confident * HEIGHT * WIDTH / 4
     np.testing.assert_allclose(frame.points.depth, 2)
