@@ -1,5 +1,3 @@
-"""Which points are outliers, and how much each point weighs."""
-
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""The influential field, where it can be counted by hand."""
-
 from __future__ import annotations
 
 import pytest

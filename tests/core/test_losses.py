@@ -1,5 +1,3 @@
-"""Losses against values worked out by hand."""
-
 from __future__ import annotations
 
 from math import inf, isfinite, log

@@ -1,5 +1,3 @@
-"""Scores against values worked out by hand and against plain numpy."""
-
 from __future__ import annotations
 
 import pickle

@@ -1,5 +1,3 @@
-"""Lens distortion is that of OpenCV, and undoing it gives the direction back."""
-
 from __future__ import annotations
 
 import cv2
