@@ -102,17 +102,11 @@ def refinement(root: Path, **changes: Any) -> RefineRequest:
     return RefineRequest().with_fields(**fields | changes)
 
 
-def batch(
-    root: Path,
-    listener: Recorder | None = None,
-    *,
-    refine: dict[str, Any] | None = None,
-    **changes: Any,
-) -> BatchSummary:
+def batch(root: Path, listener: Recorder | None = None, **changes: Any) -> BatchSummary:
     """A batch of the folder into its out/."""
-    fields: dict[str, Any] = {"source": root, "output": root / "out"}
-    request = BatchRequest(refine=refinement(root, **(refine or {})), **fields | changes)
-    return run_batch(request, listener or Recorder())
+    fields: dict[str, Any] = {"source": root, "output": root / "out"} | changes
+    fields["refine"] = refinement(root, **fields.get("refine", {}))
+    return run_batch(BatchRequest(**fields), listener or Recorder())
 
 
 def done(root: Path, listener: Recorder | None = None, **changes: Any) -> list[str]:

@@ -92,9 +92,7 @@ def test_pixels_that_are_far_not_valid_or_not_sure_are_left_out(tmp_path: Path) 
     assert written(path, tmp_path / "b.ply", max_sigma=0.1)[0] == (HEIGHT - 4) * (WIDTH - 8)
 
 
-def test_frames_are_one_cloud_in_the_world_in_which_views_agree_and_voxels_merge(
-    tmp_path: Path,
-) -> None:
+def test_frames_are_one_cloud_in_which_views_agree_and_voxels_merge(tmp_path: Path) -> None:
     out, cloud, poses = tmp_path / "out", tmp_path / "o.ply", tmp_path / "poses.txt"
     for name, depth in (("a", 2.0), ("b", 2.0), ("c", 3.0)):
         frame(out, name, depth)

@@ -94,10 +94,7 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, "cannot be written (file exists)", output=below)
     refused(frame, OutputError, ".jpg", output="s.jpg")
     assert (frame.folder / "sparse_overlay.png").is_file()
-
-
-def test_options_of_a_scan_are_refused_for_anything_else(frame: ScanOnDisk) -> None:
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError):  # options of a scan
         ScanOptions(extrinsics=frame.calib).describes(frame.gt)
 
 

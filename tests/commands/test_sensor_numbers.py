@@ -106,9 +106,7 @@ def write_list(path: Path, rows: NDArray[Any]) -> None:
 
 @pytest.mark.parametrize("name", ["a.npy", "a.txt", "a.csv"])
 @pytest.mark.parametrize("columns", [3, 4])
-def test_a_list_with_a_calibration_is_a_scan_unless_it_has_pixels(
-    tmp_path: Path, scan: Rows, name: str, columns: int
-) -> None:
+def test_a_list_is_a_scan_or_of_pixels(tmp_path: Path, scan: Rows, name: str, columns: int) -> None:
     write_list(tmp_path / name, scan[:, :columns])
     same_points(tmp_path / name, scan[:, :3])
     with pytest.raises(InputError, match="--calib"):
@@ -120,9 +118,7 @@ def test_a_list_with_a_calibration_is_a_scan_unless_it_has_pixels(
 
 
 @pytest.mark.parametrize("silent", [0.0, np.nan, [1.2, 0.0, 0.9], [0.0, 0.0, 1e10]])
-def test_beams_without_return_are_no_points_and_are_counted(
-    tmp_path: Path, scan: Rows, silent: float | list[float]
-) -> None:
+def test_silent_beams_are_noted(tmp_path: Path, scan: Rows, silent: float | list[float]) -> None:
     rows = np.concatenate([scan, np.zeros((9000, 4))])
     rows[-9000:, :3] = silent
     rows = rows[np.random.default_rng(0).permutation(len(rows))].astype("<f4")
@@ -168,15 +164,13 @@ def warnings_of(sparse: Path = STREET / "000000.bin", **scan: Any) -> list[str]:
     return [note for note in read(sparse, scan=options).notes if note.startswith("warning: ")]
 
 
-@pytest.mark.parametrize(("axis", "name"), [(1, "y"), (2, "z")])
-def test_a_mirrored_scan_is_warned_of_with_the_better_reading(
-    axis: int, name: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_mirrored_scan_is_warned_of_with_the_better_reading(axis: int, tmp_path: Path) -> None:
     mirrored = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
     mirrored[:, axis] *= -1
     mirrored.tofile(tmp_path / "mirrored.bin")
     (warning,) = warnings_of(tmp_path / "mirrored.bin")
-    assert f"with {name} of the scan negated" in warning
+    assert f"with {'xyz'[axis]} of the scan negated" in warning
 
 
 def test_a_calibration_that_the_image_contradicts_is_warned_of(tmp_path: Path) -> None:
@@ -212,9 +206,7 @@ def indoor(
 @pytest.mark.parametrize(
     ("suffix", "of"), [(".png", 2), (".png", 255), (".npy", 2), (".npy", 255), (".exr", 1)]
 )
-def test_only_sparse_depth_of_enough_confidence_is_used(
-    tmp_path: Path, suffix: str, of: int
-) -> None:
+def test_only_depth_of_enough_confidence_is_used(tmp_path: Path, suffix: str, of: int) -> None:
     rng, truth = np.random.default_rng(0), codes_of(INDOOR / "gt.png") / 1000
     small = truth[1::4, 1::4].copy()  # of a phone, a quarter of the image's size
     confidence = rng.integers(0, 3, small.shape)
@@ -282,9 +274,7 @@ def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> Non
     np.testing.assert_allclose(frame.image, pixels / 255, atol=1e-6)
 
 
-def test_extrinsics_with_a_calibration_of_kitti_are_rectified_as_its_own_are(
-    tmp_path: Path, scan: Rows
-) -> None:
+def test_extrinsics_with_kittis_calibration_are_rectified_too(tmp_path: Path, scan: Rows) -> None:
     turn = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
     np.savetxt(tmp_path / "pose.txt", turn.T @ matrix("Tr_velo_to_cam"))  # of the unrectified one
     other = np.eye(3, 4)  # another sensor's

@@ -54,9 +54,7 @@ def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: 
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_gain_is_in_per_cent_of_the_first_and_its_interval_narrows_with_equal_gains(
-    sign: int,
-) -> None:
+def test_the_gain_is_in_per_cent_of_the_first_and_narrow_for_equal_gains(sign: int) -> None:
     before = np.random.default_rng(0).lognormal(0, 1, 9)
     noise = np.random.default_rng(1).uniform(0.3, 0.7, 9)
     change, clusters = partial(statistics.gain, sign=sign), clusters_of(np.arange(9))

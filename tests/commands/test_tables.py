@@ -11,17 +11,15 @@ from pnpdepth_cli.commands.tables import Table, refinement_tables
 from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 
-CHANGES = [
-    (1.0, nan, "–", "dim"),
-    (0.0, 1.0, "–", "dim"),
-    (2.0, 2.0, "+0.0%", "dim"),
-    (1.0, 0.5, "-50.0%", "good"),
-    (1.0, 1.5, "+50.0%", "bad"),
-]
-
 
 def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
-    for before, after, *cell in CHANGES:
+    for before, after, *cell in (
+        (1.0, nan, "–", "dim"),
+        (0.0, 1.0, "–", "dim"),
+        (2.0, 2.0, "+0.0%", "dim"),
+        (1.0, 0.5, "-50.0%", "good"),
+        (1.0, 1.5, "+50.0%", "bad"),
+    ):
         assert [*tables.change(before, after)] == cell
 
 

@@ -37,8 +37,11 @@ def layers_of(network: nn.Module) -> tuple[str, ...]:
     return suggest_layers(network, (IMAGE,), lambda output: output)
 
 
-def test_the_last_layer_of_each_resolution_from_the_bottleneck_on_is_listed() -> None:
-    assert layers_of(net()) == ("relu", "up")
+def test_the_last_layer_of_each_resolution_that_runs_once_is_listed() -> None:
+    network = net()
+    assert layers_of(network) == ("relu", "up")
+    network.relu = network.squash = nn.ReLU(inplace=True)
+    assert layers_of(network) == ("middle", "up")
 
 
 def test_a_front_without_gradient_is_reported() -> None:
@@ -46,12 +49,6 @@ def test_a_front_without_gradient_is_reported() -> None:
     network[0].forward = torch.no_grad()(network[0].forward)  # type: ignore[method-assign]
     with pytest.raises(ModelError):
         layers_of(network)
-
-
-def test_a_layer_that_runs_twice_is_not_listed() -> None:
-    network = net()
-    network.relu = network.squash = nn.ReLU(inplace=True)
-    assert layers_of(network) == ("middle", "up")
 
 
 # ------------------------------------------------------------------ for the points
@@ -76,9 +73,7 @@ def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
 
 
 @pytest.mark.parametrize(("points", "layer"), [(20, "0"), (1536, "2"), (0, "0")])
-def test_few_points_want_a_deep_layer_and_many_a_late_one_if_the_definition_names_none(
-    points: int, layer: str, network: Network
-) -> None:
+def test_few_points_want_a_deep_layer_unless_set(points: int, layer: str, network: Network) -> None:
     assert default_layer(network, (32, 48), points) == layer
     for stated in ({"layers": ("2",)}, {"defaults": Settings(layer="2")}):
         definition = replace(network.definition, **stated)

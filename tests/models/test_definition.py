@@ -44,7 +44,7 @@ def test_arguments_come_in_the_order_of_the_input_kind() -> None:
         (("n", 3, "h", "w"), Multiple(8)),
     ],
 )
-def test_an_image_of_a_graph_has_three_channels_first_or_last(
+def test_three_channels_are_first_or_last(
     shape: tuple[object, ...], size: Fixed | Multiple
 ) -> None:
     known = {"size": Multiple(8), "build": nn.Identity}
@@ -75,8 +75,6 @@ def test_an_image_of_a_graph_has_three_channels_first_or_last(
         *((definition, hook, "x") for hook in ("read_checkpoint", "arguments", "output", "verify")),
     ],
 )
-def test_a_field_that_makes_no_sense_is_refused_by_its_name(
-    make: Callable[..., object], field: str, value: object
-) -> None:
+def test_a_bad_field_is_named(make: Callable[..., object], field: str, value: object) -> None:
     with pytest.raises(ModelError, match=rf"\A.* {field}=.*\Z"):
         make(**{field: value})

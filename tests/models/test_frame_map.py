@@ -33,9 +33,7 @@ def every_pixel(height: int, width: int) -> SparsePoints:
 
 
 @given(policies, sides, sides)
-def test_any_image_fits_any_policy_and_depth_comes_back_in_its_size(
-    policy: Fixed | Multiple, height: int, width: int
-) -> None:
+def test_any_image_fits_and_comes_back(policy: Fixed | Multiple, height: int, width: int) -> None:
     frame = FrameMap.fit(policy, height, width)
     resized = frame.rgb_to_network(torch.rand(1, 3, height, width))
     assert tuple(resized.shape) == (1, 3, *frame.network)
@@ -58,9 +56,7 @@ def test_any_image_fits_any_policy_and_depth_comes_back_in_its_size(
 @pytest.mark.parametrize(
     "policy", [Fixed(30, 40), Fixed(30, 40, "crop"), Multiple(32, longest=40), Near(of=8, width=40)]
 )
-def test_what_a_point_reads_in_the_network_is_what_is_at_its_pixel(
-    policy: Fixed | Multiple | Near, size: tuple[int, int]
-) -> None:
+def test_points_stay_at_their_pixel(policy: Fixed | Multiple | Near, size: tuple[int, int]) -> None:
     frame = FrameMap.fit(policy, *size)
     network = frame.rgb_to_network(ramps(*size))
     there = frame.points_to_network(every_pixel(*size))
@@ -86,9 +82,7 @@ def test_sizes_are_cropped_in_the_middle_shrunk_to_the_longest_or_near_as_transf
 
 
 @pytest.mark.parametrize("size", [Multiple(32), Fixed(20, 30), Fixed(20, 30, "crop"), Near(of=16)])
-def test_a_prior_keeps_its_depths_and_is_unknown_beside_unknown_pixels_and_padding(
-    size: Fixed | Multiple | Near,
-) -> None:
+def test_a_prior_stays_but_beside_the_unknown_and_padding(size: Fixed | Multiple | Near) -> None:
     frame, prior = FrameMap.fit(size, 50, 70), torch.full((1, 1, 50, 70), 3.0)
     whole = frame.prior_to_network(prior)
     expected = torch.zeros(1, 1, *frame.network)

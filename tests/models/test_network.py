@@ -71,9 +71,7 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
     ("of_depth", "of_noise", "count", "said"),
     [(0.0, 1.0, 200, True), (0.3, 0.0, 200, False), (0.3, 0.5, 200, False), (0.0, 1.0, 10, False)],
 )
-def test_a_network_that_is_no_better_than_the_median_depth_is_named(
-    of_depth: float, of_noise: float, count: int, said: bool
-) -> None:
+def test_a_blind_network_is_named(of_depth: float, of_noise: float, count: int, said: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     depth = torch.exp(torch.rand(1, 1, 40, 40, generator=generator) * 2)
     unrelated = torch.rand(1, 1, 40, 40, generator=generator)
@@ -88,9 +86,7 @@ def test_a_network_that_is_no_better_than_the_median_depth_is_named(
 # ------------------------------------------------------------------ loading
 
 
-def test_weights_come_from_the_file_named_or_the_definitions_own_and_never_by_chance(
-    tmp_path: Path,
-) -> None:
+def test_weights_come_from_the_named_file_or_the_definition_never_by_chance(tmp_path: Path) -> None:
     weights = tmp_path / "own.safetensors"
     save_file({"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}, weights)
     bare = definition(build=lambda: nn.Conv2d(1, 1, 1), layers=("",))

@@ -95,9 +95,7 @@ def written(folder: Path, text: str, name: str = "mine.py") -> Path:
     return file
 
 
-def test_a_file_gives_its_definition_or_a_function_and_may_import_what_is_beside_it(
-    tmp_path: Path,
-) -> None:
+def test_a_file_gives_its_definition_or_a_function_and_imports_neighbours(tmp_path: Path) -> None:
     written(tmp_path, "WIDTH = 7", "beside.py")
     file = written(tmp_path, GOOD)
     assert find_definition(str(file)).build().out_channels == 7
@@ -123,9 +121,7 @@ def test_an_error_in_a_model_file_names_its_line(text: str, place: str, tmp_path
 
 
 @pytest.mark.parametrize("spec", ["absent.py", "mine.py:network", "mine.py:x", "popping.py"])
-def test_what_is_missing_or_no_definition_is_refused_and_the_search_path_stays(
-    spec: str, tmp_path: Path
-) -> None:
+def test_what_is_no_definition_is_refused_and_the_path_stays(spec: str, tmp_path: Path) -> None:
     written(tmp_path, "x = 1\n")
     written(tmp_path, "import sys; sys.path.pop(0)", "popping.py")
     before = list(sys.path)

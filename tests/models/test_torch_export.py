@@ -207,7 +207,7 @@ def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -
             find_definition(str(path))
 
 
-def test_pickles_libraries_and_code_in_an_archive_are_left_alone(
+def test_pickles_libraries_and_code_in_an_archive_stay_unread(
     archive: Path, tmp_path: Path
 ) -> None:
     trap = tmp_path / "trap"

@@ -101,9 +101,7 @@ def test_a_mistake_of_all_frames_or_the_user_ends_a_batch(cluster: Any, root: Pa
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
 
 
-def test_addresses_of_clusters_what_is_none_and_the_missing_extra(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_addresses_of_clusters_are_checked(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"):
         assert parse_address(text) == text
     for text in ("frames/", "out", "ray://host", "a/b:1"):
@@ -144,9 +142,7 @@ def recorded(out: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_killed_many_times_at_random_moments_it_ends_byte_identical(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_kills_do_not_change_a_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])  # so that a batch begins in milliseconds

@@ -44,9 +44,7 @@ def run(folder: Path, errors: Iterable[float]) -> str:
 
 
 @pytest.mark.parametrize("frames", [3, 6])
-def test_a_lower_error_is_a_gain_with_an_interval_if_frames_are_not_too_few(
-    tmp_path: Path, frames: int
-) -> None:
+def test_a_lower_error_is_a_gain_with_interval_from_6_frames(tmp_path: Path, frames: int) -> None:
     errors, factors = np.random.default_rng(0).uniform(0.5, 0.9, (2, frames))
     better = errors * factors
     comparison = compare([run(tmp_path / "one", errors), run(tmp_path / "two", better)])
@@ -81,9 +79,7 @@ def test_p_values_are_adjusted_for_the_number_of_measures_and_runs(tmp_path: Pat
         compare([one])
 
 
-def test_the_best_of_a_column_is_bold_and_stars_and_colours_are_the_p_values(
-    tmp_path: Path,
-) -> None:
+def test_the_best_of_a_column_is_bold_and_p_values_are_stars_and_colours(tmp_path: Path) -> None:
     errors = np.random.default_rng(0).uniform(0.5, 1, 12)
     factors = {"a": 1.0, "b": 0.5, "c": 2.0}
     paths = [run(tmp_path / name, factor * errors) for name, factor in factors.items()]
@@ -121,9 +117,7 @@ def test_what_not_all_runs_have_is_left_out_and_reported(tmp_path: Path) -> None
     assert comparison.notes[1].startswith("iMAE: over 8 of 9 frames")
 
 
-def test_runs_of_other_definitions_frames_or_pixels_are_refused_or_warned_of(
-    tmp_path: Path,
-) -> None:
+def test_runs_of_other_definitions_frames_or_pixels_are_refused_or_said(tmp_path: Path) -> None:
     evaluated = []
     for prediction, options in (
         ([11, 11], {}),
@@ -189,9 +183,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return written
 
 
-def test_numbers_lie_along_the_axis_names_make_lines_and_a_point_is_the_mean_over_seeds(
-    tmp_path: Path, figures: list[Any]
-) -> None:
+def test_a_plot_has_an_axis_lines_and_means_over_seeds(tmp_path: Path, figures: list[Any]) -> None:
     errors = {"100 x 0": 0.5, "20 x 0": 1.0, "20 x 1": 0.5, "20 y 0": 0.5, "100 y 0": 1.25}
     runs = []
     for values, mae in errors.items():
@@ -221,9 +213,7 @@ def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: li
     assert (tmp_path / "p.png").read_bytes() == before
 
 
-def test_a_plot_needs_one_option_a_known_format_leave_to_replace_a_file_and_matplotlib(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_plot_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     options = ({"lr": "1%"}, {"lr": "3%"}, {"loss": "l2"})
     one, two, other = (refined(tmp_path, 0.5, **varied) for varied in options)

@@ -119,9 +119,7 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> No
     assert found == {"north/0": "done", "south/0": "done"}
 
 
-def test_images_count_alike_and_one_without_prediction_in_neither_means_nor_coverage(
-    tmp_path: Path,
-) -> None:
+def test_images_count_alike_and_one_without_prediction_not_at_all(tmp_path: Path) -> None:
     depth_file(tmp_path / "gt" / "c.npy", [[1, 1]])
     sparse = FileRecord(path=str(depth_file(tmp_path / "sparse.npy", [[0, 9]])))
     for name, prediction, gt in (("a", [2, 3], [1, 4]), ("ü b", [8, 0], [5, 5])):
@@ -199,9 +197,7 @@ def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     assert result.counts["coverage"] == pytest.approx(coverage)
 
 
-def test_an_interval_ends_at_what_the_measure_can_be_and_few_groups_have_none(
-    tmp_path: Path,
-) -> None:
+def test_an_interval_ends_at_what_a_measure_can_be_and_few_groups_have_none(tmp_path: Path) -> None:
     for name, depth in zip("abcdefgh", [2.0] * 6 + [2.1, 9.0], strict=True):
         frame(tmp_path / "one", [[depth]], [[2]], name)
         frame(tmp_path / "two", [[depth]], [[2]], f"{'fg'[name > 'd']}/{name}")
@@ -214,9 +210,7 @@ def test_an_interval_ends_at_what_the_measure_can_be_and_few_groups_have_none(
     assert [each.group for each in result.frames] == ["f"] * 4 + ["g"] * 4
 
 
-def test_integer_files_are_read_by_option_then_by_themselves_then_by_protocol(
-    tmp_path: Path,
-) -> None:
+def test_integer_files_are_read_by_option_then_themselves_then_protocol(tmp_path: Path) -> None:
     for folder in ("out", "gt"):
         code_image(tmp_path / folder / "a.png", np.full((480, 640), 1000))
     by_option = scored(tmp_path, pred_scale=1000.0, gt_scale=1000.0)

@@ -73,9 +73,7 @@ def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: Fram
         assert path.read_bytes() == (frame.folder / "b" / path.name).read_bytes()
 
 
-def test_results_are_whole_and_replaced_only_on_request_and_inputs_never(
-    frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_whole_and_kept(frame: FrameOnDisk, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise StorageError("the disk is full")
 

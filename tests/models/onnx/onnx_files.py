@@ -14,7 +14,6 @@ def write_network(
     *,
     shape: tuple[Any, ...] = (1, 3, 32, 48),
     opset: int = 13,
-    channels_last: bool = False,
     nodes: tuple[Any, ...] = (),
     outputs: tuple[str, ...] = ("depth",),
     domain: str = "",
@@ -26,6 +25,7 @@ def write_network(
         values = rng.normal(size=size) / np.sqrt(np.prod(size[1:]))
         return numpy_helper.from_array(values.astype(np.float32), name)
 
+    channels_last = shape[3] == 3
     image = "nchw" if channels_last else "rgb"
     body = [
         helper.make_node("Conv", [image, "w1"], ["a"], "enc/conv.1", pads=[1] * 4, strides=[2, 2]),

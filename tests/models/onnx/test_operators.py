@@ -164,8 +164,6 @@ UNCOVERED: list[tuple[str, list[np.ndarray | None], dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("op", "inputs", "more"), UNCOVERED)
-def test_what_an_operator_does_not_cover_is_refused_by_its_name(
-    op: str, inputs: list[Any], more: dict[str, Any]
-) -> None:
+def test_what_is_not_covered_is_refused(op: str, inputs: list[Any], more: dict[str, Any]) -> None:
     with pytest.raises(ModelError, match=op):
         outputs_of(model_of(op, inputs, 17, **more), inputs[0])

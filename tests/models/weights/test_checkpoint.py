@@ -7,6 +7,7 @@ import os
 import struct
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,6 @@ def loads(path: Path, expected: Mapping[str, Tensor]) -> list[str]:
     return notes
 
 
-def save_older(content: Any, path: Path) -> None:
-    torch.save(content, path, _use_new_zipfile_serialization=False)
-
-
 def save_arrays(state: Mapping[str, Tensor], path: Path) -> None:
     npy_of(path, pickled({name: tensor.numpy() for name, tensor in state.items()}))
 
@@ -58,6 +55,7 @@ def save_beside(state: Any, path: Path) -> None:
     torch.save({"epoch": 3, "optimizer": optimiser, "state_dict": OrderedDict(state)}, path)
 
 
+save_older = partial(torch.save, _use_new_zipfile_serialization=False)
 SAVES = {".safetensors": save_file, ".pth": torch.save, ".pth.tar": save_older, ".npy": save_arrays}
 
 
@@ -68,7 +66,7 @@ def test_every_format_and_layout_gives_the_same_weights(suffix: str, tmp_path: P
 
 
 @pytest.mark.parametrize("prefix", ["module.", "module.module.", "_orig_mod.", "model._orig_mod."])
-def test_prefixes_of_parallel_compiled_and_lightning_modules_are_stripped(
+def test_prefixes_of_parallel_and_compiled_modules_are_stripped(
     prefix: str, tmp_path: Path
 ) -> None:
     torch.save(
@@ -79,9 +77,7 @@ def test_prefixes_of_parallel_compiled_and_lightning_modules_are_stripped(
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_of_several_state_dictionaries_the_one_that_is_read_is_named(
-    order: int, tmp_path: Path
-) -> None:
+def test_of_several_states_the_one_that_is_read_is_named(order: int, tmp_path: Path) -> None:
     averaged = {name: 2 * tensor for name, tensor in weights().items()}
     states = {"model": weights(), "ema": averaged, "epoch": 7}
     torch.save(dict(list(states.items())[::order]), tmp_path / "w.pth")

@@ -41,7 +41,7 @@ def save(content: Any, path: Path, new: bool = True) -> Path:
 
 
 @both_layouts
-def test_of_a_whole_module_the_state_is_read_and_what_was_not_run_is_named(
+def test_of_a_whole_module_the_state_is_read_and_the_rest_is_named(
     tmp_path: Path, new: bool
 ) -> None:
     net, notes = Net(), list[str]()
@@ -189,9 +189,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_no_dict_of_arrays_or_larger_than_the_file_is_refused(
-    kind: str, tmp_path: Path
-) -> None:
+def test_what_is_no_dict_of_arrays_or_too_large_is_refused(kind: str, tmp_path: Path) -> None:
     path = npy_of(tmp_path / "bomb.npy", pickled(REFUSED[kind]))
     with little():
         refused(path)
