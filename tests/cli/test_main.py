@@ -57,12 +57,14 @@ COMMANDS = {
         ("compare a.json b.json", "--csv x --latex ./x", 2, "--csv and --latex are the same file"),
         ("eval", "--json --csv -", 2, "can go to stdout"),
         ("eval", "--protocol nyu-eigen", 3, "640×480"),
+        ("batch images.csv", "-o out", 2, "nor has it ground truth"),
         ("compare missing.json", "missing.json", 3, "missing.json"),
     ],
 )
 def test_the_exit_code_is_that_of_the_kind_of_error(
     root: Path, capsys: pytest.CaptureFixture[str], command: str, more: str, code: int, message: str
 ) -> None:
+    Path("images.csv").write_text("image\ndrive/rgb/a.png\n")
     Path("one_pose.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     before = sorted(root.rglob("*"))
     assert run(f"{command} {COMMANDS.get(command.split()[-1], '')} {more}".split()) == code
