@@ -6,7 +6,7 @@ from torch import nn
 
 from pnpdepth_cli.core.influence import Patch, influential_field
 from pnpdepth_cli.core.split import Split
-from tests.core.networks import Net, conv, image
+from tests.core.networks import Counting, Net, conv, image
 
 
 def field(network: nn.Module, layer: str) -> tuple[Patch | None, Patch]:
@@ -29,13 +29,8 @@ def test_a_field_is_as_wide_as_counted_if_it_has_a_patch() -> None:
 @pytest.mark.parametrize(("enough", "tried"), [(None, 3), (1, 1), (2, 3), (3, 1)])
 def test_points_are_tried_until_a_side_is_enough_or_far(enough: float | None, tried: int) -> None:
     network = nn.Sequential(conv(3, 4), nn.Conv2d(4, 1, (3, 1), padding=(1, 0)))
-    calls = list[object]()
-
-    def counted(output: torch.Tensor) -> torch.Tensor:
-        calls.append(output)
-        return output
-
+    counted = Counting(nn.Identity())
     with Split(network, "0") as split:
         found = influential_field(split, split.front(image(32, 32)), counted, enough)
     assert found == ((3, 1), (5, 1))
-    assert len(calls) == 1 + tried
+    assert counted.calls == 1 + tried

@@ -19,10 +19,9 @@ from pnpdepth_cli.frames.open_network import prepare
 from tests.frames.scenes import SIZE, frame_in_memory
 
 SETTINGS = pnp.Settings(iterations=0)
-Pair = tuple[NDArray[np.float32], pnp.SparsePoints]
 
 
-def pair(seed: int, count: int = 60) -> Pair:
+def pair(seed: int, count: int = 60) -> tuple[NDArray[np.float32], pnp.SparsePoints]:
     frame = frame_in_memory(count, seed)
     return np.ascontiguousarray(frame.rgb.permute(1, 2, 0).numpy()), frame.points
 
@@ -55,31 +54,22 @@ def test_learnt_weights_are_used_while_the_refiner_is_open(
         by_hand = pnp.refine(network, *FRAMES[0], SETTINGS)
     assert np.array_equal(learnt.depth, by_hand.depth)
     points = FRAMES[0][1]
-    residuals = [
-        float((points.sample(torch.from_numpy(each.depth)) - points.depth).abs().mean())
-        for each in (own, learnt)
-    ]
-    assert residuals[1] < residuals[0]
+    at_points = (points.sample(torch.from_numpy(each.depth)) for each in (own, learnt))
+    before_learning, afterwards = ((at - points.depth).abs().mean() for at in at_points)
+    assert afterwards < before_learning
     assert all(torch.equal(network.module.state_dict()[name], before[name]) for name in before)
 
 
 @pytest.mark.parametrize(
     ("frames", "p_value", "why"),
-    [
-        (FRAMES[:7], 0.01, "7 frames; at least 8 are needed"),
-        (FRAMES, 0.2, "is not beyond chance"),
-    ],
+    [(7, 0.01, "7 frames; at least 8 are needed"), (8, 0.2, "is not beyond chance")],
 )
 def test_without_proof_the_weights_of_the_network_stay(
-    network: pnp.Network,
-    monkeypatch: pytest.MonkeyPatch,
-    frames: list[Pair],
-    p_value: float,
-    why: str,
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch, frames: int, p_value: float, why: str
 ) -> None:
     monkeypatch.setattr("scipy.stats.ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=p_value))
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
-    with pnp.Refiner(network, SETTINGS, adapt=frames) as refiner:
+    with pnp.Refiner(network, SETTINGS, adapt=FRAMES[:frames]) as refiner:
         refined = refiner.refine(*FRAMES[0])
     assert why in "\n".join(refined.notes)
     assert np.array_equal(refined.depth, own.depth)
@@ -93,10 +83,8 @@ def test_a_network_without_points_and_a_frame_of_one_point_are_refused(
     name: str, count: int, error: type[pnp.PnpDepthError]
 ) -> None:
     frames = [*FRAMES, pair(8, count)]
-    with (
-        pnp.Refiner(pnp.load_network(name), SETTINGS, adapt=frames) as refiner,
-        pytest.raises(error),
-    ):
+    refiner = pnp.Refiner(pnp.load_network(name), SETTINGS, adapt=frames)
+    with refiner, pytest.raises(error):
         refiner.refine(*FRAMES[0])
 
 

@@ -44,7 +44,6 @@ DEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "a mask": lambda z, y: y + y[z > 0].sum(),
     "foreach": lambda z, y: torch._foreach_add([y], [z.detach()])[0],
 }
-
 INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "the features before z": lambda z, y: y,
     "the shape of z": lambda z, y: y * z.shape[1],
