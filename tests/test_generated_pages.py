@@ -63,7 +63,6 @@ def call_lines(head: str, node: ast.FunctionDef, returns: str) -> Iterator[str]:
 
 def function_lines(node: ast.FunctionDef) -> Iterator[str]:
     """A function, a method or a property, and the first sentence of its docstring."""
-    assert node.returns is not None
     returns = ast.unparse(node.returns)
     if any(ast.unparse(mark).endswith("property") for mark in node.decorator_list):
         yield f"{node.name}: {returns}"

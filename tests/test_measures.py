@@ -72,9 +72,7 @@ def frames() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def of(key: str, depth: np.ndarray, truth: np.ndarray) -> float:
-    formula = TABLE[key].formula
-    assert formula is not None
-    return formula(depth, truth)
+    return TABLE[key].formula(depth, truth)
 
 
 def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:

@@ -29,9 +29,7 @@ def test_spacings_are_those_to_the_next_point_in_a_row_or_beside_it() -> None:
 def test_each_point_has_its_own_line_from_the_top(gap: int) -> None:
     xy, line = lines_of_points(gap)
     order = np.random.default_rng(0).permutation(len(xy))
-    got = scan_lines(xy[order], SIZE)
-    assert got is not None
-    np.testing.assert_array_equal(got, line[order])
+    np.testing.assert_array_equal(scan_lines(xy[order], SIZE), line[order])
 
 
 def test_random_points_and_a_few_lines_are_no_scan() -> None:

@@ -20,7 +20,7 @@ NAN, INF = math.nan, math.inf
 
 def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
     assert Settings(lr="1e-2") == Settings(lr=0.01)
-    assert Settings(lr=np.float32(0.5)) == Settings(lr=0.5)  # type: ignore[arg-type]
+    assert Settings(lr=np.float32(0.5)) == Settings(lr=0.5)
     assert Settings().closed() == PAPER.closed() == ClosedSettings()
     paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
     assert paper == (5, 0.01, "l1", "sign", "none")

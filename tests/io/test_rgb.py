@@ -94,7 +94,6 @@ def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(tmp_path: Path
         image.save(path, exif=exif)
         focal = read_focal_length(path, (300, 400))
         if tags == {0xA405: 50}:  # of equal diagonal field of view on film
-            assert focal is not None
             assert focal[0] == pytest.approx(50 / math.hypot(36, 24) * 500)
         else:
             assert focal is None

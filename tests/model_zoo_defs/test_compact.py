@@ -80,7 +80,6 @@ def test_wherever_points_lie_rear_of_front_is_the_network_and_errors_reach_every
             assert depth.shape == sparse.shape
             assert bool((torch.isfinite(depth) & (depth > 0)).all())
         gradient = gradient_at(z, (depth - some)[some > 0].abs().mean())
-    assert gradient is not None
     assert float((gradient != 0).float().mean()) > 0.3
 
 
