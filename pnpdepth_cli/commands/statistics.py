@@ -57,10 +57,8 @@ class Clusters:
         """Returns that frames are not independent, unless each of them is a cluster."""
         if self.count == len(self.ids):
             return []
-        return [
-            f"frames of one sequence are not independent: {len(self.ids):,} frames count as"
-            f" {self.text}"
-        ]
+        fact = f"{len(self.ids):,} frames count as {self.text}"
+        return [f"frames of one sequence are not independent: {fact}"]
 
 
 def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:

@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.file_bytes import (
-    one_line,
-    parse_yaml,
-    read_bytes,
-    read_json,
-    read_rows,
-    read_text,
-)
+from pnpdepth_cli.io import file_bytes
 
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
@@ -48,10 +41,10 @@ def read_extrinsics(path: Path) -> Extrinsics:
     Raises:
         InputError: The file holds no pose.
     """
-    text = read_text(path)
+    text = file_bytes.read_text(path)
     numbers = numbers_in(re.sub(r"#.*", "", text))
     if numbers is None:
-        return _pose_of_transform(path, parse_yaml(path, text))
+        return _pose_of_transform(path, file_bytes.parse_yaml(path, text))
     if len(numbers) == 7:
         return pose_of_quaternion(path, numbers)
     if len(numbers) in (12, 16):
@@ -101,7 +94,7 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
         why = f"R·Rᵀ is off by {off:.2g}" if turns else "determinant −1: a left-handed scan?"
         raise InputError(f"{path}: {name} is no rotation ({why}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
-        raise InputError(f"{path}: a translation of {one_line(translation)} m is of no sensor")
+        raise InputError(f"{path}: a translation of {translation} m is of no sensor")
     return Extrinsics(rotation, translation)
 
 
@@ -182,7 +175,7 @@ def poses_of_frames(
 
 def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     """The matrices (N, 3, 4) of the frames of these names in a transforms.json."""
-    content = read_json(path)
+    content = file_bytes.read_json(path)
     try:
         listed: dict[str, list[tuple[str, object]]] = {}
         for each in content["frames"]:
@@ -200,7 +193,7 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
             if not np.isfinite(poses[index]).all() or not is_rotation(poses[index, :, :3]):
                 raise ValueError(f"the pose of {name} is no rotation")
     except (LookupError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is no transforms.json ({one_line(error)})") from error
+        raise InputError(f"{path} is no transforms.json ({file_bytes.one_line(error)})") from error
     return poses
 
 
@@ -236,7 +229,7 @@ def _last_numbers(names: Sequence[str]) -> Floats:
 
 def _rows(path: Path) -> tuple[Floats, Floats]:
     """The numbers (N, 12 or 8) of the rows and their poses (N, 3, 4); at least one."""
-    rows, _ = read_rows(path, read_bytes(path))
+    rows, _ = file_bytes.read_rows(path, file_bytes.read_bytes(path))
     if not len(rows) or rows.shape[1] not in (_KITTI_COLUMNS, _TUM_COLUMNS):
         raise InputError(f"{path} has no rows of 12 numbers (KITTI) or 8 (TUM)")
     if rows.shape[1] == _KITTI_COLUMNS:

@@ -40,9 +40,7 @@ _TEMPLATES.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": ("
 _INVISIBLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def check_report_folder(
-    folder: Path, *, made_of: Mapping[str, object] | None, overwrite: bool
-) -> None:
+def check_report_folder(folder: Path, made_of: Mapping[str, object], *, overwrite: bool) -> None:
     """Raises OutputError for a folder that holds anything but this report.
 
     Args:

@@ -223,10 +223,7 @@ def _open_video(
 
 
 def _decode_video(path: Path) -> Iterator[Pixels]:
-    """Yields the frames (H, W, 3), blue first.
-
-    No frame is sought: that is exact at a constant rate only, which phones do not keep.
-    """
+    """Yields the frames (H, W, 3), blue first; seeking would need a constant rate."""
     import cv2
 
     with path.open("rb") as file:

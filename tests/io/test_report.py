@@ -75,4 +75,4 @@ def test_other_files_are_safe(folder: str, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("full")
     for overwrite in (False, True):
         with pytest.raises(OutputError):
-            check_report_folder(tmp_path / folder, made_of=None, overwrite=overwrite)
+            check_report_folder(tmp_path / folder, {}, overwrite=overwrite)

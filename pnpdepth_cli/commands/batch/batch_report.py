@@ -46,12 +46,10 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
     """
     inside, output = folder.resolve(), request.output.resolve()
     if output.is_relative_to(inside):
-        raise OutputError(
-            f"{folder} holds the results; name a folder of its own for the report, such as"
-            f" {request.output / 'report'}"
-        )
-    overwrite = request.refine.overwrite
-    report.check_report_folder(folder, made_of=_source(request, folder), overwrite=overwrite)
+        own = request.output / "report"
+        raise OutputError(f"{folder} holds the results; name another folder, such as {own}")
+    source, overwrite = _source(request, folder), request.refine.overwrite
+    report.check_report_folder(folder, source, overwrite=overwrite)
 
 
 def write_batch_report(

@@ -83,17 +83,13 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     parts = (part for frame in frames for part in (frame.image, frame.sparse, frame.gt))
     folders = {source, *(file_of(part).parent for part in parts if part is not None)}
     if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
-        raise OutputError(
-            f"{output} holds the frames themselves; name a folder of its own, such as"
-            f" {output / 'out'}"
-        )
+        own = output / "out"
+        raise OutputError(f"{output} holds the frames; name a folder of its own, such as {own}")
     # There must be some, with sparse depth and names that are fit for results.
     if not frames:
         first = " ({} {})".format(*lost[0]) if lost else ""
-        raise InputError(
-            f"{source} looks like {layout!r} but has no frame in it{first};"
-            f" layouts are {', '.join(LAYOUTS)}"
-        )
+        known = ", ".join(LAYOUTS)
+        raise InputError(f"{source} looks like {layout!r}, without a frame{first}; known: {known}")
     if request.reading.sample is None and all(frame.sparse is None for frame in frames):
         way_out = "--sample 500 draws so many points from the ground truth"
         if all(frame.gt is None for frame in frames):
@@ -109,9 +105,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
     if not chosen:
-        raise UsageError(
-            f"no frame of {source} has a name like {request.names!r}; the first is {frames[0].name}"
-        )
+        fact = f"no frame of {source} has a name like {request.names!r}"
+        raise UsageError(f"{fact}; the first is {frames[0].name}")
     return BatchFrames(
         layout=layout,
         frames=frames,
@@ -154,13 +149,11 @@ def _with_poses(
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
     """Returns the indices of the frames of each sequence, which one camera took, in order."""
     groups = groups_of([frame.name for frame in frames], [frame.group for frame in frames])
-    sequences: dict[tuple[str, int | None], list[int]] = {}
+    sequences: dict[str, list[int]] = {}
     for index, (frame, group) in enumerate(zip(frames, groups, strict=True)):
-        sequences.setdefault((group, frame.camera), []).append(index)
-    return {
-        group if camera is None else f"{group}_{camera}": indices
-        for (group, camera), indices in sequences.items()
-    }
+        name = group if frame.camera is None else f"{group}_{frame.camera}"
+        sequences.setdefault(name, []).append(index)
+    return sequences
 
 
 def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[FrameFiles]:
@@ -168,12 +161,11 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
     result = [*frames]
     for sequence in sequences_of(frames).values():
         for number, index in enumerate(sequence):
-            first = max(0, number - reach)
-            near = enumerate(sequence[first : number + reach + 1], first - number)
+            near = range(max(0, number - reach), min(number + reach + 1, len(sequence)))
             neighbours = [
-                _neighbour(frames[index], frames[other], abs(ahead), source)
-                for ahead, other in near
-                if ahead
+                _neighbour(frames[index], frames[sequence[other]], abs(other - number), source)
+                for other in near
+                if other != number
             ]
             result[index] = replace(frames[index], neighbours=tuple(neighbours))
     return result
@@ -182,15 +174,11 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
 def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) -> Neighbour:
     """The other frame as a neighbour, with the motion that poses from the source give."""
     if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
-        raise UsageError(
-            f"{other.name}: --accumulate takes depth maps or scans of single frames, not"
-            f" {'images alone' if other.sparse is None else 'a COLMAP model'}"
-        )
+        given = "images alone" if other.sparse is None else "a COLMAP model"
+        raise UsageError(f"{other.name}: --accumulate takes depth maps or scans, not {given}")
     if frame.pose is None or other.pose is None:
         if other.image is None:
-            raise UsageError(
-                f"{other.name}: --accumulate needs the poses of frames without images; give --poses"
-            )
+            raise UsageError(f"{other.name}: without images, --accumulate needs --poses")
         return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
     pose, other_pose = np.array(frame.pose), np.array(other.pose)
     other_pose[:, 3] -= pose[:, 3]

@@ -78,10 +78,8 @@ class Records:
         results = (path for frame in frames for path in self.outputs_of(frame).values())
         for path in (output / CSV, output / JSON, *results):
             if path.exists():
-                raise OutputError(
-                    f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
-                    " names another folder"
-                )
+                hint = "--overwrite replaces such files, -o names another folder"
+                raise OutputError(f"{path} exists, and no batch wrote it; {hint}")
 
     def find(self, frame: FrameFiles) -> FrameRecord | str:
         """Returns the record of a frame with its present settings, or why there is none."""
@@ -272,10 +270,7 @@ def write_summary(
 
 
 def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
-    """The names of the frames by their notes, warnings first.
-
-    Of notes that differ in numbers alone, the first stands for all, with its frame's name.
-    """
+    """Frames by their notes, warnings first; of notes that differ in numbers, the first stays."""
     kinds = defaultdict[str, dict[str, str]](dict)
     for record in records:
         for note in record.notes:

@@ -321,10 +321,9 @@ def _connected(address: str) -> Iterator[ModuleType]:
             socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (Exception, SystemExit) as error:
-        raise DeviceError(
-            f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"
-            " it with `ray start --head`, or leave the address out"
-        ) from None
+        hint = "check the address, start it with `ray start --head`, or leave the address out"
+        why = one_line(error)
+        raise DeviceError(f"Ray cluster {address!r} cannot be used: {why}; {hint}") from None
     try:
         yield ray
     finally:

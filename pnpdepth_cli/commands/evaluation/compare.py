@@ -150,14 +150,15 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
         )
         for run, mean, of_first in zip(runs, means, gains, strict=True)
     ]
-    return Comparison(
+    found = Comparison(
         frames=names,
         measures=measures,
         scoring=runs[0].scoring,
         runs=tuple(compared),
         clusters=clusters,
-        notes=[*_notes(runs, compared, names, measures, known, clusters)],
+        notes=[],
     )
+    return replace(found, notes=[*_notes(runs, found, known)])
 
 
 def _means(rows: Rows, keys: Sequence[str]) -> Means:
@@ -173,10 +174,8 @@ def _shared(
         for rule in sorted({*first.scoring, *run.scoring}):
             own, others = first.scoring.get(rule), run.scoring.get(rule)
             if own != others:
-                raise InputError(
-                    f"{first.path} and {run.path} were scored by different rules ({rule} {own} and"
-                    f" {others}); score both by one protocol"
-                )
+                fact = f"were scored by different rules ({rule} {own} and {others})"
+                raise InputError(f"{first.path} and {run.path} {fact}; score both by one protocol")
     names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
     if not names:
         own, other = (some_names(run.frames) for run in (first, runs[-1]))
@@ -208,43 +207,32 @@ def _gains(
         yield gains
 
 
-def _notes(
-    runs: Sequence[Run],
-    compared: Sequence[ComparedRun],
-    names: Sequence[str],
-    measures: Sequence[Measure],
-    known: NDArray[np.bool_],
-    clusters: Clusters,
-) -> Iterator[str]:
+def _notes(runs: Sequence[Run], found: Comparison, known: NDArray[np.bool_]) -> Iterator[str]:
     """What not all runs scored, and whether frames are too dependent or too few to conclude."""
     # Frames, pixels and measures that not all runs have.
     for run in runs:
-        if unshared := [name for name in run.frames if name not in names]:
-            yield (
-                f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
-                f" left out: {some_names(unshared)}"
-            )
-    pixels = zip(*(run.rows(names, ["pixels"]) for run in runs), strict=True)
+        if unshared := [name for name in run.frames if name not in found.frames]:
+            fact = f"{count_of(len(unshared), 'frame')} of {run.path} not scored in all runs"
+            yield f"warning: {fact}, left out: {some_names(unshared)}"
+    pixels = zip(*(run.rows(found.frames, ["pixels"]) for run in runs), strict=True)
     if others := sum(any(own != each[0] for own in each) for each in pixels):
-        shares = ", ".join(COVERAGE.text(run.coverage) for run in compared)
+        shares = ", ".join(COVERAGE.text(run.coverage) for run in found.runs)
         yield (
             f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
             f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
             " no ranking"
         )
-    for measure, has in zip(measures, known.T, strict=True):
+    for measure, has in zip(found.measures, known.T, strict=True):
         if not has.all():
             of = f"{has.sum():,} of {len(has):,} frames"
             yield f"{measure.title}: over {of}; the others lack it in a run"
     # The frames that count as independent.
-    yield from clusters.notes()
-    smallest, tests = 2.0 ** (1 - clusters.count), len(measures) * (len(runs) - 1)
+    yield from found.clusters.notes()
+    smallest, tests = 2.0 ** (1 - found.clusters.count), len(found.measures) * (len(runs) - 1)
     if len(known) > 1 and tests * smallest >= ALPHA:
-        yield (
-            f"warning: {clusters.text} are too few independent ones to conclude anything from"
-            f" {tests} tests: p is at least {smallest:.2g}, adjusted"
-            f" {min(1.0, tests * smallest):.2g}"
-        )
+        least = f"p is at least {smallest:.2g}, adjusted {min(1.0, tests * smallest):.2g}"
+        few = f"{found.clusters.text} are too few independent ones"
+        yield f"warning: {few} to conclude anything from {tests} tests: {least}"
 
 
 def _read_run(text: str) -> Run:
@@ -276,10 +264,9 @@ def _read_run(text: str) -> Run:
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))}); give"
-            " what eval --json printed, or the summary of a batch with ground truth"
-        ) from error
+        why = f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))})"
+        hint = "give what eval --json printed, or the summary of a batch with ground truth"
+        raise InputError(f"{why}; {hint}") from error
 
 
 def comparison_table(comparison: Comparison) -> Table:

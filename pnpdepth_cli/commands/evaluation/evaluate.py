@@ -119,10 +119,8 @@ def evaluate(
             ends[measure.key] = max(low, 0.0), min(high, 1.0 if measure.percent else math.inf)
     notes += clusters.notes()
     if len(scored) > 1 and not ends:
-        notes.append(
-            f"no interval: {clusters.text} are too few to tell how sure the means are;"
-            f" {MIN_CLUSTERS} are needed"
-        )
+        few = f"{clusters.text} are too few to tell how sure the means are"
+        notes.append(f"no interval: {few}; {MIN_CLUSTERS} are needed")
     return Evaluation(
         request=request,
         frames=rows,
@@ -151,18 +149,15 @@ def _pair_frames(
             raise InputError(f"{path}: no such file or folder; check the path")
     layout, frames = _data_set(prediction, ground_truth)
     if prediction.is_dir() != (layout is not None or ground_truth.is_dir()):
-        raise UsageError(
-            f"give two files, two folders, or a folder and a data set: {prediction}, {ground_truth}"
-        )
+        given = f"{prediction}, {ground_truth}"
+        raise UsageError(f"give two files, two folders, or a folder and a data set: {given}")
     # The predictions by name, and the frames with ground truth.
     notes: list[str] = []
     predictions = _depth_files(prediction)
     if layout is not None:
         frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
         if not frames:
-            raise InputError(
-                f"{ground_truth} looks like {layout!r}, and no frame in it has ground truth"
-            )
+            raise InputError(f"{ground_truth} looks like {layout!r}, without ground truth")
         cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
         note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
         notes.append(note + (f", of which {cuts} is used" if cuts else ""))
@@ -174,15 +169,11 @@ def _pair_frames(
     names = [frame.name for frame in frames]
     extra = sorted(predictions.keys() - {*names})
     if len(extra) == len(predictions):
-        raise InputError(
-            "no prediction has the name of a ground truth file: predictions are"
-            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}"
-        )
+        listing = f"{some_names(predictions)}; ground truth is {some_names(sorted(names))}"
+        raise InputError(f"no prediction has the name of a ground truth file: {listing}")
     if extra:
-        notes.append(
-            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth"
-            f" and are not scored: {some_names(extra)}"
-        )
+        fact = f"{len(extra):,} of {len(predictions):,} predictions have no ground truth"
+        notes.append(f"warning: {fact} and are not scored: {some_names(extra)}")
     groups = groups_of(names, [frame.group for frame in frames])
     return [
         _pair(replace(frame, group=group), predictions.get(frame.name))
@@ -223,10 +214,7 @@ def _frame_name(stem: str) -> str:
 
 
 def _depth_files(folder: Path) -> dict[str, Path]:
-    """The depth files below a folder, or a single one, by frame name, sorted.
-
-    Where files `x_depth` are, all others are no depth.
-    """
+    """The depth files by frame, sorted; where files `x_depth` are, all others are no depth."""
     if not folder.is_dir():
         return {_frame_name(folder.stem): folder}
     found, problems = find_files(folder, DEPTH_SUFFIXES)
@@ -280,16 +268,12 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
     # The pixels.
     known = sum(_numbers(scored, "known"))
     if empty := known - sum(_numbers(scored, "predicted")):
-        yield (
-            f"warning: {count_of(empty, 'pixel')} ({empty / known:.2%}) of the ground truth"
-            " without prediction"
-        )
+        count = f"{count_of(empty, 'pixel')} ({empty / known:.2%})"
+        yield f"warning: {count} of the ground truth without prediction"
     given = sum(_numbers(scored, "given"))
     if given and not request.rules.exclude_sparse:
-        yield (
-            f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
-            " leaves them out"
-        )
+        hint = "--exclude-sparse leaves them out"
+        yield f"{given:,} of the scored pixels have a point of the sparse input; {hint}"
     # How predictions were scaled, and what looks like a wrong scale.
     if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))

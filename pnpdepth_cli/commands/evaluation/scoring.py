@@ -161,10 +161,8 @@ def _depth_of_distances(
     elif result.record.size == size[::-1]:
         camera, _ = result.camera_and_pose
     if camera is None:
-        raise InputError(
-            f"--gt-range needs the camera of frame {files.name}, which neither the data set nor the"
-            " record beside the prediction has; add the column calib to a list"
-        )
+        fact = f"frame {files.name} has none in the data set or the record beside the prediction"
+        raise InputError(f"--gt-range needs a camera, but {fact}; add the column calib to a list")
     rays = rays_of_image(camera, size)
     return known_metres(gt / np.sqrt(1 + (rays**2).sum(axis=2)))
 
@@ -222,10 +220,8 @@ def _given_points(frame: FrameFiles, record: FrameRecord, gt: Depth) -> Mask:
                 raise unequal_sizes(f"sparse depth {frame.sparse}", own, "the ground truth", size)
         xy = points.xy
     else:
-        raise InputError(
-            f"frame {frame.name} has no sparse depth file to exclude: neither the record beside the"
-            " prediction nor the data set names one"
-        )
+        fact = f"frame {frame.name} has no sparse depth file to exclude"
+        raise InputError(f"{fact} in the data set or the record beside the prediction")
     given = np.zeros(size, bool)
     given.flat[pixel_index(xy[in_frame(xy, size)], size)] = True
     return given
@@ -239,10 +235,8 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     """
     height, width = size
     if crop == "nyu" and size != (480, 640):
-        raise InputError(
-            f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol paper"
-            " scores any size"
-        )
+        fact = f"crop nyu is for frames of 640×480 but this one is {width}×{height}"
+        raise InputError(f"{fact}; --protocol paper scores any size")
     top, bottom, left, right = _CROPS[crop]
     rows, columns = (top * height, bottom * height), (left * width, right * width)
     return slice(*map(int, rows)), slice(*map(int, columns))

@@ -79,15 +79,11 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     write_json(_model(folder) / _PARAMETERS, {frame.stem: parameters for frame in frames})
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
-        notes.append(
-            f"warning: {masked:,} pixels are unknown or not valid; they have the depth before"
-            " the mask or that of the nearest pixel, as 3DGS reads no masks"
-        )
+        depth = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
+        notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
     if not model_files(_model(folder)):
-        notes.append(
-            "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"
-            " with poses"
-        )
+        hint = "refine undistorted images with poses"
+        notes.append(f"warning: sparse/0 has no model, which 3DGS needs to train; {hint}")
     return [*notes, *distortion_note(frames, "3DGS")]
 
 

@@ -44,10 +44,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     # The program takes lenses of one kind.
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
-        raise InputError(
-            f"the cameras have lenses of different kinds ({', '.join(lenses)}), but Nerfstudio"
-            " takes one; undistort the images first"
-        )
+        fact = f"the cameras have lenses of several kinds ({', '.join(lenses)})"
+        raise InputError(f"{fact}, but Nerfstudio takes one; undistort the images first")
     # Depth, points and image of each frame.
     clipped, entries, start = 0, [], []
     for frame in frames:
@@ -82,10 +80,8 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     _, names = _LENSES[camera.lens]
     values = dict(zip(names, camera.distortion, strict=False))
     if any(camera.distortion[len(names) :]):
-        raise InputError(
-            f"{frame.image} has a lens that Nerfstudio does not know ({camera.lens},"
-            f" {len(camera.distortion)} coefficients); undistort the images first"
-        )
+        fact = f"{camera.lens} with {len(camera.distortion)} coefficients"
+        raise InputError(f"{frame.image}: Nerfstudio knows no lens {fact}; undistort images first")
     image = os.path.relpath(frame.image_path.resolve(), folder.resolve())
     # The pose, with Nerfstudio's axes: y up, z backwards.
     matrix = np.eye(4)
