@@ -146,9 +146,7 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
             16 bits or so small that it would become 0.
         InputError: The depth is not (H, W).
     """
-    depth_format = formats.format_of_suffix(path.suffix)
-    if depth_format is None:
-        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(DEPTH_SUFFIXES)}")
+    depth_format = formats.format_of_suffix(path)
     if depth.ndim != 2 or 0 in depth.shape:
         raise InputError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
     values: NDArray[np.generic] = known_metres(depth)

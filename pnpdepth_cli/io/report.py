@@ -21,7 +21,7 @@ from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_folder, cannot_write
 from pnpdepth_cli.io.file_bytes import plain, read_json, write_json
-from pnpdepth_cli.io.visualisation import LOGARITHMIC_FROM, DepthScale, hex_colours, signed_bar
+from pnpdepth_cli.io.visualisation import LOGARITHMIC_FROM, DepthScale, signed_bar
 
 PAGE = "index.html"
 IMAGES = "images"
@@ -96,10 +96,11 @@ def write_report(
             report.js shows it. Its `key` is that of its images, or None.
         viewer: Whether frames have 3D views, so that the page may run scripts of its folder.
     """
+    turbo = DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))
     data = {
         **data,
-        "map_colours": hex_colours(signed_bar("gain", 9)),
-        "depth_colours": hex_colours(DepthScale(low_m=1, high_m=2).paint(np.linspace(1, 2, 17))),
+        "map_colours": [f"#{bytes(colour).hex()}" for colour in signed_bar("gain", 9)],
+        "depth_colours": [f"#{bytes(colour).hex()}" for colour in turbo],
         "logarithmic_from": LOGARITHMIC_FROM,
     }
     style, script = (_source(f"report.{kind}") for kind in ("css", "js"))

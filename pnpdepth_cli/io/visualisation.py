@@ -114,11 +114,6 @@ def signed_bar(colors: str, length: int) -> Pixels:
     return _paint_signed(np.linspace(-1, 1, length), np.full(length, 0.88), colors)
 
 
-def hex_colours(colours: Pixels) -> list[str]:
-    """Returns (N, 3) colours as #rrggbb."""
-    return [f"#{bytes(colour).hex()}" for colour in colours]
-
-
 def _magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
     """The factor by which an image (H, W, ...) fits its column, a whole number if it enlarges."""
     height, width = shape[:2]

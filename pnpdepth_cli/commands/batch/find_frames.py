@@ -13,15 +13,8 @@ import numpy as np
 from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.commands.requests import FramesRequest
-from pnpdepth_cli.dataset.frame_files import (
-    SCAN_ONLY_SUFFIXES,
-    FrameFiles,
-    Neighbour,
-    as_pose,
-    file_of,
-    groups_of,
-    name_problem,
-)
+from pnpdepth_cli.dataset import frame_files
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, as_pose, groups_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
@@ -81,7 +74,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         raise OutputError(f"{output} is a file; name a folder")
     layout, frames, lost = list_frames(source, request.layout)
     parts = (part for frame in frames for part in (frame.image, frame.sparse, frame.gt))
-    folders = {source, *(file_of(part).parent for part in parts if part is not None)}
+    folders = {source, *(frame_files.file_of(part).parent for part in parts if part is not None)}
     if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
         own = output / "out"
         raise OutputError(f"{output} holds the frames; name a folder of its own, such as {own}")
@@ -178,7 +171,7 @@ def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) ->
         raise UsageError(f"{other.name}: --accumulate takes depth maps or scans, not {given}")
     if frame.pose is None or other.pose is None:
         if other.image is None:
-            raise UsageError(f"{other.name}: without images, --accumulate needs --poses")
+            raise UsageError(f"{other.name}: --accumulate of frames without images needs --poses")
         return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
     pose, other_pose = np.array(frame.pose), np.array(other.pose)
     other_pose[:, 3] -= pose[:, 3]
@@ -202,7 +195,7 @@ def _as_requested(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
         return frame
     # points are sampled from the ground truth, else from the projected scan
     scan = frame.sparse
-    is_scan = scan is not None and scan.suffix.lower() in SCAN_ONLY_SUFFIXES
+    is_scan = scan is not None and scan.suffix.lower() in frame_files.SCAN_ONLY_SUFFIXES
     return replace(frame, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
 
 
@@ -223,7 +216,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}
     # Of a folder, a COLMAP model or KITTI's calibrations, each file.
     for part, source in sources.items():
-        path = None if source is None else file_of(source)
+        path = None if source is None else frame_files.file_of(source)
         if path is not None and path.is_dir():
             inside = model_files(path) if part == "sparse" else sorted(path.glob("calib_*.txt"))
             yield from ((f"{part} {file.name}", file) for file in inside)
@@ -239,7 +232,7 @@ def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
         # Names that differ in Unicode normalisation only are one file on macOS.
         name, shown = unicodedata.normalize("NFC", frame.name), one_line(repr(frame.name))
         files = [name + ending for ending in endings]
-        problem = name_problem(frame.name)
+        problem = frame_files.name_problem(frame.name)
         if name.startswith(".batch"):
             problem = "is one of the batch's own"
         for path in (*files, *map(str, PurePosixPath(name).parents)):

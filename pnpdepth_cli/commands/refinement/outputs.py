@@ -118,8 +118,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
 
 def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     """Returns the frame with depths that the format can hold, with a note if any is clipped."""
-    depth_format = format_of_suffix(outputs["depth"].suffix)
-    if depth_format is None or not depth_format.integer:
+    if not format_of_suffix(outputs["depth"]).integer:
         return frame
     scale = output_scale(inputs)
     nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
@@ -179,8 +178,7 @@ def write_outputs(
 def _write_sigma(path: Path, sigma: DepthMap) -> None:
     """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
     scale = _power_of_ten(LARGEST_CODE / max(float(sigma.max()), 1e-9))
-    depth_format = format_of_suffix(path.suffix)
-    if depth_format is not None and depth_format.integer:
+    if format_of_suffix(path).integer:
         sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))
     write_depth(path, sigma, scale=scale)
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.budget import check_claim, max_image_bytes
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import InputError, UsageError
+from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, check_value_count, damaged, one_line
 
 KITTI_SCALE = 256.0
@@ -101,9 +101,12 @@ def format_of_content(data: bytes) -> DepthFormat | None:
     return next((kind for kind in FORMATS.values() if data.startswith(kind.magic)), None)
 
 
-def format_of_suffix(suffix: str) -> DepthFormat | None:
-    """The format that is written for a suffix in any case; None for an unknown one."""
-    return next((kind for kind in FORMATS.values() if suffix.lower() in kind.suffixes), None)
+def format_of_suffix(path: Path) -> DepthFormat:
+    """The format that is written for a suffix in any case. OutputError for an unknown one."""
+    of_suffix = {suffix: kind for kind in FORMATS.values() for suffix in kind.suffixes}
+    if path.suffix.lower() not in of_suffix:
+        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(of_suffix)}")
+    return of_suffix[path.suffix.lower()]
 
 
 def kind_of(data: bytes) -> str | None:
