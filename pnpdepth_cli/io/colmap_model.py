@@ -149,10 +149,9 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
     alike = [name for name in model.images if name.rpartition("/")[2] == image.name]
     if len(alike) == 1:
         return alike[0]
-    raise InputError(
-        f"{image} is {len(alike)} of the {len(model.images):,} images of {model.folder}, not one;"
-        " COLMAP did not register it, or give it in the image folder of the model"
-    )
+    fact = f"{image} is {len(alike)} of the {len(model.images):,} images of {model.folder}, not one"
+    hint = "COLMAP did not register it, or give it in the image folder of the model"
+    raise InputError(f"{fact}; {hint}")
 
 
 def _parameter_count(name: str) -> int:

@@ -78,8 +78,7 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     data = read_bytes(path)
     depth_format = formats.format_of_content(data)
     if depth_format is None:
-        kind = formats.kind_of(data)
-        if kind is not None:
+        if (kind := formats.kind_of(data)) is not None:
             raise formats.no_depth(path, f"an 8-bit {kind}")
         raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)

@@ -59,8 +59,7 @@ def read_bytes(path: Path) -> bytes:
 def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
     """Yields the lines of a text that hold more than a comment after #, with their numbers."""
     for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
-        text = line.partition("#")[0].strip()
-        if text:
+        if text := line.partition("#")[0].strip():
             yield number, text
 
 

@@ -199,8 +199,7 @@ def _header(data: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
     stream = io.BytesIO(data)
     while stream.tell() < min(len(data), _LONGEST_HEADER):
         line = stream.readline()
-        words = line.decode("latin-1").split()
-        if words:
+        if words := line.decode("latin-1").split():
             lines.append(words)
         if line.lstrip().startswith(last):
             return lines, data[stream.tell() :]

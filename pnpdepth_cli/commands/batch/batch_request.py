@@ -40,35 +40,27 @@ def parse_address(text: str) -> str:
     raise UsageError(f"{text!r} is no address of a Ray cluster; {hint}")
 
 
+@dataclass
 class Listener:
-    """Hears of the progress of a batch, and may stop it; its counts are numbers of frames.
+    """Hears of the progress of a batch, and may stop it; its counts are numbers of frames."""
 
-    Args:
-        say: Receives a note or a warning, one line.
-        show: Receives how many frames are done or have failed, of how many.
-        stopped: Asked before each frame; True ends the batch.
-    """
-
-    def __init__(
-        self,
-        say: Callable[[str], None],
-        show: Callable[[int, int], None],
-        stopped: Callable[[], bool],
-    ) -> None:
-        self.say, self.stopped, self._show = say, stopped, show
-        self.done = self.to_do = 0
+    say: Callable[[str], None]  # receives a note or a warning, one line
+    show: Callable[[int, int], None]  # receives how many are done or have failed, of how many
+    stopped: Callable[[], bool]  # asked before each frame; True ends the batch
+    done: int = 0
+    to_do: int = 0
 
     def begin(self, to_do: int) -> None:
         """Starts counting; `to_do` frames follow."""
         self.to_do = to_do
-        self._show(0, to_do)
+        self.show(0, to_do)
 
     def frame(self, record: FrameRecord) -> None:
         """Counts a frame, and says why it failed if it did."""
         if record.status != "done":
             self.say(f"{record.status}: {record.name}: {record.message}")
         self.done += 1
-        self._show(self.done, self.to_do)
+        self.show(self.done, self.to_do)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -217,11 +217,9 @@ def _notes(runs: Sequence[Run], found: Comparison, known: NDArray[np.bool_]) -> 
     pixels = zip(*(run.rows(found.frames, ["pixels"]) for run in runs), strict=True)
     if others := sum(any(own != each[0] for own in each) for each in pixels):
         shares = ", ".join(COVERAGE.text(run.coverage) for run in found.runs)
-        yield (
-            f"warning: {count_of(others, 'frame')} with other numbers of scored pixels in the runs"
-            f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
-            " no ranking"
-        )
+        fact = f"with other numbers of scored pixels in the runs (coverage: {shares})"
+        why = "a run that leaves hard pixels empty looks better; this is no ranking"
+        yield f"warning: {count_of(others, 'frame')} {fact}, and {why}"
     for measure, has in zip(found.measures, known.T, strict=True):
         if not has.all():
             of = f"{has.sum():,} of {len(has):,} frames"

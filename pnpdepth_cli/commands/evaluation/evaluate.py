@@ -278,15 +278,12 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
     if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
-        yield (
-            f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,}"
-            f" images), standard deviation / median {spread:.3f}"
-        )
+        of = f"factor {median:.4g} (median of {len(factors):,} images)"
+        yield f"scale-by {request.scale_by}: {of}, standard deviation / median {spread:.3f}"
     elif unscaled := [row.unit for row in scored if row.unit != METRES]:
-        yield (
-            f"warning: {count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres, so"
-            " errors against the ground truth show nothing; --scale-by median scales each image"
-        )
+        fact = f"{count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres"
+        why = "errors against the ground truth show nothing; --scale-by median scales each image"
+        yield f"warning: {fact}, so {why}"
     ratios = _numbers(scored, "median_ratio") or [math.nan]
     by_option = {option: _readings(scored, side)[0][0] for side, option in _OPTIONS.items()}
     if warning := scale_warning("predictions", float(np.median(ratios)), by_option):

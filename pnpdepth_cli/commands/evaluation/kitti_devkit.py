@@ -73,7 +73,9 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     p, g = fill_background(predicted).T[known], gt.T[known]
     error = np.abs(g - p)
     with np.errstate(invalid="ignore"):
-        log_error = _log(g) - _log(p)
+        # logarithms rounded once to single precision, as C's logf nearly always does
+        log_g, log_p = (np.log(each, dtype=np.float64).astype(np.float32) for each in (g, p))
+        log_error = log_g - log_p
         inverse = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64)).astype(np.float32)
         # the errors in the kit's order
         count = np.float32(len(g))
@@ -100,8 +102,3 @@ def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _sum(values: NDArray[np.floating]) -> Floats:
     # cumsum adds one after the other; sum would add in pairs
     return np.asarray(np.cumsum(values, axis=0, dtype=np.float32)[-1])
-
-
-def _log(values: Floats) -> Floats:
-    """The natural logarithm rounded once to single precision, as C's logf nearly always does."""
-    return np.log(values, dtype=np.float64).astype(np.float32)

@@ -78,12 +78,8 @@ class ExportFrame:
         rgb = image_of_size(self.image, self.size)
         parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
         step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
-        cloud = PointCloud(
-            xyz=np.concatenate([part.xyz for part in parts])[::step],
-            normals=np.concatenate([part.normals for part in parts])[::step],
-            rgb=np.concatenate([part.rgb for part in parts if part.rgb is not None])[::step],
-        )
-        return cloud.transform(self.pose)
+        columns = (np.concatenate(column)[::step] for column in zip(*parts, strict=True))
+        return PointCloud(*columns).transform(self.pose)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +103,9 @@ def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
     count = sum(frame.camera.has_lens for frame in frames)
     if not count:
         return []
-    return [
-        f"warning: {count:,} of {len(frames):,} images have lens distortion, and so has their"
-        f" depth; {taker} takes undistorted ones: run COLMAP's image_undistorter and refine its"
-        " output"
-    ]
+    fact = f"{count:,} of {len(frames):,} images have lens distortion, and so has their depth"
+    hint = "run COLMAP's image_undistorter and refine its output"
+    return [f"warning: {fact}; {taker} takes undistorted ones: {hint}"]
 
 
 def export_results(

@@ -109,10 +109,9 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     if frame.valid is not None or not is_scan:
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
-    note = (
-        f"note: {100 * outside:.0f} % of the pixels lie outside of the scan's points, and their"
-        " depth is a guess; --unknown zero writes 0 where points do not support it"
-    )
+    fact = f"{100 * outside:.0f} % of the pixels lie outside of the scan's points"
+    hint = "their depth is a guess; --unknown zero writes 0 where points do not support it"
+    note = f"note: {fact}, and {hint}"
     return replace(frame, notes=(*frame.notes, note)) if outside > _MUCH else frame
 
 
@@ -127,10 +126,9 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
     if not clipped.any():
         return frame
     limits = f"{metres(float(nearest))}–{metres(float(farthest))} m"
-    note = (
-        f"warning: {int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}, what a"
-        f" 16-bit PNG with {scale:g} codes per metre holds; --format exr holds every depth"
-    )
+    fact = f"{int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}"
+    holds = f"what a 16-bit PNG with {scale:g} codes per metre holds"
+    note = f"warning: {fact}, {holds}; --format exr holds every depth"
     after = np.where(clipped, np.clip(frame.after, nearest, farthest), frame.after)
     return replace(frame, after=after, notes=(*frame.notes, note))
 

@@ -161,10 +161,9 @@ def _as_our_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (Reader1Error, Reader2Error, SerdeError, *others) as error:
-        raise InputError(
-            f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if it is"
-            " cut short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
-        ) from error
+        why = f"{type(error).__name__}: {one_line(error)}"
+        hint = "repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
+        raise InputError(f"{path} cannot be read as a bag ({why}); if cut short, {hint}") from error
 
 
 _CHUNK_BYTES = 1 << 28

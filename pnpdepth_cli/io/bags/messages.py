@@ -206,8 +206,7 @@ def camera_of_bag(bag: Bag, image_topic: str) -> tuple[Calibration, str] | None:
         }
         if not values["k"].any():
             return None  # an uncalibrated camera
-        content: dict[str, object]
-        content = {name: v for name, v in values.items() if np.isfinite(v).all()}
+        content: dict[str, object] = {k: v for k, v in values.items() if np.isfinite(v).all()}
         model = str(message.distortion_model) if values["d"].size else "none"
         content |= {"distortion_model": model, "width": message.width, "height": message.height}
         calibration = camera_in_yaml(bag.path, content, None)

@@ -103,10 +103,10 @@ def format_of_content(data: bytes) -> DepthFormat | None:
 
 def format_of_suffix(path: Path) -> DepthFormat:
     """The format that is written for a suffix in any case. OutputError for an unknown one."""
-    of_suffix = {suffix: kind for kind in FORMATS.values() for suffix in kind.suffixes}
-    if path.suffix.lower() not in of_suffix:
-        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(of_suffix)}")
-    return of_suffix[path.suffix.lower()]
+    known: dict[str, DepthFormat] = {s: each for each in FORMATS.values() for s in each.suffixes}
+    if path.suffix.lower() not in known:
+        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(known)}")
+    return known[path.suffix.lower()]
 
 
 def kind_of(data: bytes) -> str | None:

@@ -68,8 +68,7 @@ def check_tags(data: bytes) -> None:
 
 def check_exif(image: PIL.Image.Image) -> None:
     """Raises the errors of `check_tags` for an image's EXIF, which may end without a next page."""
-    exif = image.info.get("exif")
-    if exif:
+    if exif := image.info.get("exif"):
         check_tags(exif.removeprefix(b"Exif\0\0") + bytes(4))
 
 
