@@ -169,8 +169,9 @@ def _pair_frames(
     names = [frame.name for frame in frames]
     extra = sorted(predictions.keys() - {*names})
     if len(extra) == len(predictions):
-        listing = f"{some_names(predictions)}; ground truth is {some_names(sorted(names))}"
-        raise InputError(f"no prediction has the name of a ground truth file: {listing}")
+        fact = "no prediction has the name of a ground truth file"
+        own, others = some_names(predictions), some_names(sorted(names))
+        raise InputError(f"{fact}: predictions are {own}; ground truth is {others}")
     if extra:
         fact = f"{len(extra):,} of {len(predictions):,} predictions have no ground truth"
         notes.append(f"warning: {fact} and are not scored: {some_names(extra)}")

@@ -53,7 +53,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     # A depth file alone, or all files in a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.uncertainty:
-            raise UsageError(f"--uncertainty writes more files; name a folder, not {output}")
+            raise UsageError(f"--uncertainty writes a second file; name a folder, not {output}")
         outputs: Outputs = {"depth": output}
     elif output.is_file() or (suffix[1:].isalpha() and not output.is_dir()):
         raise OutputError(f"{output} is no folder; name one, or a depth file ({formats})")
