@@ -82,7 +82,7 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if not frames:
         first = " ({} {})".format(*lost[0]) if lost else ""
         known = ", ".join(LAYOUTS)
-        raise InputError(f"{source} looks like {layout!r}, without a frame{first}; known: {known}")
+        raise InputError(f"{source} looks like {layout!r} but has no frame{first}; known: {known}")
     if request.reading.sample is None and all(frame.sparse is None for frame in frames):
         way_out = "--sample 500 draws so many points from the ground truth"
         if all(frame.gt is None for frame in frames):
