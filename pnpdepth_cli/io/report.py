@@ -63,11 +63,6 @@ def check_report_folder(folder: Path, made_of: Mapping[str, object], *, overwrit
         raise OutputError(f"{folder} is not empty; name another folder, or --overwrite a report")
 
 
-def image_key(name: str) -> str:
-    """Returns the start of a frame's image names: fit for a file, and of this name alone."""
-    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
-
-
 def visible(text: str) -> str:
     r"""Returns the text with invisible characters, such as a new line in a name, as \\uXXXX."""
     return _INVISIBLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)

@@ -68,11 +68,6 @@ class DepthScale:
         table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
         return np.where(known[..., None], table[:, 0, ::-1][levels], np.uint8(UNKNOWN))
 
-    def spaced(self, count: int) -> NDArray[np.float64]:
-        """Returns so many depths from near to far, whose positions are equally far apart."""
-        space = np.geomspace if self.logarithmic else np.linspace
-        return space(self.low_m, self.high_m, count)
-
 
 def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
     """Returns the scale over the 2nd to 98th percentile of all known depths together."""
@@ -148,9 +143,11 @@ def _save_depth_figure(
     path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
 ) -> FigureRecord:
     """Writes a PNG of panels beside a bar of depth colours."""
-    labels = [f"{depth:.3g}" for depth in scale.spaced(_LABELS)]
+    space = np.geomspace if scale.logarithmic else np.linspace
+    bar, marks = (space(scale.low_m, scale.high_m, count) for count in (256, _LABELS))
+    labels = [f"{depth:.3g}" for depth in marks]
     noun = "metres" if unit == "m" else unit
-    figure = _save_figure(path, panels, scale.paint(scale.spaced(256)), labels, noun, columns)
+    figure = _save_figure(path, panels, scale.paint(bar), labels, noun, columns)
     return replace(figure, scale_m=(scale.low_m, scale.high_m))
 
 

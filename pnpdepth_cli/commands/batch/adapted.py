@@ -68,13 +68,12 @@ def _learn_once(
     files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
     text = json.dumps([own.settings, files], sort_keys=True)
     digest, file = hashlib.sha256(text.encode()).hexdigest(), weights.with_suffix(".json")
-    record = read_json(file) if file.exists() else {}
+    record: dict[str, str | None] = read_json(file) if file.exists() else {}
     if record.get("digest") != digest or not (record.get("why") or weights.exists()):
         record = {"digest": digest, "why": _learn(lessons, weights, listener)}
         make_folder(file.parent)
         write_json(file, record)
-    why: str | None = record["why"]
-    return why
+    return record["why"]
 
 
 def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> str | None:

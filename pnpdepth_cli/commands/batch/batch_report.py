@@ -7,6 +7,7 @@ The records say where their panels are. So a report also has the frames of earli
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -116,10 +117,12 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
 def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, object]:
     """Links the images of a frame, unless they were deleted; returns the page's entry of them."""
     files = {kind: request.output / path for kind, path in record.outputs.items()}
-    key, views, figures = report.image_key(record.name), dict[str, object](), record.figures
+    views, figures = dict[str, object](), record.figures
     there = all(kind in files and files[kind].exists() for kind in figures)
     if "preview" not in figures or not there:
         return {"key": None}
+    # The start of its images' names: fit for a file, and of this frame alone.
+    key = hashlib.sha256(record.name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
     for kind, figure in figures.items():
         name = f"{key}_{kind}.png"
         report.link_image(files[kind], images / name)

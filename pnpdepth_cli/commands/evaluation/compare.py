@@ -284,12 +284,11 @@ def comparison_table(comparison: Comparison) -> Table:
                 style = "good" if found.percent > 0 else "bad"
             p = "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}"
             rows.append([*row, (texts[0], style), *texts[1:], p])
+    frames = count_of(len(comparison.frames), "shared frame")
+    gains = f"gains in per cent of the error of {comparison.runs[0].name}, positive is better"
+    tests = f"intervals (95 %) and p-values {_describe_tests(comparison)}"
     return Table(
-        title=(
-            f"{count_of(len(comparison.frames), 'shared frame')}; gains in per cent of the error of"
-            f" {comparison.runs[0].name}, positive is better; intervals (95 %) and p-values"
-            f" {_describe_tests(comparison)}"
-        ),
+        title=f"{frames}; {gains}; {tests}",
         columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
     )

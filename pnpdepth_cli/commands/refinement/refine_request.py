@@ -96,11 +96,10 @@ class RefineRequest:
 
     def outputs_in(self, folder: Path, name: str, *, with_gt: bool) -> Outputs:
         """Returns the files of a result in a folder; slashes in the name are subfolders."""
-        without = set() if self.uncertainty else {"sigma", "valid"}
-        without |= set() if self.view_3d else {"view"}
-        without |= set() if with_gt else {"improvement"}
+        asked = {"view": self.view_3d, "improvement": with_gt}
+        asked |= dict.fromkeys(("sigma", "valid"), self.uncertainty)
         endings = endings_of(f".{self.format}")
-        return {k: folder / f"{name}{end}" for k, end in endings.items() if k not in without}
+        return {k: folder / f"{name}{end}" for k, end in endings.items() if asked.get(k, True)}
 
 
 def endings_of(suffix: str) -> dict[str, str]:
