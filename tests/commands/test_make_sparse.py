@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.make_sparse import (
-    Written,
-    project_scan,
-    sample_depth,
-    simulate_scan,
-)
+from pnpdepth_cli.commands.make_sparse import Written, project_scan, sample_depth, simulate_scan
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.file_record import SamplePattern

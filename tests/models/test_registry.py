@@ -89,15 +89,10 @@ def bare():
 """
 
 
-def written(folder: Path, text: str, name: str = "mine.py") -> Path:
-    file = folder / name
-    file.write_text(text)
-    return file
-
-
 def test_a_file_gives_its_definition_or_a_function_and_imports_neighbours(tmp_path: Path) -> None:
-    written(tmp_path, "WIDTH = 7", "beside.py")
-    file = written(tmp_path, GOOD)
+    file = tmp_path / "mine.py"
+    file.write_text(GOOD)
+    (tmp_path / "beside.py").write_text("WIDTH = 7")
     assert find_definition(str(file)).build().out_channels == 7
     torch.save(find_definition(f"{file}:bare").build().state_dict(), tmp_path / "w.pt")
     network = load_network(f"{file}:bare", tmp_path / "w.pt")
@@ -115,15 +110,15 @@ def test_a_file_gives_its_definition_or_a_function_and_imports_neighbours(tmp_pa
     ],
 )
 def test_an_error_in_a_model_file_names_its_line(text: str, place: str, tmp_path: Path) -> None:
-    file = written(tmp_path, text)
+    (tmp_path / "mine.py").write_text(text)
     with pytest.raises(ModelError, match=rf"^[^\n]*mine\.py[^\n]*{place}[^\n]*$"):
-        find_definition(str(file))
+        find_definition(str(tmp_path / "mine.py"))
 
 
 @pytest.mark.parametrize("spec", ["absent.py", "mine.py:network", "mine.py:x", "popping.py"])
 def test_what_is_no_definition_is_refused_and_the_path_stays(spec: str, tmp_path: Path) -> None:
-    written(tmp_path, "x = 1\n")
-    written(tmp_path, "import sys; sys.path.pop(0)", "popping.py")
+    (tmp_path / "mine.py").write_text("x = 1\n")
+    (tmp_path / "popping.py").write_text("import sys; sys.path.pop(0)")
     before = list(sys.path)
     with pytest.raises(ModelError, match=spec.partition(":")[0]):
         find_definition(str(tmp_path / spec))
