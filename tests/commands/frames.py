@@ -116,8 +116,7 @@ def scan_on_disk(folder: Path) -> ScanOnDisk:
     xy = np.column_stack([pixels % WIDTH, pixels // WIDTH]) + rng.uniform(-0.4, 0.4, (150, 2))
     depth = 4 + 0.02 * xy[:, 0]
     in_camera = np.column_stack([(xy - [31.5, 23.5]) / FOCAL_PX, np.ones(150)]) * depth[:, None]
-    turn = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    points = (in_camera - [0.1, -0.05, -0.2]) @ turn
+    points = (in_camera - [0.1, -0.05, -0.2]) @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     np.column_stack([points, np.zeros(150)]).astype("<f4").tofile(scan)
     calib.write_text(CALIBRATION)
     return ScanOnDisk(folder, image, scan, calib, gt, xy, depth)

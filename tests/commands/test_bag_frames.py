@@ -46,8 +46,7 @@ def extracted(folder: Path, kind: str = "a.mcap", **bag: Any) -> list[str]:
 
 def points_of(frame: FrameFiles) -> Points:
     """The scan of a frame that was written, in its image."""
-    options = ScanOptions(calib=frame.calib)
-    return read_scan_points(frame.sparse, options, (HEIGHT, WIDTH)).points
+    return read_scan_points(frame.sparse, ScanOptions(calib=frame.calib), (HEIGHT, WIDTH)).points
 
 
 FORWARD = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]

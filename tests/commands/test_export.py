@@ -101,12 +101,11 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_at_every_pixel(root: Path) -> 
     assert any(f"{3 * 3 * WIDTH:,} pixels are unknown" in note for note in notes)
     parameters = json.loads((root / "sparse/0/depth_params.json").read_text())
     assert set(parameters) == set(NAMES)
-    expected = np.concatenate([DEPTH[[2, 2]], DEPTH[2:]])
     for name, each in parameters.items():
         png = cv2.imread(str(root / f"inverse_depths/{name}.png"), cv2.IMREAD_UNCHANGED)
         assert png.dtype == np.uint16
         inverse = png.astype(np.float32) / float(2**16) * each["scale"] + each["offset"]
-        assert inverse == pytest.approx(1 / expected, rel=2e-4)
+        assert inverse == pytest.approx(1 / np.concatenate([DEPTH[[2, 2]], DEPTH[2:]]), rel=2e-4)
 
 
 @pytest.mark.parametrize("unit_scale", [None, 0.25])

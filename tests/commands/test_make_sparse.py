@@ -31,8 +31,7 @@ def recorded(written: Written) -> dict[str, Any]:
 
 def projected(frame: ScanOnDisk, output: str = "sparse.csv", **more: Any) -> dict[str, Any]:
     files = {"scan": frame.scan, "image": frame.image, "output": frame.folder / output}
-    options = {"options": ScanOptions(calib=frame.calib)}
-    return recorded(project_scan(**(files | options | more)))
+    return recorded(project_scan(**(files | {"options": ScanOptions(calib=frame.calib)} | more)))
 
 
 @pytest.mark.parametrize("suffix", [".csv", *DEPTH_SUFFIXES])
@@ -85,8 +84,7 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     calib.write_text('{"K": [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}')
     into = {"output": "calib.csv", "overwrite": True, "options": ScanOptions(calib=calib)}
     refused(frame, OutputError, "calib.json is one of the inputs", **into)
-    below = f"{frame.gt.name}/s.png"
-    refused(frame, OutputError, "cannot be written (file exists)", output=below)
+    refused(frame, OutputError, "cannot be written (file exists)", output=f"{frame.gt.name}/s.png")
     refused(frame, OutputError, ".jpg", output="s.jpg")
     assert (frame.folder / "sparse_overlay.png").is_file()
     with pytest.raises(UsageError):  # options of a scan

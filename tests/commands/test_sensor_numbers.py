@@ -277,11 +277,9 @@ def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> Non
 def test_extrinsics_with_kittis_calibration_are_rectified_too(tmp_path: Path, scan: Rows) -> None:
     turn = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
     np.savetxt(tmp_path / "pose.txt", turn.T @ matrix("Tr_velo_to_cam"))  # of the unrectified one
-    other = np.eye(3, 4)  # another sensor's
-    rows = {"P2": matrix("P2"), "R0_rect": turn, "Tr_velo_to_cam": other}
+    rows = {"P2": matrix("P2"), "R0_rect": turn, "Tr_velo_to_cam": np.eye(3, 4)}
     lines = [f"{name}: {' '.join(map(str, row.ravel()))}" for name, row in rows.items()]
     (tmp_path / "calib.txt").write_text("\n".join(lines))
     np.save(tmp_path / "a.npy", scan[:, :3])
     given = {"calib": tmp_path / "calib.txt", "extrinsics": tmp_path / "pose.txt"}
-    options = ScanOptions(keep_occluded=True, **given)
-    same_points(tmp_path / "a.npy", scan[:, :3], scan=options)
+    same_points(tmp_path / "a.npy", scan[:, :3], scan=ScanOptions(keep_occluded=True, **given))

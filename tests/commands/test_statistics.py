@@ -61,8 +61,7 @@ def test_the_gain_is_in_per_cent_of_the_first_and_narrow_for_equal_gains(sign: i
     half = statistics.interval(change, [before, before / 2], clusters)
     assert half == pytest.approx((-50 * sign, -50 * sign), abs=1e-6)
     low, high = statistics.interval(change, [before, before * noise], clusters)
-    value = float(change(before.mean(), (before * noise).mean()))
-    assert low + 1 < value < high - 1
+    assert low + 1 < float(change(before.mean(), (before * noise).mean())) < high - 1
     assert np.isnan(statistics.gain(np.zeros(2), np.array([1.0, np.nan]), sign)).all()
     assert np.isnan(statistics.gain(1.0, 2.0, 0))  # neither is better
 

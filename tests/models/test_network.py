@@ -76,8 +76,7 @@ def test_a_blind_network_is_named(of_depth: float, of_noise: float, count: int, 
     depth = torch.exp(torch.rand(1, 1, 40, 40, generator=generator) * 2)
     unrelated = torch.rand(1, 1, 40, 40, generator=generator)
     xy = torch.randint(0, 40, (count, 2), generator=generator)
-    at = depth[0, 0, xy[:, 1], xy[:, 0]]
-    points = SparsePoints(xy=xy.float(), depth=at, size=(40, 40))
+    points = SparsePoints(xy=xy.float(), depth=depth[0, 0, xy[:, 1], xy[:, 0]], size=(40, 40))
     reader = AlignedDepth(network(output_scale="affine"), points, "auto")
     reader(of_depth * depth + of_noise * unrelated)
     assert any("network 'n' says nothing about" in note for note in reader.notes) == said

@@ -132,9 +132,8 @@ def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
 
 def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path) -> None:
     sides = {2: 32 * Dim("rows", min=1, max=64), 3: 32 * Dim("columns", min=1, max=64)}
-    rgb = (torch.rand(1, 3, 64, 96),)
     for name, net in (("plain", nn.Conv2d(3, 1, 3, 1, 1)), ("computing", Net().eval())):
-        program = torch.export.export(net, rgb, dynamic_shapes=(sides,))
+        program = torch.export.export(net, (torch.rand(1, 3, 64, 96),), dynamic_shapes=(sides,))
         torch.export.save(program, tmp_path / f"{name}.pt2")
     assert find_definition(str(tmp_path / "plain.pt2")).size == Multiple(32)
     with pytest.raises(ModelError, match="fixed sizes"):
@@ -223,8 +222,7 @@ def test_pickles_libraries_and_code_in_an_archive_stay_unread(
 
     unread = ("sample_inputs/model.pt", "constants/custom_obj_0", "aotinductor/model/m.so")
     entries = {f"data/{entry}": pickled.getvalue() for entry in unread}
-    hostile = rewritten(archive, {MODEL: with_code, **entries})
-    network = load_network(str(hostile), None)
+    network = load_network(str(rewritten(archive, {MODEL: with_code, **entries})), None)
     rgb = torch.rand(1, 3, 32, 48)
     assert torch.equal(network.module(rgb), load_network(str(archive), None).module(rgb))
     assert not trap.exists()

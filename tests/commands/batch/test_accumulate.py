@@ -42,8 +42,7 @@ def test_points_of_neighbours_lower_the_error_at_held_out_points(tmp_path: Path)
     accumulating(root, refine=refine)
     first, second = record_of(root, "drive_000"), record_of(root, "drive_001")
     assert 40 < first["points"]["moved"] < second["points"]["moved"]
-    neighbours = [Path(each["path"]).stem for each in second["neighbours"]]
-    assert neighbours == ["drive_000", "drive_002"]
+    assert [Path(each["path"]).stem for each in second["neighbours"]] == ["drive_000", "drive_002"]
     shutil.rmtree(root / "out")
     batch(root, refine=refine)
     alone = record_of(root, "drive_001")

@@ -36,8 +36,7 @@ def test_weights_are_kept_used_for_every_frame_and_found_again_if_they_are_bette
     assert batch(drive) == 0
     out, weights = drive.parent / "out", drive.parent / "out/adapted/drive.safetensors"
     records = [json.loads(path.read_text()) for path in out.glob("drive_*.json")]
-    uses = [record["model"]["checkpoint"] == str(weights) for record in records]
-    assert uses == [is_better] * 8
+    assert [record["model"]["checkpoint"] == str(weights) for record in records] == [is_better] * 8
     assert weights.is_file() == is_better
     before = {path: path.stat().st_mtime_ns for path in out.rglob("drive*")}
     assert len(before) > 16
@@ -64,7 +63,6 @@ def test_stopped_without_use_of_points_or_with_a_bad_frame_nothing_is_learnt(dri
 def test_few_frames_and_dense_points_are_not_learnt_from(
     count: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drive = drive_on_disk(tmp_path / "drive", frames=count)
-    assert batch(drive) == 0, capsys.readouterr().err
+    assert batch(drive_on_disk(tmp_path / "drive", frames=count)) == 0, capsys.readouterr().err
     assert said in capsys.readouterr().err
     assert json.loads((tmp_path / "out/adapted/drive.json").read_text())["why"] == said

@@ -190,12 +190,10 @@ def test_a_name_without_files_of_its_own_is_refused(root: Path, name: str) -> No
 
 def test_shards_share_a_folder_without_overlap_and_the_limit_comes_first(root: Path) -> None:
     (root / "sparse/a.png").write_bytes(b"no depth")
-    parts = [done(root, shard=(number, 3)) for number in (1, 2, 3)]
-    assert parts == [["a", "d"], ["b"], ["c"]]
+    assert [done(root, shard=(number, 3)) for number in (1, 2, 3)] == [["a", "d"], ["b"], ["c"]]
     counts = summary(root)["counts"]
     assert (counts["done"], counts["failed"], counts["pending"]) == (3, 1, 0)
-    result = batch(root, limit=3, shard=(2, 2), output=root / "few")
-    assert result.counts["pending"] == 3
+    assert batch(root, limit=3, shard=(2, 2), output=root / "few").counts["pending"] == 3
     assert [path.name for path in (root / "few").glob("*_depth.png")] == ["b_depth.png"]
 
 
@@ -264,8 +262,7 @@ def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path
             for measure, mean in means.items():
                 values = [row["errors"][basis][stage][measure] for row in rows]
                 assert mean == pytest.approx(np.mean(values), rel=1e-12)
-    errors = rows[1]["errors"]
-    assert float(table[1]["rmse_after"]) == errors["ground_truth"]["after"]["rmse"]
+    assert float(table[1]["rmse_after"]) == rows[1]["errors"]["ground_truth"]["after"]["rmse"]
     # Files that are in no frame: five are named, and all are in the summary.
     assert len(content["unmatched"]) == 7
     assert sum("rgb/x" in text for text in listener.messages) == 5

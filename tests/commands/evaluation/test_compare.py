@@ -196,8 +196,7 @@ def test_a_plot_has_an_axis_lines_and_means_over_seeds(tmp_path: Path, figures: 
     lines = {line.get_label(): line.get_xydata().tolist() for line in above.get_lines()}
     assert lines["loss=x"] == [[20, 0.75], [100, 0.5]]
     assert lines["loss=y"] == [[20, 0.5], [100, 1.25]]
-    gains = [line.get_ydata().tolist() for line in below.get_lines()]
-    assert gains == [[25, 50], [50, -25]]
+    assert [line.get_ydata().tolist() for line in below.get_lines()] == [[25, 50], [50, -25]]
     (legend,) = figures[0].legends
     named = [text.get_text() for text in legend.get_texts()]
     assert named == ["loss=x", "loss=y", "before refinement"]

@@ -129,8 +129,7 @@ def test_images_count_alike_and_one_without_prediction_not_at_all(tmp_path: Path
     assert [each.name for each in result.frames if each.status == "failed"] == ["c"]
     assert result.mean["rmse"] == (1 + 3) / 2
     assert "coverage over 2 of 3 frames" in means_table(result).title
-    counts = {"frames": 3, "scored": 2, "pixels": 3, "coverage": 3 / 4}
-    assert result.to_json()["counts"] == counts
+    assert result.to_json()["counts"] == {"frames": 3, "scored": 2, "pixels": 3, "coverage": 3 / 4}
     assert says(result, "1 of the scored pixels have a point of the sparse input")
     without = scored(tmp_path, exclude_sparse=True)
     assert (without.counts["pixels"], says(without, "sparse input")) == (2, False)

@@ -31,8 +31,7 @@ def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points() -> None:
         (0.005, 0.02, None, 1_000_000),
         (0.005, 80.0, None, 256),
     ):
-        depth = torch.tensor([nearest, farthest])
-        points = SparsePoints(xy=torch.eye(2), depth=depth, size=(2, 2))
+        points = SparsePoints(xy=torch.eye(2), depth=torch.tensor([nearest, farthest]), size=(2, 2))
         assert output_scale(Frame(rgb=None, points=points, depth_scale=scale)) == expected
 
 

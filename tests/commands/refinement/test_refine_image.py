@@ -123,8 +123,7 @@ def test_a_mistake_gives_one_clear_line_and_writes_nothing(
     frame: FrameOnDisk, changes: dict[str, Any], error: type[PnpDepthError], message: str
 ) -> None:
     np.save(frame.folder / "small.npy", frame.depth[:10])
-    codes = np.rint(frame.depth * 1000).astype(np.uint16)
-    Image.fromarray(codes).save(frame.folder / "codes.png")
+    Image.fromarray(np.rint(frame.depth * 1000).astype(np.uint16)).save(frame.folder / "codes.png")
     (frame.folder / "far.csv").write_text("x,y,depth\n500,5,2\n")
     before = {*frame.folder.iterdir()}
     paths = {part: changes[part] for part in ("gt", "sparse") if changes.get(part)}
@@ -200,8 +199,7 @@ def test_an_image_is_moved_unless_off_or_by_the_paper(tmp_path: Path, frame: Fra
 
 def test_moving_gives_what_an_image_moved_on_disk_gives(tmp_path: Path, frame: FrameOnDisk) -> None:
     refined(tmp_path, frame, registration=(1.0, -4.0, 3.0), output=tmp_path / "a.npy")
-    files = write_frame(tmp_path, 0, 500)
-    image = cv2.imread(str(files["image"]))
+    image = cv2.imread(str(write_frame(tmp_path, 0, 500)["image"]))
     moved = np.pad(image, ((0, 3), (4, 0), (0, 0)), mode="edge")[3:, :-4]
     cv2.imwrite(str(tmp_path / "moved.png"), moved)
     changes: dict[str, Any] = {"image": tmp_path / "moved.png", "registration": "off"}

@@ -112,8 +112,7 @@ def test_several_outputs_are_listed_and_one_can_be_named(tmp_path: Path) -> None
     assert f"2 outputs; name the depth as {path}:g" in refused(path)
     refused(path, f"{path}:x")
     for name in ("depth", "g"):
-        network = load_network(f"{path}:{name}", None)
-        assert "agrees with onnxruntime" in network.verify((IMAGE,))[0]
+        assert "agrees with onnxruntime" in load_network(f"{path}:{name}", None).verify((IMAGE,))[0]
 
 
 def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Path) -> None:

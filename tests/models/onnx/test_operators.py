@@ -102,11 +102,10 @@ def model_of(
     names = [f"in{n}" if f"in{n}" in constants else "" for n in range(len(inputs))]
     node = helper.make_node(op, names, [f"out{n}" for n in range(outputs)], **attributes)
     x = constants.pop("in0")
-    kind = helper.np_dtype_to_tensor_dtype(x.dtype)
     graph = helper.make_graph(
         [node],
         "g",
-        [helper.make_tensor_value_info("in0", kind, x.shape)],
+        [helper.make_tensor_value_info("in0", helper.np_dtype_to_tensor_dtype(x.dtype), x.shape)],
         [onnx.ValueInfoProto(name=name) for name in node.output],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
     )

@@ -95,8 +95,7 @@ def tensor_pickle(elements: int, shape: tuple[int, ...], stride: tuple[int, ...]
     pickler = pickle.Pickler(content, protocol=2)
     pid = ("storage", torch.FloatStorage, "0", "cpu", elements)
     pickler.persistent_id = lambda each: pid if each is storage else None  # type: ignore[method-assign]
-    rebuild = torch._utils._rebuild_tensor_v2
-    pickler.dump(Hostile(rebuild, storage, 0, shape, stride, False, {}))
+    pickler.dump(Hostile(torch._utils._rebuild_tensor_v2, storage, 0, shape, stride, False, {}))
     return content.getvalue()
 
 

@@ -67,8 +67,7 @@ def bundle(folder: Path, entries: dict[str, bytes], *contents: bytes) -> Path:
 def test_what_tensorflow_wrote_is_read_to_the_bit_or_refused_if_it_is_cut(tmp_path: Path) -> None:
     index, whole = tmp_path / "x.ckpt.index", zlib.decompress(base64.b85decode(INDEX))
     index.write_bytes(whole)
-    data = zlib.decompress(base64.b85decode(DATA))
-    index.with_suffix(".data-00000-of-00001").write_bytes(data)
+    index.with_suffix(".data-00000-of-00001").write_bytes(zlib.decompress(base64.b85decode(DATA)))
     expected = {
         "conv1.biases": torch.tensor([-1, 2.5, 3]),
         "conv1.weights": torch.arange(12.0).reshape(1, 2, 2, 3),
