@@ -68,9 +68,7 @@ def test_the_gain_is_in_per_cent_of_the_first_and_narrow_for_equal_gains(sign: i
 
 def p_value_of(changes: np.ndarray) -> float:
     """Of runs whose frames differ by these."""
-    return statistics.swap_p_value(
-        np.zeros_like(changes), changes, clusters_of(np.arange(len(changes)))
-    )
+    return statistics.swap_p_value(0 * changes, changes, clusters_of(np.arange(len(changes))))
 
 
 def test_the_p_value_is_the_fraction_of_all_swaps_that_differ_as_much_and_never_zero() -> None:

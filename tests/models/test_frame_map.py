@@ -27,11 +27,6 @@ def ramps(height: int, width: int) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)]).float()[None]
 
 
-def every_pixel(height: int, width: int) -> SparsePoints:
-    xy = ramps(height, width)[0, :2].flatten(1).t().contiguous()
-    return SparsePoints(xy=xy, depth=torch.arange(1.0, len(xy) + 1), size=(height, width))
-
-
 @given(policies, sides, sides)
 def test_any_image_fits_and_comes_back(policy: Fixed | Multiple, height: int, width: int) -> None:
     frame = FrameMap.fit(policy, height, width)
@@ -59,7 +54,9 @@ def test_any_image_fits_and_comes_back(policy: Fixed | Multiple, height: int, wi
 def test_points_stay_at_their_pixel(policy: Fixed | Multiple | Near, size: tuple[int, int]) -> None:
     frame = FrameMap.fit(policy, *size)
     network = frame.rgb_to_network(ramps(*size))
-    there = frame.points_to_network(every_pixel(*size))
+    xy = ramps(*size)[0, :2].flatten(1).t().contiguous()
+    every = SparsePoints(xy=xy, depth=torch.arange(1.0, len(xy) + 1), size=size)
+    there = frame.points_to_network(every)
     assert there.size == frame.network
     assert len(there) == math.prod(frame.crop[2:])  # those outside the crop are dropped
     last = torch.tensor(frame.resized[::-1]) - 3

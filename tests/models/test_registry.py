@@ -36,14 +36,6 @@ def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def install(folder: Path, entry_points: str) -> None:
-    """A package of somebody else, with these entry points in the group pnpdepth.models."""
-    info = folder / "other-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[pnpdepth.models]\n{entry_points}\n")
-
-
 @pytest.mark.parametrize("text", [ONE, SEVERAL])
 def test_one_new_file_in_model_zoo_defs_adds_a_network(text: str, open_list: Path) -> None:
     stem = f"my_net{len(text)}"
@@ -53,18 +45,24 @@ def test_one_new_file_in_model_zoo_defs_adds_a_network(text: str, open_list: Pat
     assert find_definition(name).build().out_channels == 1
 
 
-def test_an_entry_point_of_another_package_adds_networks(open_list: Path) -> None:
+ENTRY_POINTS = """[pnpdepth.models]
+object = other_nets:definition
+a-dict = other_nets:definitions
+lost = missing_package:definition
+others = os.path:sep
+"""
+
+
+def test_entry_points_add_networks_or_are_reported_when_they_are_named(open_list: Path) -> None:
     one, several = ONE.replace("NAME", "theirs-object"), SEVERAL.replace("NAME", "theirs-in-a-dict")
     (open_list / "other_nets.py").write_text(one + several)
-    install(open_list, "object = other_nets:definition\na-dict = other_nets:definitions")
+    info = open_list / "other-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
     for name in ("theirs-object", "theirs-in-a-dict"):
         assert all_definitions()[name] == find_definition(name)
-
-
-def test_a_package_that_cannot_be_loaded_is_reported_only_when_it_is_named(open_list: Path) -> None:
-    install(open_list, "theirs = missing_package:definition\nothers = os.path:sep")
-    assert "compact" in all_definitions()
-    named = {"theirs": "missing_package", "others": "gives a str", "fcrn-tyni": "fcrn-tiny"}
+    named = {"lost": "missing_package", "others": "gives a str", "fcrn-tyni": "fcrn-tiny"}
     for name, reason in named.items():
         with pytest.raises(ModelError, match=reason):
             find_definition(name)

@@ -76,9 +76,8 @@ def test_every_format_gives_its_weights_and_is_refused_if_cut(suffix: str, tmp_p
 def test_prefixes_of_parallel_and_compiled_modules_are_stripped(
     prefix: str, tmp_path: Path
 ) -> None:
-    torch.save(
-        {"state_dict": {f"{prefix}{k}": v for k, v in weights().items()}}, tmp_path / "w.ckpt"
-    )
+    state = {f"{prefix}{name}": tensor for name, tensor in weights().items()}
+    torch.save({"state_dict": state}, tmp_path / "w.ckpt")
     (note,) = loads(tmp_path / "w.ckpt", weights())
     assert all(repr(f"{part}.") in note for part in prefix.split(".")[:-1])
 
