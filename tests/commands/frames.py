@@ -107,11 +107,10 @@ class ScanOnDisk:
 def scan_on_disk(folder: Path) -> ScanOnDisk:
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    truth = (4 + 0.02 * x).astype(np.float32)
     image, scan, calib, gt = (folder / n for n in ("img.png", "img.bin", "calib.txt", "gt.png"))
     rgb = np.stack([255 * x / WIDTH, 255 * y / HEIGHT, 128 + 0 * x], -1).astype(np.uint8)
     cv2.imwrite(str(image), rgb)
-    write_depth(gt, truth, scale=1000)
+    write_depth(gt, (4 + 0.02 * x).astype(np.float32), scale=1000)
     pixels = rng.permutation(HEIGHT * WIDTH)[:150]
     xy = np.column_stack([pixels % WIDTH, pixels // WIDTH]) + rng.uniform(-0.4, 0.4, (150, 2))
     depth = 4 + 0.02 * xy[:, 0]

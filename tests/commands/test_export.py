@@ -14,7 +14,7 @@ import pytest
 from pnpdepth_cli.commands.exports import export_results
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
-from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
@@ -205,11 +205,10 @@ def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -
     export_results(folder, dense, to="colmap")
     export_results(folder, dense, to="colmap", overwrite=True)
     cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
-    cases: list[tuple[Path, Path, type[PnpDepthError], str]] = [
+    for source, output, error, named in (
         (root / "images", root / "new", InputError, "NAME_depth"),
         (folder, dense, OutputError, "--overwrite"),
         (folder, root / "new", InputError, "a_valid"),
-    ]
-    for source, output, error, named in cases:
+    ):
         with pytest.raises(error, match=named):
             export_results(source, output, to="colmap")

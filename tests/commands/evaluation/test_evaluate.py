@@ -79,9 +79,8 @@ MATCHED = {
 def test_files_are_matched_by_name(tmp_path: Path) -> None:
     predictions = [name for _, name in MATCHED.values() if name != "."]
     others = ["b_preview.png", "b.png", ".hidden/c_depth.png"]  # of a refinement, and hidden
-    found = scored(folders(tmp_path, [*predictions, *others], MATCHED)).frames
     names = dict[str, tuple[str, str]]()
-    for each in found:
+    for each in scored(folders(tmp_path, [*predictions, *others], MATCHED)).frames:
         files = {side: Path(file.path) for side, file in each.inputs.items()}
         prediction = files.get("prediction", tmp_path / "out").relative_to(tmp_path / "out")
         names[files["gt"].relative_to(tmp_path / "gt").as_posix()] = (each.name, str(prediction))
