@@ -8,11 +8,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.evaluation.compare import (
+    Comparison,
     compare,
     comparison_table,
     methods_table,
@@ -173,39 +175,35 @@ def refined(folder: Path, mae: float, **varied: str) -> str:
     return saved(folder / ",".join(varied.values()), stages, varied=varied)
 
 
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The figures that are written."""
-    figure, written = pytest.importorskip("matplotlib.figure").Figure, list[Any]()
-    savefig = figure.savefig
-    monkeypatch.setattr(
-        figure, "savefig", lambda self, *a, **k: (written.append(self), savefig(self, *a, **k))
-    )
-    return written
+def plotted(comparison: Comparison, path: Path) -> Any:
+    """The figure that is written."""
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    with mock.patch.object(figure, "savefig", autospec=True, side_effect=figure.savefig) as saving:
+        plot_comparison(comparison, path)
+    return saving.call_args.args[0]
 
 
-def test_a_plot_has_an_axis_lines_and_means_over_seeds(tmp_path: Path, figures: list[Any]) -> None:
+def test_a_plot_has_an_axis_lines_and_means_over_seeds(tmp_path: Path) -> None:
     errors = {"100 x 0": 0.5, "20 x 0": 1.0, "20 x 1": 0.5, "20 y 0": 0.5, "100 y 0": 1.25}
     runs = []
     for values, mae in errors.items():
         count, loss, seed = values.split()
         runs.append(refined(tmp_path, mae, sample=count, loss=loss, seed=seed))
-    plot_comparison(compare(runs), tmp_path / "p.svg")
-    above, below = figures[0].axes
+    figure = plotted(compare(runs), tmp_path / "p.svg")
+    above, below = figure.axes
     assert (below.get_xlabel(), below.get_xscale()) == ("sample", "log")
     lines = {line.get_label(): line.get_xydata().tolist() for line in above.get_lines()}
     assert lines["loss=x"] == [[20, 0.75], [100, 0.5]]
     assert lines["loss=y"] == [[20, 0.5], [100, 1.25]]
     assert [line.get_ydata().tolist() for line in below.get_lines()] == [[25, 50], [50, -25]]
-    (legend,) = figures[0].legends
+    (legend,) = figure.legends
     named = [text.get_text() for text in legend.get_texts()]
     assert named == ["loss=x", "loss=y", "before refinement"]
 
 
-def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path, figures: list[Any]) -> None:
+def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path) -> None:
     comparison = compare([refined(tmp_path, 0.5, method=name) for name in ("paper", "fused")])
-    plot_comparison(comparison, tmp_path / "p.png")
-    (_, below) = figures[0].axes
+    (_, below) = plotted(comparison, tmp_path / "p.png").axes
     assert [tick.get_text() for tick in below.get_xticklabels()] == ["paper", "fused"]
     assert below.get_lines()[0].get_xdata().tolist() == [0, 1]
     before = (tmp_path / "p.png").read_bytes()
