@@ -89,8 +89,7 @@ class _Fields:
             raise InputError(f"{self.path} has no {name}; it is incomplete or of another kind")
         numbers = numbers_in(self.values[name])
         if numbers is None or not (np.abs(numbers) <= _LARGEST).all():
-            fact = f"{name} is not made of numbers that a camera has"
-            raise InputError(f"{self.path}: {fact}; correct it")
+            raise InputError(f"{self.path}: {name} is not made of a camera's numbers; correct it")
         if count is not None and len(numbers) != count:
             raise InputError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
         return numbers
@@ -142,8 +141,7 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         numbers = fields.numbers("Tr", "Tr_velo_cam", "Tr_velo_to_cam")
         return _kitti(fields, camera, "KITTI", pose_of_matrix(path, "Tr", numbers))
     if unknown := sorted(set(fields.values) - set(_PLAIN)):
-        fact = f"{unknown[0]!r} is not part of a calibration"
-        raise InputError(f"{path}: {fact}; use {', '.join(_PLAIN)}")
+        raise InputError(f"{path}: the name {unknown[0]!r} is none of {', '.join(_PLAIN)}")
     return _single(fields, camera, source)
 
 

@@ -102,8 +102,7 @@ def depth_from_stored(
     while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):  # as networks give it
         values = values[0] if len(values) == 1 else values[..., 0]
     if values.ndim != 2:
-        fact = f"has the shape {stored.values.shape}"
-        raise InputError(f"{path} {fact}; a depth image is (H, W)")
+        raise InputError(f"{path} has the shape {stored.values.shape}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
     source, below = stored.reading.source, int(np.count_nonzero(np.less(values, 0)))
     lost = f", {below:,} pixels below 0 taken as unknown" if below else ""

@@ -164,8 +164,7 @@ def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
     if len(grey) == 1:
         names = grey * 3
     if not channels.keys() >= {*names}:
-        listing = ", ".join(channels)
-        raise InputError(f"{path} has no one image in ({listing}); export R, G and B")
+        raise InputError(f"{path} has no one image in ({', '.join(channels)}); export R, G and B")
     return np.stack([channels[name] for name in names], axis=2)
 
 

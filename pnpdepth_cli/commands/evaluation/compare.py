@@ -310,11 +310,10 @@ def methods_table(comparison: Comparison) -> Table:
             text, is_known = measure.text(mean), mean is not None and measure.sign != 0
             stars = "*" * sum(p < limit for limit in _STARS)
             row.append((text + stars, "bold" if is_known and text == best else ""))
+    best = f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold"
+    marks = f"*, **, ***: differs from {runs[0].name} with p < 0.05, 0.01, 0.001"
     return Table(
-        title=(
-            f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold; *, **, ***:"
-            f" differs from {runs[0].name} with p < 0.05, 0.01, 0.001 {_describe_tests(comparison)}"
-        ),
+        title=f"{best}; {marks} {_describe_tests(comparison)}",
         columns=["", *comparison.measures],
         rows=rows,
     )

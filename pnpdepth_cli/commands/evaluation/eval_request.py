@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from pnpdepth_cli import choices
@@ -121,12 +121,8 @@ class EvalRequest:
         usual = with_thresholds(self._thresholds)
         of_parts = () if self.depth_limits is None else by_depth(usual, *self.depth_limits)
         if self.protocol == "kitti":
-            usual = tuple(
-                replace(m, shown_unit="mm", shown_factor=1000.0, decimals=1)
-                if m.key in ("rmse", "mae")
-                else m
-                for m in usual
-            )
+            in_mm = partial(replace, shown_unit="mm", shown_factor=1000.0, decimals=1)
+            usual = tuple(in_mm(m) if m.key in ("rmse", "mae") else m for m in usual)
         named = (key for key in self.columns or () if key in choices.MEASURES)
         return (*usual, *of_parts, *(choices.MEASURES[key] for key in named))
 

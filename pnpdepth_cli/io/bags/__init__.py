@@ -185,15 +185,13 @@ def _check_bag(path: Path) -> None:
     if path.is_dir():
         files, metadata = sorted(path.glob("*.db3")), path / "metadata.yaml"
         if not metadata.is_file():
-            fact = "has no metadata.yaml, so it is no ROS 2 bag"
-            raise InputError(f"{path} {fact}; give the bag's own folder or file")
+            raise InputError(f"{path} has no metadata.yaml of a ROS 2 bag; give its own folder")
         match parse_yaml(metadata, read_bytes(metadata).decode("utf-8", "replace")):
             case {"rosbag2_bagfile_information": dict(information)}:
                 if str(information.get("compression_mode", "")).lower() not in ("", "none"):
                     raise InputError(f"{path}: the bag is compressed; `ros2 bag convert` it")
             case _:
-                fact = "is no metadata of a bag; repair it: ros2 bag reindex"
-                raise InputError(f"{metadata} {fact}")
+                raise InputError(f"{metadata} is no metadata of a bag; repair it: ros2 bag reindex")
     for file in files:
         size_of_regular_file(file)
         if file.suffix.lower() == ".db3":
