@@ -23,6 +23,13 @@ INDEX = (
 DATA = "c-muNXxPudpy0s3-~hxR&|nWFp!^0PUI4@gfcODO-jRVp0EiWU*ub$skP)KAj*)>SDe(2QlGKV40OZUKfd"
 
 
+def written(folder: Path) -> Path:
+    """TensorFlow's checkpoint of four variables of numbers, and one of text."""
+    for suffix, text in ((".index", INDEX), (".data-00000-of-00001", DATA)):
+        (folder / f"x.ckpt{suffix}").write_bytes(zlib.decompress(base64.b85decode(text)))
+    return folder / "x.ckpt.index"
+
+
 def varint(value: int) -> bytes:
     return bytes([value]) if value < 128 else bytes([value & 127 | 128]) + varint(value >> 7)
 
@@ -65,9 +72,8 @@ def bundle(folder: Path, entries: dict[str, bytes], *contents: bytes) -> Path:
 
 
 def test_what_tensorflow_wrote_is_read_to_the_bit_or_refused_if_it_is_cut(tmp_path: Path) -> None:
-    index, whole = tmp_path / "x.ckpt.index", zlib.decompress(base64.b85decode(INDEX))
-    index.write_bytes(whole)
-    index.with_suffix(".data-00000-of-00001").write_bytes(zlib.decompress(base64.b85decode(DATA)))
+    index = written(tmp_path)
+    whole = index.read_bytes()
     expected = {
         "conv1.biases": torch.tensor([-1, 2.5, 3]),
         "conv1.weights": torch.arange(12.0).reshape(1, 2, 2, 3),
