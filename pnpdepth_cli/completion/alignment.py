@@ -106,10 +106,8 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
     kinds = ("none", "scale", "affine") if kind == "auto" else (kind,)
     fits = [fit for s in spaces for k in kinds if (fit := _fit(x, d, s, k)) is not None]
     if not fits and len(x) < 2:
-        raise NoPointsError(
-            f"alignment {kind!r} needs at least 2 sparse points where the network sees them,"
-            f" here is {len(x)}; 'scale' needs only one"
-        )
+        fact = f"alignment {kind!r} needs 2 sparse points where the network sees them"
+        raise NoPointsError(f"{fact}, here is {len(x)}; 'scale' needs only one")
     if not fits:
         raise ModelError(
             f"alignment {kind!r} is not possible: the network's output is the same at all"

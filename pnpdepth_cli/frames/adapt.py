@@ -103,10 +103,8 @@ def learn(
         DivergedError: The loss is not finite.
     """
     if "sparse" not in network.definition.input_kind:
-        raise UsageError(
-            f"network {network.definition.name!r} takes no sparse depth, so it cannot learn from"
-            " points hidden from its input"
-        )
+        name = network.definition.name
+        raise UsageError(f"network {name!r} takes no sparse depth, so none can be hidden from it")
     # Some frames are for validation.
     lessons = [_lesson(network, name, frame) for name, frame in frames]
     every = max(2, min(5, len(lessons) // 3))

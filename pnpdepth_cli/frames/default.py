@@ -172,10 +172,8 @@ def _notes(
     """Which points were left out, and which of the user's networks have no part in the result."""
     notes = list[str]()
     if left_out := len(frame.points) - len(inliers.points):
-        notes.append(
-            f"outliers: {left_out:,} of {len(frame.points):,} points left out, inconsistent with"
-            " the others"
-        )
+        count = f"{left_out:,} of {len(frame.points):,} points"
+        notes.append(f"outliers: {count} left out, inconsistent with the others")
     for own in experts:
         of_user = sum(weights[each.name] for each in experts if each.user is own.user)
         if own.user is None or own.name != own.user.name or of_user >= fuse.LEAST_PART:

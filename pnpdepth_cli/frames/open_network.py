@@ -107,11 +107,9 @@ class OpenNetwork:
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
-                raise errors.NoPointsError(
-                    f"none of the {len(frame.points)} sparse points lies inside the part of the"
-                    f" image that network {self.name!r} sees (rows and columns"
-                    f" {prepared.map.crop})"
-                )
+                seen = f"{prepared.map.crop}, the rows and columns that network {self.name!r} sees"
+                fact = f"none of the {len(frame.points)} sparse points lies in {seen}"
+                raise errors.NoPointsError(fact)
             reader = AlignedDepth(network, prepared.points, settings.align)
             try:
                 # Without updates one pass of the whole network is enough.

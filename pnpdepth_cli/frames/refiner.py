@@ -181,10 +181,8 @@ def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
     """Inside, no other refiner opens these modules: two cuts of one would disturb each other."""
     with _OPENING:
         if len(set(modules)) < len(modules) or not _OPEN.isdisjoint(modules):
-            raise UsageError(
-                "a network is in use by another Refiner: close that one, share it between threads,"
-                " or load the network again"
-            )
+            hint = "close that one, share it between threads, or load the network again"
+            raise UsageError(f"a network is in use by another Refiner: {hint}")
         _OPEN.update(modules)
     try:
         yield
@@ -275,10 +273,8 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
         white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]  # as files are read
         return (values / white).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
-        raise InputError(
-            f"an image is uint8, uint16, or float in 0..1; this one is {values.dtype} in"
-            f" {values.min()}..{values.max()}"
-        )
+        given = f"{values.dtype} in {values.min()}..{values.max()}"
+        raise InputError(f"an image is uint8, uint16, or float in 0..1; this one is {given}")
     return values.astype(np.float32)
 
 

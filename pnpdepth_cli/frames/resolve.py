@@ -95,10 +95,8 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     except ValueError:
         return wanted
     if not 0 <= fraction <= 1 or not definition.layers:
-        raise errors.UsageError(
-            f"layer {wanted!r}: a number is a fraction between 0 and 1 of the layers that the"
-            f" definition of {definition.name!r} lists ({len(definition.layers)} of them)"
-        )
+        listed = f"the {len(definition.layers)} layers in the definition of {definition.name!r}"
+        raise errors.UsageError(f"layer {wanted!r}: a number is a fraction 0…1 of {listed}")
     return definition.layers[round(fraction * (len(definition.layers) - 1))]
 
 
