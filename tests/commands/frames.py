@@ -59,10 +59,10 @@ class FrameOnDisk:
     depth: NDArray[np.float32]
 
 
-def frame_on_disk(folder: Path) -> FrameOnDisk:
-    y, x = np.mgrid[:46, :62]
-    depth = (1.5 + x / 62 + 0.5 * (y > 23)).astype(np.float32)
-    rgb = np.stack([255 * x / 62, 255 * y / 46, 128 + 0 * x], -1).astype(np.uint8)
+def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDisk:
+    y, x = np.mgrid[:height, :width]
+    depth = (1.5 + x / width + 0.5 * (y > height // 2)).astype(np.float32)
+    rgb = np.stack([255 * x / width, 255 * y / height, 128 + 0 * x], -1).astype(np.uint8)
     image, sparse, gt = folder / "img.png", folder / "s.png", folder / "gt.png"
     cv2.imwrite(str(image), rgb)
     points, thin = np.random.default_rng(0).permutation(depth.size)[:60], np.zeros_like(depth)
