@@ -28,7 +28,7 @@ def test_networks_are_listed_and_layers_with_why_one_cannot_be_cut_at(
     assert shown["unused"] == ["–", *rows["unused"]["problem"].split()]
 
 
-def test_an_onnx_file_is_refined_and_checked(
+def test_onnx_is_refined_and_checked(
     frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")

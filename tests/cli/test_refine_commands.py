@@ -132,9 +132,7 @@ def test_method_number_of_points_networks_and_switches_can_be_varied(root: Path)
     assert run([*batch, "--iterations", "0", *varied]) == 0
 
 
-def test_a_second_run_does_only_what_is_left(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_second_run_does_what_is_left(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (root / "rgb/b.png").write_bytes(b"")
     assert run(arguments("--limit", "1", "--vary", "iterations=0")) == 0
     capsys.readouterr()

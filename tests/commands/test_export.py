@@ -183,9 +183,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
         ("inputs.sparse.image", "/etc/x.png"),
     ],
 )
-def test_results_that_cannot_be_exported_are_one_line(
-    root: Path, entry: str, value: object
-) -> None:
+def test_what_cannot_be_exported_is_one_line(root: Path, entry: str, value: object) -> None:
     folder = results(root)
     record = json.loads((folder / "a.json").read_text())
     *parents, name = entry.split(".")

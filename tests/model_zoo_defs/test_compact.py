@@ -46,9 +46,7 @@ def prior_of(sparse: Tensor) -> Tensor:
     return prior
 
 
-def test_depth_scales_with_its_inputs_and_an_unknown_prior_changes_nothing(
-    network: Compact,
-) -> None:
+def test_depth_scales_with_its_inputs_and_an_unknown_prior_does_nothing(network: Compact) -> None:
     rgb, sparse = frame(300)
     prior, unknown = prior_of(sparse), torch.zeros_like(sparse)
     with torch.no_grad():

@@ -44,9 +44,7 @@ def test_arguments_come_in_the_order_of_the_input_kind() -> None:
         (("n", 3, "h", "w"), Multiple(8)),
     ],
 )
-def test_three_channels_are_first_or_last(
-    shape: tuple[object, ...], size: Fixed | Multiple
-) -> None:
+def test_channels_are_first_or_last(shape: tuple[object, ...], size: Fixed | Multiple) -> None:
     known = {"size": Multiple(8), "build": nn.Identity}
     found = graph_definition([shape], Path("net.onnx"), {}, **known)
     assert found.size == size

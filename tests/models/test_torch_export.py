@@ -206,9 +206,7 @@ def test_what_is_no_exported_program_is_refused(archive: Path, tmp_path: Path) -
             find_definition(str(path))
 
 
-def test_pickles_libraries_and_code_in_an_archive_stay_unread(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_pickles_libraries_and_code_in_archives_stay_unread(archive: Path, tmp_path: Path) -> None:
     trap = tmp_path / "trap"
     pickled = io.BytesIO()
     torch.save((Hostile(os.mkdir, str(trap)),), pickled)

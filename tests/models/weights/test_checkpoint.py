@@ -73,9 +73,7 @@ def test_every_format_gives_its_weights_and_is_refused_if_cut(suffix: str, tmp_p
 
 
 @pytest.mark.parametrize("prefix", ["module.", "module.module.", "_orig_mod.", "model._orig_mod."])
-def test_prefixes_of_parallel_and_compiled_modules_are_stripped(
-    prefix: str, tmp_path: Path
-) -> None:
+def test_prefixes_of_parallel_or_compiled_modules_are_stripped(prefix: str, tmp_path: Path) -> None:
     state = {f"{prefix}{name}": tensor for name, tensor in weights().items()}
     torch.save({"state_dict": state}, tmp_path / "w.ckpt")
     (note,) = loads(tmp_path / "w.ckpt", weights())

@@ -41,9 +41,7 @@ def save(content: Any, path: Path, new: bool = True) -> Path:
 
 
 @both_layouts
-def test_of_a_whole_module_the_state_is_read_and_the_rest_is_named(
-    tmp_path: Path, new: bool
-) -> None:
+def test_of_a_whole_module_the_state_is_read_the_rest_named(tmp_path: Path, new: bool) -> None:
     net, notes = Net(), list[str]()
     optimiser = torch.optim.SGD(net.parameters(), lr=0.1, momentum=0.9)
     whole = {"args": argparse.Namespace(lr=0.1), "model": net, "optimizer": optimiser}

@@ -108,7 +108,7 @@ def test_variables_of_two_files_are_read(tmp_path: Path) -> None:
         {str(n): entry(1, (2,), 0, 8) for n in range(9)},
     ],
 )
-def test_what_claims_more_than_is_there_is_refused(
+def test_claims_of_more_than_is_there_are_refused(
     entries: dict[str, bytes], tmp_path: Path
 ) -> None:
     refused(bundle(tmp_path, entries, b"\0" * 8))
