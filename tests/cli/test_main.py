@@ -101,9 +101,7 @@ def test_a_shell_causes_one_line_at_most(line: str, code: int, errors: int, tmp_
     assert (done.returncode, done.stderr.count("\n")) == (code, errors), done.stderr
 
 
-def test_what_openexr_prints_to_stdout_does_not_get_between_the_data(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_openexr_prints_none_to_stdout(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folders = tmp_path / "pred", tmp_path / "gt"
     for folder in folders:
         folder.mkdir()

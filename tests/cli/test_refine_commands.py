@@ -32,9 +32,7 @@ def summaries() -> dict[str, dict[str, Any]]:
     return {p.parent.name: json.loads(p.read_text()) for p in Path("out").glob("*/summary.json")}
 
 
-def test_a_bad_frame_is_one_line_and_exit_code_7_whatever_its_name(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_frame_is_one_line_and_code_7(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (root / "rgb/b.png").write_bytes(b"")
     for part in ("rgb", "sparse"):
         (root / part / "b.png").rename(root / part / "b\nb\x1b.png")

@@ -79,9 +79,7 @@ def test_columns_choose_measures_in_latex(frames: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are Unicode there")
-def test_a_name_that_is_no_utf_8_is_scored_and_printed(
-    frames: Path, capfdbinary: pytest.CaptureFixture[bytes]
-) -> None:
+def test_names_of_bytes_are_scored(frames: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
     for folder in ("out", "gt"):
         Path(folder, "a.npy").rename(Path(folder, os.fsdecode(b"\xff.npy")))
     for form in ("--json", "--csv -", "--columns rmse"):
@@ -89,9 +87,7 @@ def test_a_name_that_is_no_utf_8_is_scored_and_printed(
     assert b"\\udcff" in capfdbinary.readouterr().out
 
 
-def test_exported_frames_are_counted_and_warnings_go_to_stderr(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_counts_frames_and_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, dense = results(project(tmp_path, "OPENCV")), tmp_path / "dense"
     assert code_of(f"export {folder} --to colmap -o {dense}") == 0
     out, err = capsys.readouterr()

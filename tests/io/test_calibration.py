@@ -220,9 +220,7 @@ NO_POSES = [
     + [(read_extrinsics, text) for text in NO_POSES],
 )
 @pytest.mark.filterwarnings("error")
-def test_what_is_missing_or_wrong_is_named_in_one_line(
-    tmp_path: Path, read: Callable[[Path], object], text: str
-) -> None:
+def test_what_is_wrong_is_named(tmp_path: Path, read: Callable[[Path], object], text: str) -> None:
     with pytest.raises(InputError, match=r"^.*calib\.txt.*$"):
         read(write(tmp_path, text))
 

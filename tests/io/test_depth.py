@@ -315,9 +315,7 @@ def test_a_header_says_if_rows_are_of_a_scan(tmp_path: Path, header: str, of_sca
         *((text, NoPointsError) for text in ("0 0 0\n" * 5, "# nothing\n")),
     ],
 )
-def test_what_is_no_sparse_depth_is_refused_by_its_name(
-    tmp_path: Path, content: str, error: type[PnpDepthError]
-) -> None:
+def test_other_content_is_refused(tmp_path: Path, content: str, error: type[PnpDepthError]) -> None:
     (tmp_path / "s.csv").write_text(content)
     with pytest.raises(error, match=r"s\.csv"):
         read_sparse(tmp_path / "s.csv")

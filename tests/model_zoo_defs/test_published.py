@@ -139,8 +139,6 @@ def test_a_published_file_loads_whole(name: str, counters: bool, tmp_path: Path)
     assert all(torch.equal(own[name], tensor) for name, tensor in kept.items())
 
 
-# ------------------------------------------------------------------ fcrn's numpy file
-
 NORM = {"weight": "scale", "bias": "offset", "running_mean": "mean", "running_var": "variance"}
 
 

@@ -51,9 +51,6 @@ def test_a_front_without_gradient_is_reported() -> None:
         layers_of(network)
 
 
-# ------------------------------------------------------------------ for the points
-
-
 def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
     assert wanted_field((100, 400), 100) == 120
     assert wanted_field((100, 400), 10_000) == 50

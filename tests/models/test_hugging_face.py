@@ -112,8 +112,6 @@ def test_settings_that_are_no_numbers_are_refused(change: dict[str, Any], folder
         prepared(folder, change)
 
 
-# ------------------------------------------------------------------ with weights
-
 NECK = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8}
 VIT = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 2}
 STAGES = {"out_indices": [1, 2, 3, 4], "reshape_hidden_states": False}

@@ -82,9 +82,6 @@ def test_a_blind_network_is_named(of_depth: float, of_noise: float, count: int, 
     assert any("network 'n' says nothing about" in note for note in reader.notes) == said
 
 
-# ------------------------------------------------------------------ loading
-
-
 def test_weights_come_from_the_named_file_or_the_definition_never_by_chance(tmp_path: Path) -> None:
     weights = tmp_path / "own.safetensors"
     save_file({"weight": torch.full((1, 1, 1, 1), 3.0), "bias": torch.ones(1)}, weights)

@@ -74,8 +74,6 @@ def test_weights_and_programs_that_are_not_run_are_no_network(name: str) -> None
         find_definition(name)
 
 
-# ------------------------------------------------------------------ a Python file
-
 GOOD = f"""
 {ONE.replace("NAME", "mine").replace("3, 1, 1", "3, WIDTH, 1")}
 from beside import WIDTH

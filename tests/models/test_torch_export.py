@@ -140,8 +140,6 @@ def test_a_program_that_computes_sizes_is_refused_with_a_way_out(tmp_path: Path)
         find_definition(str(tmp_path / "computing.pt2"))
 
 
-# ------------------------------------------------------------------ archives that mean harm
-
 MODEL = "models/model.json"
 WEIGHTS = "data/weights/model_weights_config.json"
 Change = Callable[[Any], object]

@@ -329,9 +329,6 @@ def test_distances_of_a_wide_camera_are_scored_as_depth(tmp_path: Path) -> None:
         assert found.frames[0].inputs["gt"].read_as == "float32 NPY, distances"
 
 
-# ------------------------------------------------------------------ protocols
-
-
 def request(name: str, **changes: Any) -> EvalRequest:
     return EvalRequest(prediction=Path(), ground_truth=Path(), protocol=name, **changes)
 

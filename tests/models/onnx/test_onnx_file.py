@@ -139,9 +139,6 @@ def test_arithmetic_on_shapes_is_no_layer_and_leaves_the_cut_exact(tmp_path: Pat
     assert network.module.to("meta")(IMAGE.to("meta")).shape == (1, 1, 64, 96)
 
 
-# ------------------------------------------------------------------ files that mean harm
-
-
 Change = Callable[[Any], object]
 
 

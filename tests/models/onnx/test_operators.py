@@ -87,9 +87,6 @@ def test_an_operator_computes_what_the_standard_says(op: str) -> None:
     assert op in PARTLY_COVERED or not refused
 
 
-# ------------------------------------------------------------------ what the standard lacks
-
-
 def normal(*shape: int) -> np.ndarray:
     return np.random.default_rng(0).normal(size=shape).astype(F32)
 

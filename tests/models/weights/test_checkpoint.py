@@ -96,9 +96,6 @@ def test_of_several_states_the_one_that_is_read_is_named(order: int, tmp_path: P
     loads(tmp_path / "w.pth:ema", weights())
 
 
-# ------------------------------------------------------------------ files that do not fit
-
-
 def test_every_kind_of_misfit_is_listed(tmp_path: Path) -> None:
     state = weights()
     del state["norm.running_mean"], state["norm.running_var"]
@@ -129,9 +126,6 @@ def test_every_kind_of_misfit_is_listed(tmp_path: Path) -> None:
 def test_a_file_without_named_tensors_is_refused(content: Any, tmp_path: Path) -> None:
     torch.save(content, tmp_path / "w.pth")
     refused(tmp_path / "w.pth")
-
-
-# ------------------------------------------------------------------ files larger than memory
 
 
 def test_files_that_memory_cannot_hold_are_refused_before_they_are_read(tmp_path: Path) -> None:

@@ -129,8 +129,6 @@ def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -
         assert "compressed" in refused(path)
 
 
-# ------------------------------------------------------------------ numpy
-
 RING: dict[str, Any] = {}
 RING["again"] = RING
 PYTHON_2 = (
