@@ -155,6 +155,8 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
     method = run(frame, more_models=(str(second),), propagate=None).method
     assert method is not None
     assert method.networks == ["tiny", "second", "compact"]
+    own = run(frame, method="alone", overwrite=True)
+    assert own.weights == {"tiny": 1.0}
 
 
 def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnDisk) -> None:
