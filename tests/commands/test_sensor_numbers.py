@@ -115,6 +115,9 @@ def test_a_list_is_a_scan_or_of_pixels(tmp_path: Path, scan: Rows, name: str, co
     if name != "a.csv":
         write_list(tmp_path / name, rows)
         np.testing.assert_allclose(read(tmp_path / name).points.xy, rows[:, :2], rtol=1e-6)
+        write_list(tmp_path / name, rows * (1, 1, 1000))
+        in_mm = read(tmp_path / name, depth_scale=1000.0).points
+        np.testing.assert_allclose(in_mm.depth, rows[:, 2], rtol=1e-6)
 
 
 @pytest.mark.parametrize("silent", [0.0, np.nan, [1.2, 0.0, 0.9], [0.0, 0.0, 1e10]])
