@@ -203,7 +203,8 @@ class Recorder:
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
-        call, since = (module, sum(m is module for m, _ in self._saved)), self.watch.now()
+        number = next(n for n in range(len(self._saved) + 1) if (module, n) not in self._saved)
+        call, since = (module, number), self.watch.now()
         self._saved[call] = None
         first_inside = len(self._saved)
         before = list(tensors_in(inputs))
@@ -273,7 +274,7 @@ class Recorder:
         return self._replay.cut_call is None and not any(module in group for group in apart)
 
     def _drop_from(self, first: int) -> None:
-        for call in list(self._saved)[first:]:
-            saved = self._saved.pop(call)
+        while len(self._saved) > first:
+            _, saved = self._saved.popitem()
             if saved is not None:
                 saved.value = None  # the watch would hold its tensors
