@@ -106,11 +106,9 @@ class Settings:
     @property
     def fixed_by(self) -> str:
         """What fixes the method, as the user gives it; empty for the default one."""
-        given = self.given()
         flags = {each.name: flag_of(each) if each.metadata else each.name for each in fields(self)}
         flags["method"] = f"--method {self.method}"
-        not_fixed = {"seed"} if self.is_paper else {"seed", "method"}
-        return " ".join(flags[name] for name in given if name not in not_fixed)
+        return " ".join(flags[name] for name in fixing(self))
 
     @property
     def is_paper(self) -> bool:
@@ -130,6 +128,12 @@ class Settings:
         """Returns these settings, and the paper's where these are open."""
         names = {each.name for each in fields(ClosedSettings)}
         return ClosedSettings(**{k: v for k, v in self.given().items() if k in names})
+
+
+def fixing(settings: Settings) -> list[str]:
+    """Returns the names of the settings that fix the method; none for the default one."""
+    not_fixed = {"seed"} if settings.is_paper else {"seed", "method"}
+    return [name for name in settings.given() if name not in not_fixed]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network, load_network
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import Settings, fixing
 from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 COMPANION = "compact"
@@ -39,8 +39,7 @@ def check_combination(asked: Settings, networks: int) -> None:
     Raises:
         UsageError: They do.
     """
-    words = [word.removeprefix("--") for word in asked.fixed_by.split() if word != asked.method]
-    fixed = ", ".join(f"`{word}`" for word in words)
+    fixed = ", ".join(f"`{name}`" for name in fixing(asked))
     if fixed and networks > 1:
         raise UsageError(f"several networks are fused, but {fixed} fixes one")
     if fixed and asked.method == "alone":
