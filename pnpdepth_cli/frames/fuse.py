@@ -45,10 +45,10 @@ MIN_POINTS = 5
 MOST_VALIDATION_POINTS = 1000
 """Of more validation points, so many at random are predicted. It bounds the time of a LiDAR's."""
 DOUBT, NO_GAIN = 2.0, 0.5
-"""Standard errors by which the image lowers the error at the validation points. From the first it
-is not doubted, below the second there is a warning. With 500 points, 25 even frames with their own
-image have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image have at most
-0.4."""
+"""Standard errors by which the image lowers the error at the validation points. From the first on,
+no expert that leaves the image out joins; below the second there is a warning. With 500 points, 25
+even frames with their own image have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with
+another image have at most 0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
 OWN_SCANNER = 0.75

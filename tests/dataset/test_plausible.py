@@ -186,7 +186,7 @@ def test_millimetres_stop_and_the_option_reads_them(depth: np.ndarray, kind: lis
     assert (kept, warning.startswith("warning: ")) == (1, True)
 
 
-def test_a_room_in_centimetres_is_doubted_but_not_the_ground_below_an_aircraft() -> None:
+def test_a_room_in_centimetres_is_warned_of_but_not_the_ground_below_an_aircraft() -> None:
     room, ground = np.linspace(100.5, 500, 50), np.linspace(250.5, 350, 50)
     kept, (warning,) = divisor(room, FLOAT)
     assert kept == 1

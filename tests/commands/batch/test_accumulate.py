@@ -106,7 +106,7 @@ def test_neighbours_are_of_one_camera_and_move_to_that_of_the_frame(tmp_path: Pa
 
 
 @pytest.mark.parametrize("turned", [None, 0.0, 0.02])
-def test_poses_are_estimated_or_doubted_by_images(turned: float | None, tmp_path: Path) -> None:
+def test_poses_are_estimated_or_checked_by_images(turned: float | None, tmp_path: Path) -> None:
     for part in ("rgb", "sparse", "calib"):
         shutil.copytree(DRIVE / part, tmp_path / part)
     (tmp_path / "net").mkdir()
