@@ -46,7 +46,7 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.frames.frame import Refined
-from pnpdepth_cli.frames.fuse import LEAST_PART
+from pnpdepth_cli.frames.refine_frame import LEAST_PART
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
@@ -103,7 +103,7 @@ def measure(
     start = time.process_time()
     refined = by_default(network, inputs, seed)
     seconds = time.process_time() - start
-    depths = {LINEAR: linear(inputs.points), AFTER: torch.from_numpy(refined.after)}
+    depths = {LINEAR: linear(inputs.points), AFTER: torch.from_numpy(refined.depth)}
     depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
@@ -125,9 +125,9 @@ def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
     """Fractions of the ground truth, and of large errors: `caught` by the mask, `ranked` by σ."""
     assert refined.sigma is not None
     assert refined.valid is not None
-    known = (gt > 0) & (refined.after > 0)
-    error, sigma = np.abs(gt - refined.after)[known], refined.sigma[known]
-    relative, large = sigma / refined.after[known], error > LARGE_ERROR * gt[known]
+    known = (gt > 0) & (refined.depth > 0)
+    error, sigma = np.abs(gt - refined.depth)[known], refined.sigma[known]
+    relative, large = sigma / refined.depth[known], error > LARGE_ERROR * gt[known]
     masked, uncertain = ~refined.valid[known], relative > np.quantile(relative, 1 - MASKED)
     return {
         "within": [float((error <= multiple * sigma).mean()) for multiple in MULTIPLES],

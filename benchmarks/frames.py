@@ -14,8 +14,9 @@ from pnpdepth_cli.commands.batch.running import spread
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
-from pnpdepth_cli.frames.method import Method, refine_fixed
+from pnpdepth_cli.frames.method import Method, pipeline_of
 from pnpdepth_cli.frames.open_network import OpenNetwork
+from pnpdepth_cli.frames.refine_frame import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Normalisation
@@ -144,8 +145,9 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
     """The refinement of a frame with all of its points."""
-    with OpenNetwork(network, layer, settings) as opened:
-        return refine_fixed(opened, inputs.registered())
+    pipeline = pipeline_of(Settings(method="paper", propagate=settings.propagate))
+    with OpenNetwork(network, layer, settings, always_updated=True) as opened:
+        return refine_frame([opened], inputs.registered(), pipeline)
 
 
 WEIGHTS = {"pncnn": "pncnn/kitti_model_best.pth.tar", "nconv": "nconv/CNN_ep0003.pth.tar"}
@@ -163,7 +165,7 @@ def opened(name: str, data: Path) -> Network:
 def by_default(network: Network, inputs: Frame, seed: int = 0) -> Refined:
     """The frame as `pnpdepth refine` gives it by default."""
     with Method([network], Settings(seed=seed), inputs) as method:
-        return method.refine(inputs)
+        return method.refine(inputs, with_stages=True)
 
 
 def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:

@@ -35,7 +35,7 @@ def main(data: Path, output: Path) -> None:
     columns = {
         "FastDepth aligned": refined.before,
         "z updated, propagated": refined.stages[PROPAGATED],
-        f"fused (FastDepth {100 * part:.0f} %)": refined.after,
+        f"fused (FastDepth {100 * part:.0f} %)": refined.depth,
     }
     # One scale for all depths, one for all errors.
     depth = inputs.points.depth.numpy()

@@ -9,6 +9,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
+from pnpdepth_cli.camera import Camera as Camera
+from pnpdepth_cli.completion.alignment import Alignment as Alignment
+from pnpdepth_cli.completion.image_registration import ImageRegistration as ImageRegistration
 from pnpdepth_cli.core.metrics import Scores as Scores
 from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.core.split import Split as Split
@@ -19,10 +22,14 @@ from pnpdepth_cli.errors import ModelError as ModelError
 from pnpdepth_cli.errors import NoPointsError as NoPointsError
 from pnpdepth_cli.errors import PnpDepthError as PnpDepthError
 from pnpdepth_cli.errors import UsageError as UsageError
+from pnpdepth_cli.frames.frame import DepthMap as DepthMap
 from pnpdepth_cli.frames.frame import Refined as Refined
-from pnpdepth_cli.frames.frame import Registration
+from pnpdepth_cli.frames.frame import Registration as Registration
+from pnpdepth_cli.frames.frame import Validation as Validation
+from pnpdepth_cli.frames.refiner import Pair as Pair
 from pnpdepth_cli.frames.refiner import Refiner as Refiner
-from pnpdepth_cli.frames.refiner import Unit, in_metres
+from pnpdepth_cli.frames.refiner import Unit as Unit
+from pnpdepth_cli.frames.refiner import in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.definition import Fixed as Fixed
@@ -77,6 +84,8 @@ def refine(
     settings: Settings | None = None,
     *,
     unit: Unit | None = None,
+    camera: ArrayLike | Camera | None = None,
+    stages: bool = False,
     uncertainty: bool = False,
     registration: Registration = "auto",
 ) -> Refined:
@@ -86,18 +95,20 @@ def refine(
         network: Network from `load_network`.
         image: Image as `Refiner.refine` takes it; None for a network that takes sparse depth only.
         sparse: Depth map, rows of x, y and depth, or SparsePoints, as `Refiner.refine` takes them.
-        settings: Settings as `Refiner` takes them; what they leave open, the network decides.
+        settings: The method and values for its steps; what they leave open, the network decides.
         unit: Unit of the depth of an array, "m" or "mm".
+        camera: Intrinsics (3, 3) in pixels of the image, or a Camera.
+        stages: Whether the depth after each step is returned too, as `Refined.stages`.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         registration: Whether the image is moved to the points: "auto", "off", or (zoom, right,
             down).
 
     Raises:
-        InputError: Image or points cannot be used.
+        InputError: Image, points or camera cannot be used.
         DivergedError: The loss became non-finite; `last_good` is the Refined before that.
     """
     with Refiner(network, settings, uncertainty=uncertainty, registration=registration) as refiner:
-        return refiner.refine(image, sparse, unit=unit)
+        return refiner.refine(image, sparse, unit=unit, camera=camera, stages=stages)
 
 
 def score(

@@ -6,6 +6,7 @@ Files and sensors give numpy arrays; `core` and everything above it work on torc
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
     from numpy.typing import NDArray
+    from scipy.spatial import cKDTree
     from torch import Tensor
     from typing_extensions import TypeVar
 
@@ -31,9 +33,12 @@ METRES, MODEL_UNITS = "m", "model units"
 """Units of depth: metres, and those of a COLMAP model whose scale is not known."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SparsePoints(Generic[A]):
-    """N measured depths at pixel coordinates of a frame, as tensors unless stated otherwise."""
+    """N measured depths at pixel coordinates of a frame, as tensors unless stated otherwise.
+
+    Two sets of points are equal only if they are one object: arrays have no truth value.
+    """
 
     xy: A
     """(N, 2) float32 pixel coordinates, x right, y down, whole numbers at pixel centres."""
@@ -50,6 +55,13 @@ class SparsePoints(Generic[A]):
     def __repr__(self) -> str:
         height, width = self.size
         return f"SparsePoints({width}×{height}, {len(self):,} points)"
+
+    @functools.cached_property
+    def tree(self: SparsePoints[Tensor]) -> cKDTree:
+        """The tree of the coordinates, by which the nearest points are found."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.xy.cpu().double().numpy())
 
     def resized(self, height: int, width: int) -> SparsePoints[A]:
         """Returns the points in a frame of the same field of view with height × width pixels.
@@ -94,6 +106,8 @@ class SparsePoints(Generic[A]):
         import torch
 
         xy, depth = (torch.as_tensor(array, device=device) for array in (self.xy, self.depth))
+        if xy is self.xy and depth is self.depth:
+            return self  # type: ignore[return-value]
         return SparsePoints(xy=xy, depth=depth, size=self.size, dropped=self.dropped)
 
     def known_in(self: SparsePoints[Tensor], depth: Tensor) -> Tensor:

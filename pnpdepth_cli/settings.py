@@ -16,6 +16,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 
 LARGEST_SEED = 2**32 - 1
+_OF_UPDATES = ("layer", "iterations", "lr", "loss", "update", "schedule", "blur")
 
 
 def option(default: Any, help: str, **details: object) -> Any:
@@ -50,8 +51,9 @@ class Settings:
 
     method: str = option(
         "fused",
-        "fused: NETWORK and the included network `compact` refined, fused and propagated; alone:"
-        " the same without `compact`; paper: the paper's setting and nothing else.",
+        "Which steps are made; every other option tunes one of them. fused: NETWORK and the"
+        " included network `compact` are aligned, refined, fused and propagated; alone: the same"
+        " without `compact`; paper: z is updated with the paper's setting, and nothing else.",
         choices=choices.METHODS,
     )
     layer: str | None = option(
@@ -61,7 +63,9 @@ class Settings:
         " depth.",
         metavar="NAME|0..1",
     )
-    iterations: int | None = option(None, "Number of updates; 0 is no refinement.", metavar="K")
+    iterations: int | None = option(
+        None, "Number of updates of z; 0 leaves z as it is.", metavar="K"
+    )
     lr: float | str | None = option(
         None, "Step size: absolute, or % of the std of z.", metavar="NUMBER|P%"
     )
@@ -77,13 +81,14 @@ class Settings:
     align: str | None = option(
         None,
         "Fit the network's output to the points by scale, or scale and shift."
-        "  [default: the network's own]",
+        "  [default: the network's own, auto where that is none, none with the paper's method]",
         choices=choices.ALIGNMENTS,
     )
     propagate: str | None = option(
         None,
         "Propagate the residuals at the points to all pixels: by a Gaussian process, or lines"
-        " through the nearest points.  [default: none, with other options of the method]",
+        " through the nearest points.  [default: gp, local for scan lines, none with the paper's"
+        " method]",
         choices=("none", *choices.PROPAGATIONS),
     )
     seed: int = option(
@@ -104,11 +109,9 @@ class Settings:
             object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
 
     @property
-    def fixed_by(self) -> str:
-        """What fixes the method, as the user gives it; empty for the default one."""
-        flags = {each.name: flag_of(each) if each.metadata else each.name for each in fields(self)}
-        flags["method"] = f"--method {self.method}"
-        return " ".join(flags[name] for name in fixing(self))
+    def of_updates(self) -> list[str]:
+        """The names of the settings that are given and only updates of z use."""
+        return [name for name in self.given() if name in _OF_UPDATES]
 
     @property
     def is_paper(self) -> bool:
@@ -128,12 +131,6 @@ class Settings:
         """Returns these settings, and the paper's where these are open."""
         names = {each.name for each in fields(ClosedSettings)}
         return ClosedSettings(**{k: v for k, v in self.given().items() if k in names})
-
-
-def fixing(settings: Settings) -> list[str]:
-    """Returns the names of the settings that fix the method; none for the default one."""
-    not_fixed = {"seed"} if settings.is_paper else {"seed", "method"}
-    return [name for name in settings.given() if name not in not_fixed]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,11 +41,13 @@ def frame() -> Frame:
 
 def test_the_public_names_are_these() -> None:
     assert {*pnp.__all__} == {
+        "__version__",
         *("load_network", "refine", "score", "Refiner", "Refined", "Settings", "Scores", "Split"),
         *("Network", "ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"),
-        *("SparsePoints", "PnpDepthError", "UsageError", "InputError", "ModelError"),
+        *("SparsePoints", "Camera", "Alignment", "ImageRegistration", "Validation"),
+        *("DepthMap", "Pair", "Registration", "Unit"),
+        *("PnpDepthError", "UsageError", "InputError", "ModelError"),
         *("NoPointsError", "DivergedError", "DeviceError"),
-        "__version__",
     }
     assert all(getattr(pnp, name) is not None for name in pnp.__all__)
     assert set(pnp.__all__) <= set(dir(pnp))
@@ -185,8 +187,9 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
         (pnp.UsageError, lambda net: pnp.load_network("compact", definition=net.definition)),
         (pnp.UsageError, lambda network: pnp.Refiner("compact")),
         (pnp.UsageError, lambda network: pnp.Refiner([])),
-        (pnp.UsageError, lambda net: pnp.Refiner(net, pnp.Settings(method="alone", layer="0"))),
-        (pnp.UsageError, lambda net: pnp.Refiner([net] * 2, pnp.Settings(iterations=3))),
+        (pnp.UsageError, lambda net: pnp.Refiner([net] * 2, pnp.Settings(method="paper"))),
+        (pnp.InputError, lambda net: pnp.refine(net, BLACK, np.ones((4, 4)), camera=np.eye(4))),
+        (pnp.InputError, lambda net: pnp.refine(net, BLACK, np.ones((4, 4)), camera=-np.eye(3))),
         (pnp.UsageError, lambda network: LOSSES["no_such.py"]),
         (pnp.InputError, lambda net: pnp.Refiner(net).share_registration([np.ones(3)])),
         (pnp.InputError, lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")])),

@@ -42,10 +42,10 @@ def test_what_the_user_leaves_open_is_the_networks_and_then_the_papers() -> None
     assert {name: getattr(settings, name) for name in asked.given()} == asked.given()
 
 
-def test_any_setting_of_the_method_fixes_it() -> None:
-    assert Settings().fixed_by == Settings(seed=3).fixed_by == ""
-    assert Settings(iterations=2, blur=1.0).fixed_by == "--iterations blur"
-    assert Settings(method="paper", iterations=2).fixed_by == "--method paper --iterations"
+def test_settings_that_only_updates_use_are_those_of_equation_3() -> None:
+    assert Settings().of_updates == Settings(seed=3, align="auto", propagate="gp").of_updates == []
+    asked = Settings(method="paper", lr="3%", layer="0.5", iterations=2)
+    assert asked.of_updates == ["layer", "iterations", "lr"]
 
 
 @pytest.mark.parametrize(

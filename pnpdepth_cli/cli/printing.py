@@ -90,10 +90,11 @@ def print_refinement(record: FrameRecord) -> None:
     # Updates, times and files.
     parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]
     parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
-    if record.method.kind != "default":
+    updates = len(record.loss) - 1
+    if updates > 0:
         settings = record.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
-        parts.insert(0, f"{tables.count_of(len(record.loss) - 1, 'update')} ({how})")
+        parts.insert(0, f"{tables.count_of(updates, 'update')} of z ({how})")
     say(" · ".join(parts))
     say(f"wrote {'  '.join(record.outputs.values())}")
 

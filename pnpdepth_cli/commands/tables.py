@@ -28,15 +28,6 @@ Errors = Mapping[str, Mapping[str, Scores]]
 """Scores by basis, then by stage, as `FrameRecord.errors` has them."""
 
 _LINEAR = "linear interpolation of all points"
-_ROWS = {
-    stages.BEFORE: "{name}, aligned with the points",
-    stages.UPDATED: "{name}, z updated",
-    stages.PROPAGATED: "{name}, residual propagated",
-    stages.ALONE: "{fusing} alone",
-    stages.AFTER: "fused ({weights})",
-    stages.LINEAR: _LINEAR,
-}
-"""What the row of a stage of the default method is called."""
 _LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -142,19 +133,13 @@ def means_tables(
 def refinement_tables(record: FrameRecord) -> list[Table]:
     """Returns the errors of a record on each basis."""
     assert record.method is not None
-    assert record.model is not None
-    title = f"{record.model.name} cut at {record.settings.get('layer')}"
-    if record.method.kind == "default":
-        title = " + ".join(record.method.networks)
-    of_one = sum(weight > 0 for weight in record.weights.values()) == 1
-    tables = []
-    for basis in bases_of(record.errors):
-        by_stage = dict(record.errors[basis])
-        # The result is no stage of its own where one expert, the network, has all the weight.
-        if of_one and stages.PROPAGATED in by_stage and stages.ALONE not in by_stage:
-            del by_stage[stages.AFTER]
-        tables.append(_table(title, basis, by_stage, record.unit, stage_titles(record)))
-    return tables
+    names = " + ".join(record.method.names)
+    title = f"{names}, method {record.method.name}"
+    titles = stage_titles(record)
+    return [
+        _table(title, basis, record.errors[basis], record.unit, titles)
+        for basis in bases_of(record.errors)
+    ]
 
 
 def _table(
@@ -167,7 +152,7 @@ def _table(
 ) -> Table:
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
-    last = stages.AFTER if stages.AFTER in by_stage else stages.PROPAGATED
+    last = stages.AFTER
     scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {}).get("mae")
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
@@ -194,28 +179,37 @@ def _table(
 
 
 def stage_titles(record: FrameRecord) -> dict[str, str]:
-    """Returns what each stage of a frame is, in words."""
+    """Returns what each stage of a frame is, in words.
+
+    The result is no stage of its own where it is the network's last stage: then that one is named.
+    """
     assert record.method is not None
-    assert record.model is not None
-    if record.method.kind == "default":
-        names = record.method.networks
-        of = {"name": names[0], "fusing": names[-1], "weights": weights_text(record.weights)}
-        return {stage: title.format(**of) for stage, title in _ROWS.items()}
-    name, settings = record.model.name, record.settings
-    before = f"{name}, aligned with the points" if settings["align"] != "none" else name
-    made = f"{count_of(len(record.loss) - 1, 'update')} of z"  # fewer than asked if it diverged
-    steps = [made] if settings["iterations"] else []
-    steps += ["residual propagated"] if settings["propagate"] != "none" else []
-    return {stages.BEFORE: before, stages.AFTER: ", ".join([name, *steps]), stages.LINEAR: _LINEAR}
+    method = record.method
+    name = method.networks[0].name
+    updates = len(record.loss) - 1  # fewer than asked if they diverged
+    # The steps of the user's network.
+    steps = {stages.BEFORE: name}
+    if record.alignment is not None:
+        steps[stages.BEFORE] = f"{name}, aligned with the points"
+    if updates > 0:
+        steps[stages.UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
+    if method.propagation != "none":
+        steps[stages.PROPAGATED] = f"{name}, residual propagated"
+    # What becomes of them.
+    weighted = [expert for expert, weight in record.weights.items() if weight > 0]
+    if weighted in ([], [name]):
+        _, steps[stages.AFTER] = steps.popitem()
+    else:
+        steps[stages.ALONE] = f"{method.names[-1]} alone"
+        steps[stages.AFTER] = f"fused ({weights_text(record.weights)})"
+    steps[stages.LINEAR] = _LINEAR
+    return steps
 
 
 def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
-    assert record.method is not None
-    titles, name = stage_titles(record), record.method.networks[0]
-    alone = all(weight == 0 for expert, weight in record.weights.items() if expert != name)
-    last = stages.PROPAGATED if alone and stages.PROPAGATED in titles else stages.AFTER
-    return titles[stages.BEFORE], titles[last]
+    titles = stage_titles(record)
+    return titles.get(stages.BEFORE, titles[stages.AFTER]), titles[stages.AFTER]
 
 
 def weights_text(weights: Mapping[str, float]) -> str:

@@ -75,8 +75,8 @@ _XYZ_OF_RGB = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResidualField:
-    """A residual that is known at N points of an image."""
+class Residuals:
+    """The residual at N points of an image, and the kernel of its Gaussian process."""
 
     features: Tensor  # (3 or 6, H, W), see `features_of`
     points: SparsePoints  # the points at pixel coordinates of the image, on the CPU
@@ -87,20 +87,25 @@ class ResidualField:
     colour_length: float = 8.0  # length scale of the colour
     noise: float = 1e-3  # variance of the noise
 
+    @functools.cached_property
+    def fitted(self) -> Residuals:
+        """The residuals with the kernel of smallest leave-one-out error."""
+        return fit(self)
+
     def scaled(self, features: Tensor) -> Tensor:
         """Returns features (..., 3 or 6) divided by their length scales."""
         lengths = [1.0, 1.0, self.depth_length]
         lengths += [self.colour_length] * (features.shape[-1] - 3)
         return features / features.new_tensor(lengths)
 
-    def select(self, mask: Tensor) -> ResidualField:
+    def select(self, mask: Tensor) -> Residuals:
         """Returns the field with only the points where mask (N,) is true."""
         points, at, residual = self.points.select(mask), self.at[mask], self.residual[mask]
         return replace(self, points=points, at=at, residual=residual)
 
 
-def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> ResidualField:
-    """Returns the residual at the points that lie in the image and have a prediction.
+def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
+    """Returns the residuals at the points that lie in the image and have a prediction.
 
     Of several points at the same coordinates the nearest counts.
 
@@ -119,7 +124,7 @@ def residual_field(prediction: Tensor, points: SparsePoints, rgb: Tensor | None)
         torch.where(known, prediction, torch.nan).log(), None if rgb is None else rgb.cpu()
     )
     predicted = points.sample(torch.where(known, prediction, 1.0)).double()
-    return ResidualField(
+    return Residuals(
         features=features,
         points=points,
         at=_sample(features, points),
@@ -174,7 +179,7 @@ def cielab(rgb: Tensor) -> Tensor:
     return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def fit(field: ResidualField) -> ResidualField:
+def fit(field: Residuals) -> Residuals:
     """Returns the field with the kernel of smallest leave-one-out error.
 
     The length scales are chosen first, then the noise: on rendered frames as good as all together.
@@ -184,7 +189,7 @@ def fit(field: ResidualField) -> ResidualField:
         return field
     near = neighbourhoods(field, _MAX_EXACT)
 
-    def error(candidate: ResidualField) -> float:
+    def error(candidate: Residuals) -> float:
         errors, _ = leave_one_out(candidate, near)
         return float(errors.abs().mean())
 
@@ -195,7 +200,7 @@ def fit(field: ResidualField) -> ResidualField:
     return min([best, *noises], key=error)
 
 
-def predict(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+def predict(field: Residuals, queries: SparsePoints | None = None) -> Tensor:
     """Returns the mean residual (H, W) float32 at every pixel, or (M,) at M points' coordinates.
 
     It is smooth where the prediction is not, so that every pixel's is predicted on a coarser grid.
@@ -219,7 +224,7 @@ def predict(field: ResidualField, queries: SparsePoints | None = None) -> Tensor
 
 
 def leave_one_out(
-    field: ResidualField, near: Tensor, weight: Tensor | None = None
+    field: Residuals, near: Tensor, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Returns error and variance (B, ≤ k) at points predicted from their neighbourhood's others.
 
@@ -240,7 +245,7 @@ def leave_one_out(
     return error[:, :inner], (variance - extra_noise)[:, :inner]
 
 
-def neighbourhoods(field: ResidualField, max_exact: int) -> Tensor:
+def neighbourhoods(field: Residuals, max_exact: int) -> Tensor:
     """Returns (B, k) numbers of points near each other, the middle one first.
 
     One neighbourhood of all points, up to `max_exact` of them.
@@ -266,7 +271,7 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
     return min(_MAX_STEP, max(step, int(across_px / _NODES_BETWEEN_LINES))), step
 
 
-def _predict_grid(field: ResidualField) -> Tensor:
+def _predict_grid(field: Residuals) -> Tensor:
     """The same, predicted at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
@@ -278,7 +283,7 @@ def _predict_grid(field: ResidualField) -> Tensor:
     return sum((values * (weight / total) for values, weight in layers), torch.zeros(()))
 
 
-def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
+def _solve(field: Residuals, near: Tensor, queries: Tensor) -> Tensor:
     """(B, Q) float32: the mean at B × Q features, from points near (B, k)."""
     (blocks, count), per_block = near.shape, queries.shape[1]
     result = queries.new_empty(blocks, per_block)
@@ -298,7 +303,7 @@ def _solve(field: ResidualField, near: Tensor, queries: Tensor) -> Tensor:
     return result
 
 
-def _systems(field: ResidualField, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _systems(field: Residuals, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Scaled features, u, and the covariances of r, of points near (B, k)."""
     at = field.at[near].double()
     scaled, u = field.scaled(at), at[..., 2]
@@ -318,18 +323,18 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
     return closeness
 
 
-def _all_points(field: ResidualField) -> Tensor:
+def _all_points(field: Residuals) -> Tensor:
     return torch.arange(len(field.points))[None]
 
 
-def _is_exact(field: ResidualField) -> bool:
+def _is_exact(field: Residuals) -> bool:
     """Whether every pixel is predicted from all points."""
     count, (height, width) = len(field.points), field.points.size
     small = count <= _MAX_EXACT_SMALL and count * height * width <= _MAX_EXACT_PRODUCT
     return small or count <= _MAX_EXACT
 
 
-def _predict_blocks(field: ResidualField, side: int, shift: int) -> tuple[Tensor, Tensor]:
+def _predict_blocks(field: Residuals, side: int, shift: int) -> tuple[Tensor, Tensor]:
     """(H, W): the mean, predicted block by block, and the pixels' weights.
 
     Blocks of side × side pixels, the first of which begins `shift` pixels before the image. A

@@ -12,7 +12,7 @@ from contextlib import suppress
 import numpy as np
 import torch
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from pnpdepth_cli.completion.alignment import from_space, to_space
@@ -98,6 +98,5 @@ def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor
 
     The nearest point comes first.
     """
-    tree = cKDTree(points.xy.cpu().double().numpy())
-    distance, number = tree.query(xy.numpy(), np.arange(1, count + 1), workers=-1)
+    distance, number = points.tree.query(xy.numpy(), np.arange(1, count + 1), workers=-1)
     return torch.from_numpy(distance), torch.from_numpy(number)

@@ -10,12 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.gaussian_process import (
-    ResidualField,
-    leave_one_out,
-    neighbourhoods,
-    residual_field,
-)
+from pnpdepth_cli.completion.gaussian_process import Residuals, leave_one_out, neighbourhoods
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.points import SparsePoints
@@ -41,22 +36,6 @@ _FAR_BETTER = 0.5  # the others' errors without the suspected points must fall t
 _FAR_BETTER_MANY = 0.65  # or this one where there are many points, whose errors are well known
 
 
-def outliers(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Tensor:
-    """Returns (N,) bool: which points are outliers; none unless some clearly are.
-
-    Args:
-        prediction: (H, W) metres.
-        rgb: (3, H, W) in 0…1, or None.
-
-    Raises:
-        NoPointsError: No point has a prediction.
-    """
-    field = residual_field(prediction, points, rgb)
-    keys = _coordinate_keys(field.points)
-    keys = keys[~torch.isin(keys, _coordinate_keys(without_outliers(field).points))]
-    return torch.isin(_coordinate_keys(points.tensors()), keys).to(points.xy.device)
-
-
 def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     """Returns (N,) bool: the points whose log depth differs by more than `FAR` from a prediction.
 
@@ -73,14 +52,14 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     return far & (far.sum() < len(points) / 2)
 
 
-def without_outliers(field: ResidualField) -> ResidualField:
-    """Returns the field with only the points that are inliers."""
+def without_outliers(residuals: Residuals) -> Residuals:
+    """Returns the residuals at the points that are inliers; all unless some clearly are not."""
     for _ in range(_PASSES):
-        inliers = inlier_mask(field)
+        inliers = inlier_mask(residuals)
         if bool(inliers.all()):
             break
-        field = field.select(inliers)
-    return field
+        residuals = residuals.select(inliers)
+    return residuals
 
 
 def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
@@ -101,7 +80,7 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
     return (1 - (apart / (ALONE * typical)).square()).clamp_min(0).square()
 
 
-def inlier_mask(field: ResidualField) -> Tensor:
+def inlier_mask(field: Residuals) -> Tensor:
     """Returns (N,) bool: the points that are inliers; all of them unless some clearly are not.
 
     Points are weighted by how well their neighbours predict them, at first by `inlier_weights`.
@@ -140,8 +119,3 @@ def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:
         if torch.equal(more, together):
             return together
         together = more
-
-
-def _coordinate_keys(points: SparsePoints) -> Tensor:
-    """(N,) int64: x and y bit by bit, equal for equal coordinates."""
-    return points.xy.float().contiguous().view(torch.int64).flatten()

@@ -1,13 +1,8 @@
-"""The residual at the sparse points, propagated to every pixel without training.
+"""Ways to predict the residual everywhere from the residual at the points (`--propagate`).
 
-With r the residual in log depth, the result is exp(r) · prediction, so that it is positive
-everywhere. r stays within its values at the points. Outliers are removed first.
-
-The ways to predict r are the entries of `TABLE`, listed in `choices.PROPAGATIONS`. A prediction
-of 0, or not finite, is unknown and stays 0. Points there and points outside the image have no
-effect. Of points at the same coordinates the nearest counts.
-
-"gp" is in `completion.gaussian_process`. "local" fits lines over the predicted log depth:
+They are the entries of `TABLE`, listed in `choices.PROPAGATIONS`; `completion.residual_field` calls
+them with the residuals at the inliers. "gp" is in `completion.gaussian_process`. "local" fits lines
+over the predicted log depth:
 
     min over a, b of  Σ_i w_i·(y_i − a·x_i − b)² + ridge·a²,   w_i = 1 / distance_i³
 
@@ -26,11 +21,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnpdepth_cli.choices import PROPAGATIONS
 from pnpdepth_cli.completion import gaussian_process
-from pnpdepth_cli.completion.gaussian_process import DEPTH, ResidualField, residual_field
+from pnpdepth_cli.completion.gaussian_process import DEPTH, Residuals
 from pnpdepth_cli.completion.interpolation import nearest_points
-from pnpdepth_cli.completion.outliers import without_outliers
 from pnpdepth_cli.points import SparsePoints
 
 # Of the lines; chosen on rendered frames, with predictions of three networks and a synthetic one.
@@ -41,40 +34,6 @@ RIDGE = 0.03
 _LINES = 400_000  # that are fitted; with more pixels, lines are interpolated
 _AT_A_POINT = 0.5  # pixels; closer than this, a point is as close as can be
 _OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
-
-
-def propagate(
-    prediction: Tensor,
-    points: SparsePoints,
-    rgb: Tensor | None,
-    xy: Tensor | None = None,
-    *,
-    kind: str = "gp",
-) -> Tensor:
-    """Returns the prediction with its residual at the points propagated, metres, 0 = unknown.
-
-    Args:
-        prediction: (H, W) metres.
-        rgb: (3, H, W) in 0…1, or None.
-        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel, (H, W).
-        kind: A name in `choices.PROPAGATIONS`, or "none".
-
-    Raises:
-        NoPointsError: No point has a prediction, except with "none".
-    """
-    known, queries = prediction.isfinite() & (prediction > 0), None
-    predicted = torch.where(known, prediction, 0.0)
-    if xy is not None:
-        queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
-        predicted = queries.sample(torch.where(known, prediction, torch.nan)).nan_to_num(0.0)
-        queries = queries.tensors()
-    if kind == "none":
-        return predicted.float()
-    field = without_outliers(residual_field(prediction, points, rgb))
-    # The residual stays within its range at the points.
-    residual: Tensor = PROPAGATIONS[kind](field, queries)
-    residual = residual.clamp(float(field.residual.min()), float(field.residual.max()))
-    return (predicted * residual.exp().to(predicted.device)).float()
 
 
 def local_lines(
@@ -119,22 +78,26 @@ def _lines_at(
     return (mean - slope * mean_z)[:, 0], slope[:, 0]
 
 
-def _by_lines(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
+def _by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
     """The residual by lines over the predicted log depth."""
-    log_depth, at = field.features[DEPTH], field.at[:, DEPTH].double()
+    log_depth = residuals.features[DEPTH]
+    xy = None
     if queries is not None:
         log_depth = queries.sample(log_depth)
-    xy, weights = None if queries is None else queries.xy, torch.ones_like(field.residual)
-    shift, slope = local_lines(field.points, xy, field.residual, at, weights)
+        xy = queries.xy
+    at_points = residuals.at[:, DEPTH].double()
+    weights = torch.ones_like(residuals.residual)
+    shift, slope = local_lines(residuals.points, xy, residuals.residual, at_points, weights)
     return (shift + slope * log_depth).float()
 
 
-def _by_gaussian_process(field: ResidualField, queries: SparsePoints | None = None) -> Tensor:
-    return gaussian_process.predict(gaussian_process.fit(field), queries)
+def _by_gaussian_process(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
+    """The mean residual of a Gaussian process, whose kernel fits the points."""
+    return gaussian_process.predict(residuals.fitted, queries)
 
 
 TABLE = {"gp": _by_gaussian_process, "local": _by_lines}
-"""Functions of a residual field without outliers, by the names in `choices.PROPAGATIONS`.
+"""Functions of the residuals at the inliers, by the names in `choices.PROPAGATIONS`.
 
 They return the residual (H, W) float32 at every pixel, or (M,) at the coordinates of M points.
 """

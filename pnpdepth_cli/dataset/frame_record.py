@@ -83,13 +83,35 @@ class ModelRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
+class NetworkRecord:
+    """How a network's depth was aligned and its z updated, with nothing left open."""
+
+    name: str
+    layer: str
+    iterations: int
+    lr: float | str
+    loss: str
+    update: str
+    schedule: str
+    blur: float
+    align: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class MethodRecord:
     """How the frame was refined."""
 
-    kind: Literal["default", "fixed"]
-    reason: str
-    """The options that fix the method; "default" without."""
-    networks: list[str]
+    name: str
+    """One of `choices.METHODS`."""
+    propagation: str
+    """How the residual at the points was propagated."""
+    networks: list[NetworkRecord]
+    """The user's networks first."""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the networks."""
+        return [network.name for network in self.networks]
 
 
 @dataclass(frozen=True, kw_only=True)

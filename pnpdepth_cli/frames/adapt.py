@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.func import functional_call
 
-from pnpdepth_cli.completion.outliers import outliers
+from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.core.losses import MIN_DEPTH
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError, wrap_user_errors
 from pnpdepth_cli.frames.frame import Frame, is_dense
-from pnpdepth_cli.frames.fuse import FEW_POINTS
-from pnpdepth_cli.frames.open_network import PreparedFrame, encoding_once, prepare
+from pnpdepth_cli.frames.open_network import FEW_POINTS, PreparedFrame, encoding_once, prepare
 from pnpdepth_cli.models.network import AlignedDepth, Network
 from pnpdepth_cli.points import SparsePoints
 
@@ -157,7 +156,7 @@ def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
     if len(points) < 2:
         raise NoPointsError(f"{name}: {len(points)} points; hiding some needs 2")
     if len(points) >= FEW_POINTS:
-        outlying = outliers(torch.ones(points.size), points.tensors(), None)
+        outlying = ResidualField(torch.ones(points.size), points.tensors(), None).outliers
         points = points.select(~outlying.to(points.xy.device))
     return prepared, points
 

@@ -19,11 +19,19 @@ from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Run, intercepted
-from pnpdepth_cli.frames.frame import Frame, Prediction
+from pnpdepth_cli.frames.frame import Frame, Prediction, is_dense
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import AlignedDepth, Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
+
+FEW_POINTS = 50
+"""With fewer points, updates of a network that takes them gain nothing: on even frames 2 to 3 %
+with 500 points, 1 % with 100, nothing with 20. A point that contradicts its neighbours may then be
+all that is seen of a small object."""
+MIRRORED_BELOW = 200
+"""With fewer points, the network that takes a prior is not updated, but sees the mirrored frame
+too, in the same time (docs/notes/fusion.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,16 +64,24 @@ class OpenNetwork:
         settings: How its output is aligned and z is updated.
         coarse: Whether z is updated by a smaller depth, which is faster, if the definition gives
             one.
+        always_updated: Whether z is updated in every frame, also where that gains nothing.
     """
 
     def __init__(
-        self, network: Network, layer: str, settings: ClosedSettings, *, coarse: bool = False
+        self,
+        network: Network,
+        layer: str,
+        settings: ClosedSettings,
+        *,
+        coarse: bool = False,
+        always_updated: bool = False,
     ) -> None:
         definition = network.definition
         self.network, self.layer, self.settings = network, layer, settings
         self.name, self.weighs_points = definition.name, definition.weighs_points
         self.takes_points = "sparse" in definition.input_kind
         self.takes_prior = definition.takes_prior
+        self.always_updated = always_updated
         self._coarse = definition.coarse if coarse else None
         self._of_image_only = definition.input_kind == "rgb"
         self._open = ExitStack()
@@ -93,16 +109,37 @@ class OpenNetwork:
             self._split = self._open.enter_context(self.network.cut_at(self.layer))
         return self._split
 
+    def sees(self, frame: Frame) -> bool:
+        """Returns whether any of the frame's points lies where the network looks."""
+        to_network = FrameMap.fit(self.network.definition.size, *frame.size)
+        return len(to_network.points_to_network(frame.points)) > 0
+
+    def is_updated(self, frame: Frame) -> bool:
+        """Returns whether z is updated in this frame.
+
+        That is wherever it gains anything, or where the user states the number of updates. With a
+        LiDAR's points, updates of a network that takes them gain 1 % and take as long as all else.
+        """
+        if not self.settings.iterations:
+            return False
+        if self.always_updated or not self.takes_points:
+            return True
+        fewest = MIRRORED_BELOW if self.takes_prior else FEW_POINTS
+        return len(frame.points) >= fewest and not is_dense(frame.points)
+
     def refine(self, frame: Frame, *, updates: bool = True) -> Prediction:
         """Returns what this network gives for the frame, its residual not propagated.
 
         Args:
             frame: The image, the same in all calls until `next_image`, and the points of this call.
+            updates: Whether z may be updated; it is where that gains anything (`is_updated`).
 
         Raises:
             PnpDepthError: The refinement fails.
         """
-        network, settings, diverged = self.network, self.settings, None
+        network = self.network
+        settings = self.settings
+        diverged = None
         with errors.out_of_memory_is_a_device_error(network.device):
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
@@ -113,7 +150,7 @@ class OpenNetwork:
             reader = AlignedDepth(network, prepared.points, settings.align)
             try:
                 # Without updates one pass of the whole network is enough.
-                if not (updates and settings.iterations):
+                if not (updates and self.is_updated(frame)):
                     result = self._plain(prepared, reader)
                 else:
                     # z is updated; the first and the last depth have full size.
@@ -132,9 +169,12 @@ class OpenNetwork:
                 if error.last_good is None:
                     raise
                 diverged, result = error, error.last_good
+        aligned = updated = prepared.to_image(result.before)
+        if result.after is not result.before:
+            updated = prepared.to_image(result.after)
         return Prediction(
-            before=prepared.to_image(result.before),
-            after=prepared.to_image(result.after),
+            aligned=aligned,
+            updated=updated,
             losses=result.losses,
             step=result.step,
             diverged=diverged,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
 from pnpdepth_cli.frames.frame import (
@@ -54,9 +55,9 @@ class Refiner:
     before this one closes.
 
     Args:
-        network: Network from `load_network`; several are fused by the default method.
-        settings: Settings of the refinement; what they leave open, the network decides. With any
-        setting of the method, `network` alone is refined by it; without, by the default method.
+        network: Network from `load_network`, or several, which are fused.
+        settings: The method and values for its steps; what they leave open, the network decides.
+            The values are for the first network, if there are several.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         registration: Whether images are moved to their points: "auto", if their depth edges show
         that they are not registered; "off"; or by (zoom, right, down), pixels.
@@ -108,7 +109,13 @@ class Refiner:
         self._stack.close()
 
     def refine(
-        self, image: ArrayLike | None, sparse: ArrayLike | SparsePoints, *, unit: Unit | None = None
+        self,
+        image: ArrayLike | None,
+        sparse: ArrayLike | SparsePoints,
+        *,
+        unit: Unit | None = None,
+        camera: ArrayLike | Camera | None = None,
+        stages: bool = False,
     ) -> Refined:
         """Returns one frame of arrays refined.
 
@@ -118,16 +125,19 @@ class Refiner:
             sparse: Depth map (H, W) in metres with 0 for unknown, rows (N, 3) of x, y and depth
                 (pixel centres at whole numbers), or SparsePoints.
             unit: Unit of the depth of an array, "m" or "mm"; needed for integers, and where half of
-            the depths are beyond 200.
+                the depths are beyond 200.
+            camera: Intrinsics (3, 3) in pixels of the image, or a Camera; needed by a network that
+                takes them.
+            stages: Whether the depth after each step is returned too, as `Refined.stages`.
 
         Raises:
-            InputError: Image or points cannot be used.
+            InputError: Image, points or camera cannot be used.
             DivergedError: The loss became non-finite; `last_good` is the Refined before that.
         """
-        frame = frame_of_arrays(image, sparse, self._register, unit)
+        frame = frame_of_arrays(image, sparse, self._register, unit, camera)
         with self._lock:
             method = self._method_for(frame)
-            refined = method.refine(frame)
+            refined = method.refine(frame, with_stages=stages)
         refined = replace(refined, notes=(*method.own.network.notes, *frame.notes, *refined.notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
@@ -233,6 +243,7 @@ def frame_of_arrays(
     sparse: ArrayLike | SparsePoints,
     register: Register = None,
     unit: Unit | None = None,
+    camera: ArrayLike | Camera | None = None,
 ) -> Frame:
     """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
 
@@ -250,10 +261,27 @@ def frame_of_arrays(
     return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
         points=inside,
+        camera=None if camera is None else _camera(camera, inside.size),
         register=register,
         one_view=register is None,
         notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
     )
+
+
+def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:
+    """The camera of an image (H, W). Raises InputError if no camera has these intrinsics."""
+    if isinstance(camera, Camera):
+        if camera.size is not None and camera.size != size:
+            raise InputError(f"the camera's images are {camera.size}, but the image is {size}")
+        return camera
+    intrinsics = _numbers(camera, "the camera's intrinsics").astype(np.float64)
+    if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
+        raise InputError(f"the camera's intrinsics are finite (3, 3), not {intrinsics.shape}")
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or intrinsics[2].tolist() != [0, 0, 1]:
+        raise InputError(
+            "the camera's intrinsics are fx 0 cx, 0 fy cy, 0 0 1 in pixels, with fx and fy above 0"
+        )
+    return Camera(intrinsics=intrinsics, size=size, source="given")
 
 
 def _frame_of_pair(pair: Pair, register: Register) -> Frame:

@@ -126,27 +126,42 @@ def resolve_settings(
     return settings.over(replace(defaults, align=alignment)).closed()
 
 
-def resolve_member(
-    network: Network, frame: Frame, asked: Settings, *, is_default: bool
-) -> OpenNetwork:
+def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwork:
     """Returns a network, where it is cut, and its settings, with nothing left open.
 
-    In the default method, a network whose output is metric is aligned too, where the points say
-    that it should be. Of networks that take the points, only those with a prior are updated.
+    What the user gives replaces the network's own value. What is left open is, but with the
+    paper's method, what serves a result whose residual is propagated: few updates, and none of a
+    network that takes the points but no prior; and a network of metres is aligned too, where the
+    points say that it should be.
+
+    Args:
+        network: The network.
+        frame: The first frame.
+        asked: Settings that the user gives for this network.
     """
     layer = asked.layer
     if layer is None and not asked.is_paper:
         layer = default_layer(network, frame.size, len(frame.points))
     layer = resolve_layer(network.definition, layer)
     settings = resolve_settings(network.definition, asked, metric=frame.unit == METRES)
-    member = OpenNetwork(network, layer, settings, coarse=is_default)
-    if is_default:
-        updated = member.takes_prior or not member.takes_points
-        iterations = min(settings.iterations, UPDATES) if updated else 0
-        aligned = settings.align != "none" or member.takes_points
-        align = settings.align if aligned else "auto"
-        member.settings = replace(settings, iterations=iterations, align=align)
-    return member
+    if asked.is_paper:
+        return OpenNetwork(network, layer, settings, always_updated=True)
+    definition = network.definition
+    takes_points = "sparse" in definition.input_kind
+    if asked.iterations is None:
+        is_updated = definition.takes_prior or not takes_points
+        iterations = min(settings.iterations, UPDATES) if is_updated else 0
+        settings = replace(settings, iterations=iterations)
+    if asked.align is None and settings.align == "none" and not takes_points:
+        settings = replace(settings, align="auto")
+    return OpenNetwork(
+        network,
+        layer,
+        settings,
+        # The smaller depth is computed from the network's own layer, not from any other.
+        coarse=asked.layer is None,
+        always_updated=asked.iterations is not None,
+    )
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:

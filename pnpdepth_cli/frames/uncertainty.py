@@ -73,7 +73,7 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         of_matches: Whether its points were matched in images, as those of COLMAP.
     """
     points = frame.used
-    network, depth = (torch.from_numpy(each) for each in (frame.before, frame.after))
+    network, depth = (torch.from_numpy(each) for each in (frame.before, frame.depth))
     # The shape of the standard deviation, calibrated at the validation points.
     shape, residual, sigma = relative_shape(points, network, depth), torch.empty(0), torch.empty(0)
     note = "uncertainty: too few points to calibrate it with"

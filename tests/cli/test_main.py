@@ -41,7 +41,7 @@ COMMANDS = {
         ("refine", f"--model {'n' * 5000}.onnx", 3, ": "),
         ("refine", "--checkpoint missing.pt", 4, "does not exist"),
         ("refine", "--device cuda:9", 6, "device cpu"),
-        ("refine", "--method alone --lr 1", 2, "--lr the network is refined alone"),
+        ("refine", "--method paper --model compact", 2, "refines one network, not 2"),
         ("batch", "--shard 0/2", 2, "1/4"),
         ("batch", "--poses one_pose.txt", 3, "has 1 poses for 2 frames"),
         ("batch", "--adapt --shard 1/2", 2, "--adapt does not go with --shard"),

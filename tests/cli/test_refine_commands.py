@@ -24,7 +24,7 @@ NETWORK = ["--model", "drive/net/my_net.py", "--checkpoint", "drive/net/my_net.s
 
 
 def arguments(*more: str) -> list[str]:
-    return ["batch", "drive", "-o", "out", *NETWORK, "--propagate", "none", *more]
+    return ["batch", "drive", "-o", "out", *NETWORK, "--method", "paper", *more]
 
 
 def summaries() -> dict[str, dict[str, Any]]:
@@ -122,10 +122,12 @@ def test_every_combination_is_the_batch_with_these_options(root: Path) -> None:
 def test_method_number_of_points_networks_and_switches_can_be_varied(root: Path) -> None:
     batch = ["batch", "drive", "-o", "out", "--limit", "1"]
     assert run([*batch, *NETWORK, "--vary", "method=fused,paper", "--vary", "sample=20,10%"]) == 0
-    fixed = {name: each["fixed_by"] for name, each in summaries().items()}
-    methods = {"fused": "", "paper": "--method paper"}
-    expected = {f"method={m},sample={n}": by for m, by in methods.items() for n in ("20", "10%")}
-    assert fixed == expected
+    methods = {name: summary["method"] for name, summary in summaries().items()}
+    assert methods == {
+        f"method={method},sample={count}": method
+        for method in ("fused", "paper")
+        for count in ("20", "10%")
+    }
     varied = ["--vary", "model=eigen-tiny,fcrn-tiny", "--vary", "uncertainty=on,off"]
     assert run([*batch, "--iterations", "0", *varied]) == 0
 

@@ -44,7 +44,7 @@ def result(capsys: pytest.CaptureFixture[str], line: str) -> Any:
         ("", 0.075, 0.070, set()),
         ("--model sparse2dense-tiny", 0.451, 0.070, set()),
         ("--model fcrn-tiny --uncertainty", 1.041, 0.070, SIGMA),
-        ("--model fcrn-tiny --propagate none", 1.386, 0.592, set()),
+        ("--model fcrn-tiny --method alone --propagate none", 1.041, 0.863, set()),
         ("--model fcrn-tiny --method paper", 1.386, 1.317, set()),
     ],
 )

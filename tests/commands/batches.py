@@ -93,9 +93,9 @@ def add_frame(root: Path, name: str, image: Any = None) -> None:
 
 
 def refinement(root: Path, **changes: Any) -> RefineRequest:
-    """A request to refine with the network in net/ alone, unless a method is asked for."""
+    """A request to refine with the network in net/, by default by the paper's method."""
     fields: dict[str, Any] = {
-        "propagate": None if "method" in changes else "none",
+        "method": "paper",
         "model": str(root / "net" / "my_net.py"),
         "checkpoint": root / "net" / "my_net.safetensors",
     }

@@ -79,14 +79,14 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
 
 
 def run(frame: FrameOnDisk, **changes: Any) -> FrameRecord:
-    """The record of the frame, refined by its network alone; by the default method without it."""
+    """The record of the frame, by default refined by the paper's method."""
     request: dict[str, Any] = {
         "image": frame.image,
         "sparse": frame.sparse,
         "output": frame.folder / "out",
         "model": str(frame.model),
         "checkpoint": frame.checkpoint,
-        "propagate": None if "method" in changes else "none",
+        "method": "paper",
     }
     return refine_image(RefineRequest().with_fields(**(request | changes)))
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import nan
-from typing import Any, Literal
+from typing import Any
 
 from pnpdepth_cli.commands import tables
 from pnpdepth_cli.commands.tables import Table, refinement_tables
-from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
+from tests.builders import method_record
 
 
 def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
@@ -24,10 +25,10 @@ def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
 
 
 def record_of(*networks: str, **fields: Any) -> FrameRecord:
-    """A record of "net", refined by the default method if networks are named."""
-    kind: Literal["default", "fixed"] = "default" if networks else "fixed"
-    method = MethodRecord(kind=kind, reason="", networks=[*networks] or ["net"])
-    return FrameRecord(model=ModelRecord(name="net", spec="net"), method=method, **fields)
+    """A record of these networks, fused and aligned."""
+    model = ModelRecord(name=networks[0], spec=networks[0])
+    aligned = {"alignment": {"kind": "affine"}, "method": method_record(*networks)}
+    return FrameRecord(model=model, **(aligned | fields))
 
 
 def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
@@ -63,11 +64,17 @@ def test_errors_are_shown_where_they_are_measured_and_at_other_points_only_witho
         "validation": at_points(12, before=4.0, after=1.0, linear=2.0),
         "used": at_points(2000, before=0.5, after=0.25),
     }
-    settings = {"layer": "middle", "align": "none", "iterations": 5, "propagate": "none"}
-    record = record_of(settings=settings, loss=[1.0] * 4, errors=errors)  # it diverged after 3
+    record = record_of(
+        "net",
+        method=method_record("net", name="paper", propagation="none"),
+        alignment=None,
+        weights={"net": 1.0},
+        loss=[1.0] * 4,  # it diverged after 3
+        errors=errors,
+    )
     truth, held_out = refinement_tables(record)
     pixels = "errors against ground truth, 1,200 pixels (50.0% of those known)"
-    assert truth.title == f"net cut at middle: {pixels}"
+    assert truth.title == f"net, method paper: {pixels}"
     assert texts(truth) == [
         ["net", "2.0000 m", "50.00%", "–"],
         ["net, 3 updates of z", "1.0000 m", "75.00%", "–"],
@@ -92,7 +99,7 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
     assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
     assert [row[:3] for row in texts(table)] == [
         ["net, aligned with the points", "2.0000 m", "3.0000 m"],
-        ["fused (net 100%)", "1.0000 m", "–"],
+        ["net, residual propagated", "1.0000 m", "–"],
         ["linear interpolation of all points", "–", "–"],
         ["nearest", "3.0000 m", "4.0000 m"],
     ]

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 from pnpdepth_cli.completion.gaussian_process import (
-    ResidualField,
+    Residuals,
     cielab,
     features_of,
     fit,
@@ -25,7 +25,7 @@ SIZE = (20, 30)
 
 def field(
     count: int, *, size: tuple[int, int] = SIZE, colour: bool = True, seed: int = 0
-) -> ResidualField:
+) -> Residuals:
     """A smooth residual at random pixels of an image with a step in its prediction."""
     generator = torch.Generator().manual_seed(seed)
     height, width = size
@@ -38,17 +38,17 @@ def field(
     features = features_of(log, rgb)
     residual = torch.sin(xy[:, 0] / width * 3).double() * 0.3 + 0.2
     at = torch.stack([points.sample(one) for one in features], dim=1)
-    return ResidualField(features=features, points=points, at=at, residual=residual)
+    return Residuals(features=features, points=points, at=at, residual=residual)
 
 
-def covariance(field: ResidualField, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def covariance(field: Residuals, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Of β₀ + β₁·u + f at features p and q; β₀ has variance 100 and β₁ has variance 1."""
     lengths = np.array([1, 1, field.depth_length, *[field.colour_length] * 3])[: p.shape[1]]
     return np.asarray(np.exp(-cdist(p / lengths, q / lengths)) + 100 + np.outer(p[:, 2], q[:, 2]))
 
 
 def reference(
-    field: ResidualField, near: np.ndarray, queries: np.ndarray, noise: np.ndarray | float
+    field: Residuals, near: np.ndarray, queries: np.ndarray, noise: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance at features (M, 6) by the textbook, from the points with these numbers."""
     a = field.at.double().numpy()[near]
@@ -58,7 +58,7 @@ def reference(
     return k @ inverse @ field.residual.numpy()[near], variance
 
 
-def dense_reference(field: ResidualField) -> np.ndarray:
+def dense_reference(field: Residuals) -> np.ndarray:
     """The mean (H, W) from all points."""
     queries = field.features.flatten(1).T.double().numpy()
     mean, _ = reference(field, np.arange(len(field.points)), queries, field.noise)
@@ -124,7 +124,7 @@ def test_the_fit_has_the_smallest_error_of_all_lengths_and_then_of_all_noises(co
         root = np.linalg.cholesky(covariance(drawn, at, at) + drawn.noise * np.eye(60))
         residual = root @ np.random.default_rng(seed).normal(size=60)
 
-        def error(one: ResidualField, at: np.ndarray = at, r: np.ndarray = residual) -> float:
+        def error(one: Residuals, at: np.ndarray = at, r: np.ndarray = residual) -> float:
             inverse = np.linalg.inv(covariance(one, at, at) + one.noise * np.eye(60))
             return float(np.abs(inverse @ r / np.diag(inverse)).mean())
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pnpdepth_cli.completion.gaussian_process import ResidualField, leave_one_out
-from pnpdepth_cli.completion.outliers import FAR, far_points, inlier_mask, inlier_weights, outliers
+from pnpdepth_cli.completion.gaussian_process import Residuals, leave_one_out
+from pnpdepth_cli.completion.outliers import FAR, far_points, inlier_mask, inlier_weights
+from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import random_points, scene
 from tests.completion.test_gaussian_process import field
@@ -24,7 +25,7 @@ def test_outliers_are_left_out_and_inliers_kept() -> None:
     assert int((kept & ~outlier).sum()) > 0.9 * int((~outlier).sum())
 
 
-def inliers_in_numpy(residuals: ResidualField) -> np.ndarray:
+def inliers_in_numpy(residuals: Residuals) -> np.ndarray:
     """The inliers among up to 256 points, from their description; one of few that are exact."""
     xy, count = residuals.points.xy.double().numpy(), len(residuals.points)
     everyone = torch.arange(count)[None]
@@ -69,12 +70,12 @@ def test_inliers_are_those_of_the_description() -> None:
 def test_outliers_are_marked_in_the_order_of_the_points() -> None:
     ground_truth, rgb, prediction = scene()
     points = random_points(ground_truth, 150)
-    assert not bool(outliers(prediction, points, rgb).any())
+    assert not bool(ResidualField(prediction, points, rgb).outliers.any())
     bad = torch.arange(150) % 6 == 0
     outside = replace(points, xy=torch.tensor([[-9.0, 3.0]]), depth=torch.tensor([50.0]))
     far = replace(points, depth=torch.where(bad, 3 * points.depth, points.depth))
     spoiled = far.joined(outside)
-    suspected = outliers(prediction, spoiled, rgb)
+    suspected = ResidualField(prediction, spoiled, rgb).outliers
     assert int(suspected[:150][bad].sum()) > 0.9 * int(bad.sum())
     assert int(suspected.sum()) < 2 * int(bad.sum())
     assert not bool(suspected[150])  # nothing is known there

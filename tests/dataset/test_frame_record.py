@@ -14,13 +14,13 @@ from pnpdepth_cli.dataset.frame_record import (
     BatchState,
     CameraRecord,
     FrameRecord,
-    MethodRecord,
     ModelRecord,
     PointsRecord,
 )
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, SamplePattern
 from pnpdepth_cli.io.file_bytes import Fingerprint
+from tests.builders import method_record
 
 CAMERA = Camera(
     intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),
@@ -54,7 +54,7 @@ RECORD = FrameRecord(
     points=PointsRecord(used=9, held_out=1, nearest=0.5, farthest=4.5, moved=2),
     camera=CameraRecord.of(CAMERA, POSE),
     model=ModelRecord(name="net", spec="net.py", checkpoint=None, checkpoint_sha256=None),
-    method=MethodRecord(kind="fixed", reason="--method paper", networks=["net"]),
+    method=method_record("net", name="paper", propagation="none"),
     settings={"layer": "middle", "iterations": 5, "lr": 0.01, "method": "fused"},
     alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
     loss=[1.0, None],

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.experts import NetworkExpert
+from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.frames.open_network import OpenNetwork
+from pnpdepth_cli.frames.validation import ValidatedFrame, whole_frame
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints
@@ -60,7 +63,11 @@ class Nearest(nn.Module):
 
 
 def member(
-    build: type[nn.Module], *, settings: ClosedSettings | None = None, **of_definition: Any
+    build: type[nn.Module],
+    *,
+    settings: ClosedSettings | None = None,
+    always_updated: bool = False,
+    **of_definition: Any,
 ) -> OpenNetwork:
     """The network as a member of the default method, by default without updates and alignment."""
     kind = "rgb" if issubclass(build, Brightness) else "rgb+sparse"
@@ -75,7 +82,7 @@ def member(
         definition=definition, module=build().eval(), device=torch.device("cpu"), checkpoint=None
     )
     settings = settings or ClosedSettings(iterations=0, align="none")
-    return OpenNetwork(network, "layer", settings)
+    return OpenNetwork(network, "layer", settings, always_updated=always_updated)
 
 
 def compact() -> OpenNetwork:
@@ -88,3 +95,34 @@ def opened(*members: OpenNetwork) -> Iterator[list[OpenNetwork]]:
     """The networks, open."""
     with ExitStack() as stack:
         yield [stack.enter_context(member) for member in members]
+
+
+def network_expert(name: str, at: Tensor, weight: float = 1.0) -> NetworkExpert:
+    """An expert with these predictions at the validation points."""
+    points = frame_in_memory().points
+    prediction = Prediction(
+        aligned=depth_of_scene(),
+        updated=depth_of_scene(),
+        losses=(0.0,),
+        step=0.0,
+        diverged=None,
+        alignment=None,
+        notes=(),
+    )
+    return NetworkExpert(
+        name=name,
+        weight=weight,
+        at=at,
+        updated=at,
+        points=points,
+        whole=prediction,
+        kept=prediction,
+    )
+
+
+def split_of(depth: Tensor) -> ValidatedFrame:
+    """A frame with validation points of these depths."""
+    xy = torch.stack([torch.arange(len(depth)) % 128, torch.arange(len(depth)) // 128], 1).float()
+    points = SparsePoints(xy=xy, depth=depth, size=SIZE)
+    whole = whole_frame(frame_in_memory(60), None)
+    return replace(whole, points=points, weights=torch.ones(len(depth)))

@@ -18,7 +18,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import prepare
 from tests.frames.scenes import SIZE, frame_in_memory
 
-SETTINGS = pnp.Settings(iterations=0)
+SETTINGS = pnp.Settings(method="paper", iterations=0)
 
 
 def pair(seed: int, count: int = 60) -> tuple[NDArray[np.float32], pnp.SparsePoints]:

@@ -13,23 +13,25 @@ from torch import Tensor
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.errors import DivergedError, NoPointsError
 from pnpdepth_cli.frames.frame import Frame, Refined
-from pnpdepth_cli.frames.method import refine_fixed
+from pnpdepth_cli.frames.method import pipeline_of
 from pnpdepth_cli.frames.open_network import prepare
+from pnpdepth_cli.frames.refine_frame import refine_frame
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.settings import ClosedSettings
+from pnpdepth_cli.settings import ClosedSettings, Settings
 from tests.core.networks import Net
 from tests.frames.scenes import Brightness, frame_in_memory, member, opened
 
 SETTINGS = ClosedSettings(iterations=4, lr="5%", update="adam")
+PAPER = pipeline_of(Settings(method="paper"))
 
 
 def refined(
     build: type[Brightness], frame: Frame, settings: ClosedSettings = SETTINGS, **definition: object
 ) -> Refined:
     with opened(member(build, settings=settings, **definition)) as (network,):
-        return refine_fixed(network, frame)
+        return refine_frame([network], frame, PAPER)
 
 
 def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
@@ -59,8 +61,8 @@ def test_an_infinite_sky_has_no_part(sky: Callable[[Tensor, Tensor], Tensor], al
     lost = len(frame.points) - len(below)
     right = refined(Brightness, replace(frame, points=below), settings)
     result = refined(Sky, frame, settings)
-    assert not result.after[:15].any()
-    np.testing.assert_allclose(result.after[15:], right.after[15:], rtol=1e-5)
+    assert not result.depth[:15].any()
+    np.testing.assert_allclose(result.depth[15:], right.depth[15:], rtol=1e-5)
     np.testing.assert_allclose(result.losses, right.losses, rtol=1e-4)
     assert f"{lost} of {len(frame.points)} sparse points" in result.notes[0]
 
@@ -69,18 +71,20 @@ def test_a_divergence_comes_with_its_last_good_depth() -> None:
     settings = replace(SETTINGS, lr=1e38, update="sgd", loss="l2")
     result = refined(Brightness, frame_in_memory(), settings)
     assert isinstance(result.diverged, DivergedError)
-    np.testing.assert_array_equal(result.after, result.before)
+    np.testing.assert_array_equal(result.depth, result.before)
 
 
 def test_a_validated_frame_is_refined_again_without_its_validation_points() -> None:
-    frame, settings = frame_in_memory(60), replace(SETTINGS, propagate="local")
-    with opened(member(Brightness, settings=settings)) as (network,):
-        checked = refine_fixed(network, frame, validated=True).validation
+    frame = frame_in_memory(60)
+    validated = pipeline_of(Settings(method="paper", propagate="local"), validated=True)
+    with opened(member(Brightness, settings=SETTINGS, always_updated=True)) as networks:
+        checked = refine_frame(networks, frame, validated).validation
         assert (len(checked.points), len(checked.kept)) == (12, 48)
-        again = refine_fixed(network, replace(frame, points=checked.kept))
-        assert refine_fixed(network, frame_in_memory(4), validated=True).validation is None
+        others = replace(frame, points=checked.kept)
+        again = refine_frame(networks, others, replace(validated, validates=False))
+        assert refine_frame(networks, frame_in_memory(4), validated).validation is None
     assert again.validation is None
-    for stage, depth in (("before", again.before), ("after", again.after)):
+    for stage, depth in (("before", again.before), ("after", again.depth)):
         expected = checked.points.sample(torch.from_numpy(depth))
         assert torch.allclose(checked.predicted[stage], expected, rtol=1e-5)
     expected = linear(checked.kept, checked.points.xy)

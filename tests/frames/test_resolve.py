@@ -47,10 +47,18 @@ def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> 
             resolve_layer(unlisted, layer)
 
 
-def test_the_default_method_updates_little_and_aligns_what_sees_the_image_alone() -> None:
-    asked, frame = Settings(iterations=9, align="none", layer="layer"), frame_in_memory()
-    for build, method in ((Brightness, (5, "auto")), (Nearest, (0, "none"))):
-        for is_default, expected in ((True, method), (False, (9, "none"))):
-            network = member(build).network
-            found = resolve_member(network, frame, asked, is_default=is_default).settings
-            assert (found.iterations, found.align) == expected
+def test_what_is_left_open_serves_a_propagated_result_and_what_is_stated_is_obeyed() -> None:
+    frame = frame_in_memory()
+    stated = Settings(layer="layer", iterations=9, align="none")
+    left_open = Settings(layer="layer")
+    paper = Settings(layer="layer", method="paper")
+    for build, asked, expected in (
+        (Brightness, left_open, (5, "auto", False)),
+        (Nearest, left_open, (0, "none", False)),
+        (Brightness, stated, (9, "none", True)),
+        (Nearest, stated, (9, "none", True)),
+        (Brightness, paper, (5, "none", True)),
+    ):
+        found = resolve_member(member(build).network, frame, asked)
+        settings = found.settings
+        assert (settings.iterations, settings.align, found.always_updated) == expected

@@ -83,8 +83,8 @@ def test_the_deviation_is_the_calibrated_product_of_four_differences(count: int)
         weights=torch.from_numpy(weights), predicted={"after": torch.from_numpy(predicted)},
     )  # fmt: skip
     frame = Refined(
-        before=network, after=depth, used=whole, held_out=whole.select(slice(0)), losses=(),
-        step=0.0, diverged=None, validation=validation,
+        before=network, depth=depth, used=whole, losses=(), step=0.0, diverged=None,
+        propagation="gp", validation=validation,
     )  # fmt: skip
     sigma = shape_in_numpy(kept, network, depth)[xy[6:, 1], xy[6:, 0]]
     residual = np.log(truth.depth.numpy()[6:] / predicted[6:])

@@ -176,11 +176,10 @@ def _notes(record: FrameRecord, basis: str) -> list[str]:
 
 def _facts(summary: BatchSummary, results: Sequence[FrameRecord]) -> list[tuple[str, str]]:
     """What was refined, and how: the settings that decide the results, by their options."""
-    counts, method = summary.counts, "the default method"
+    counts = summary.counts
     settings = dict(summary.settings)
-    if summary.fixed_by:
-        method = "the method of these settings"
-        settings |= results[0].settings if results else {}
+    if results:
+        settings |= results[0].settings
     frames = [
         f"{counts[kind]:,} {kind.replace('_', ' ')}"
         for kind in ("done", "diverged", "failed", "pending", "with_warnings")
@@ -191,7 +190,7 @@ def _facts(summary: BatchSummary, results: Sequence[FrameRecord]) -> list[tuple[
         ("frames of", f"{summary.source} (layout {summary.layout})"),
         ("frames", ", ".join(frames)),
         ("results in", summary.output),
-        ("refined by", method),
+        ("method", summary.method),
         *([("mean weights", mean_weights_text(weights))] if weights else []),
         *((name, str(settings[name])) for name in _SETTINGS if settings.get(name)),
     ]

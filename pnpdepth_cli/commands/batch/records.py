@@ -187,8 +187,8 @@ class BatchSummary:
     source: str
     output: str
     layout: str
-    fixed_by: str
-    """The options that fix the method; empty for the default one."""
+    method: str
+    """The method of all frames."""
     settings: Mapping[str, object]
     """What decides the results."""
     counts: dict[str, int]
@@ -245,7 +245,7 @@ def write_summary(
         source=str(request.source),
         output=str(request.output),
         layout=found.layout,
-        fixed_by=request.refine.method.fixed_by,
+        method=request.refine.method.method,
         settings=settings,
         counts=counts,
         unit=" and ".join(sorted({record.unit for record in results})) or "m",

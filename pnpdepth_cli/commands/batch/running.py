@@ -166,7 +166,7 @@ def _refine_frames(
                 with work.step("refine"):
                     if method is None:
                         raise InputError("no frame could be read when the batch began; try again")
-                    work.refined = method.refine(work.frame)
+                    work.refined = method.refine(work.frame, with_stages=work.frame.gt is not None)
             proven |= work.refined is not None
             fatal = StorageError if proven else (StorageError, ModelError, UsageError)
             if isinstance(work.error, fatal):

@@ -103,7 +103,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     Where it is not, a note tells how much of a scan's image lies outside of its points.
     """
     if request.unknown == "zero" and frame.valid is not None:
-        return replace(frame, after=np.where(frame.valid, frame.after, np.float32(0)))
+        return replace(frame, depth=np.where(frame.valid, frame.depth, np.float32(0)))
     source = inputs.sources["sparse"]
     is_scan = source.calibration or scan_pattern(frame.used.xy, frame.used.size)
     if frame.valid is not None or not is_scan:
@@ -121,16 +121,16 @@ def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
         return frame
     scale = output_scale(inputs)
     nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
-    known = np.isfinite(frame.after) & (frame.after > 0)
-    clipped = known & ((frame.after > farthest) | (frame.after < 0.5 / scale))
+    known = np.isfinite(frame.depth) & (frame.depth > 0)
+    clipped = known & ((frame.depth > farthest) | (frame.depth < 0.5 / scale))
     if not clipped.any():
         return frame
     limits = f"{metres(float(nearest))}–{metres(float(farthest))} m"
     fact = f"{int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}"
     holds = f"what a 16-bit PNG with {scale:g} codes per metre holds"
     note = f"warning: {fact}, {holds}; --format exr holds every depth"
-    after = np.where(clipped, np.clip(frame.after, nearest, farthest), frame.after)
-    return replace(frame, after=after, notes=(*frame.notes, note))
+    after = np.where(clipped, np.clip(frame.depth, nearest, farthest), frame.depth)
+    return replace(frame, depth=after, notes=(*frame.notes, note))
 
 
 def _power_of_ten(largest: float) -> float:
@@ -153,7 +153,7 @@ def write_outputs(
     inputs = replace(inputs, register=frame.registration).registered()
     image = inputs.image
     # Depth, its standard deviation, and where it is valid.
-    write_depth(outputs["depth"], frame.after, scale=output_scale(inputs))
+    write_depth(outputs["depth"], frame.depth, scale=output_scale(inputs))
     if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
         _write_sigma(outputs["sigma"], frame.sigma)
         write_mask(outputs["valid"], frame.valid)
@@ -162,11 +162,11 @@ def write_outputs(
     if "preview" in outputs:
         xy, depth = inputs.own.xy.numpy(), inputs.own.depth.numpy()
         figures["preview"] = preview(
-            image, xy, depth, frame.before, frame.after, outputs["preview"], inputs.unit, made_by
+            image, xy, depth, frame.before, frame.depth, outputs["preview"], inputs.unit, made_by
         )
     if "improvement" in outputs and inputs.gt is not None:
         figures["improvement"] = improvement(
-            image, frame.before, frame.after, inputs.gt, outputs["improvement"], inputs.unit
+            image, frame.before, frame.depth, inputs.gt, outputs["improvement"], inputs.unit
         )
     if "view" in outputs:
         _write_view(outputs["view"], inputs, frame)
@@ -193,7 +193,7 @@ def _write_view(path: Path, inputs: Frame, frame: Refined) -> None:
     height, width = inputs.size
     stride = math.ceil(math.sqrt(height * width / LARGEST_VIEW))
     thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    maps = {"before": frame.before, "after": frame.after}
+    maps = {"before": frame.before, "after": frame.depth}
     maps |= {} if inputs.gt is None else {"gt": inputs.gt}
     depths = {}
     for name, depth in maps.items():
@@ -240,7 +240,7 @@ def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.ui
     """(H, W, 3) of the image, or of the depth where there is none."""
     if image is not None:
         return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    return depth_scale(frame.after).paint(frame.after)
+    return depth_scale(frame.depth).paint(frame.depth)
 
 
 def _text(values: NDArray[np.number], kind: str) -> str:

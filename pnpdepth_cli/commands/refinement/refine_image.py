@@ -27,8 +27,9 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset import frame_record
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
+from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
@@ -56,7 +57,7 @@ def refine_image(request: RefineRequest) -> frame_record.FrameRecord:
     with timed(seconds, "load network"):
         method = load_method(request, inputs)
     with timed(seconds, "refine"), method:
-        frame = method.refine(inputs)
+        frame = method.refine(inputs, with_stages=inputs.gt is not None)
     return write_refined(request, outputs, method, inputs, frame, seconds)
 
 
@@ -154,7 +155,8 @@ def _record_of(
     weights = network.checkpoint
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
-    own_used = len(frame.own) - len(refined.held_out)
+    held_out = _held_out(frame)
+    own_used = len(frame.own) - len(held_out)
     # Status, files, method, settings, points and errors, in the order of the record.
     return frame_record.FrameRecord(
         name=files.name or (first.stem if first else ""),
@@ -173,9 +175,9 @@ def _record_of(
             checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
         ),
         method=frame_record.MethodRecord(
-            kind="default" if method.is_default else "fixed",
-            reason=method.asked.fixed_by or "default",
-            networks=[member.network.definition.name for member in method.members],
+            name=method.asked.method,
+            propagation=refined.propagation,
+            networks=[_network_record(member) for member in method.members],
         ),
         settings={
             "method": method.asked.method,
@@ -183,7 +185,7 @@ def _record_of(
             **asdict(method.own.settings),
             "seed": method.asked.seed,
             "step": refined.step,
-            "propagate": "gp" if method.is_default else method.own.settings.propagate,
+            "propagate": refined.propagation,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
             "holdout": request.holdout,
@@ -194,7 +196,7 @@ def _record_of(
         size=(frame.size[1], frame.size[0]),
         points=frame_record.PointsRecord(
             used=len(refined.used),
-            held_out=len(refined.held_out),
+            held_out=len(held_out),
             nearest=float(frame.own.depth.min()),
             farthest=float(frame.own.depth.max()),
             moved=len(refined.used) - own_used if frame.neighbours else None,
@@ -202,9 +204,21 @@ def _record_of(
         weights=dict(refined.weights),
         loss=list(refined.losses),
         errors=_errors_of(refined, frame, with_baselines=request.baselines),
-        improved_fraction=_improved_fraction(refined, frame.gt),
+        improved_fraction=_improved_fraction(refined, frame),
         notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
     )
+
+
+def _network_record(member: OpenNetwork) -> frame_record.NetworkRecord:
+    """The settings of one network."""
+    settings = asdict(member.settings)
+    del settings["propagate"]  # the residual of the result is propagated, not of a network
+    return frame_record.NetworkRecord(name=member.name, layer=member.layer, **settings)
+
+
+def _held_out(frame: Frame) -> SparsePoints:
+    """The points of the frame that nothing uses."""
+    return frame.points.select(slice(0)) if frame.held_out is None else frame.held_out
 
 
 def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
@@ -218,9 +232,10 @@ def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[
                     yield name, BASELINES[name](points, before)
 
     errors, validation = dict[str, Stages](), refined.validation
-    before, after = torch.from_numpy(refined.before), torch.from_numpy(refined.after)
+    held_out = _held_out(frame)
+    before, after = torch.from_numpy(refined.before), torch.from_numpy(refined.depth)
     maps, beside = {BEFORE: before, AFTER: after}, dict[str, Tensor]()
-    if frame.gt is not None or len(refined.held_out):
+    if frame.gt is not None or len(held_out):
         beside[LINEAR] = linear(frame.points)
     # Against the truth, all others are scored on the pixels where the result is known.
     if frame.gt is not None:
@@ -232,7 +247,7 @@ def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[
             name: score(depth, gt if name == AFTER else known).to_json()
             for name, depth in scored.items()
         }
-    errors[HELD_OUT] = _at_points(refined.held_out, maps | beside)
+    errors[HELD_OUT] = _at_points(held_out, maps | beside)
     # At validation points, each is predicted without them.
     if validation is not None:
         others = baselines(validation.kept, validation.network)
@@ -256,12 +271,13 @@ def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
     return stages if AFTER in stages and BEFORE in stages else {}
 
 
-def _improved_fraction(refined: Refined, gt: DepthMap | None) -> float | None:
+def _improved_fraction(refined: Refined, frame: Frame) -> float | None:
     """The fraction of the pixels with ground truth, else of held-out points, whose error fell."""
-    before, after = refined.before, refined.after
+    before, after, gt = refined.before, refined.depth, frame.gt
     if gt is None:
         maps = torch.from_numpy(before), torch.from_numpy(after)
-        points = refined.held_out.select(refined.held_out.known_in(maps[1]))
+        held_out = _held_out(frame)
+        points = held_out.select(held_out.known_in(maps[1]))
         before, after = (points.sample(depth).numpy() for depth in maps)
         gt = points.depth.numpy()
     gains = gain(before, after, gt)

@@ -101,7 +101,7 @@ def test_without_ground_truth_changes_are_at_held_out_points(root: Path, report:
 def test_each_frame_has_its_weights_and_the_errors_all_share(root: Path, report: Path) -> None:
     (root / "gt/b.png").unlink()
     (root / "rgb/d.png").write_bytes(b"no image")
-    batch(root, html=report, refine={"propagate": None})
+    batch(root, html=report, refine={"method": "fused"})
     data, frames = page_data(report), frames_of(report)
     assert frames["a"]["values"]["rmse_change"] is not None
     assert {*frames["b"]["values"].values()} == {None}

@@ -19,10 +19,11 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest
 from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.batch.records import write_summary
 from pnpdepth_cli.commands.refinement.refine_image import refine_image
-from pnpdepth_cli.dataset.frame_record import FrameRecord, MethodRecord, ModelRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import plain
+from tests.builders import method_record
 from tests.commands.batches import (
     NAMES,
     Recorder,
@@ -238,7 +239,7 @@ def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root:
     edit(root / "net/my_net.py", formula, "torch.exp(self.decode(self.middle(self.encode(rgb))))")
     summary = batch(root, refine={"lr": "1e4"})
     assert summary.counts["diverged"] == 4
-    assert "0 updates" in summary.titles["after"]  # of the updates asked for, none is in the depth
+    assert summary.titles["after"] == "tiny"  # of the updates asked for, none is in the depth
     assert done(root, refine={"lr": "1e4"}) == []
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
 
@@ -279,7 +280,7 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
             errors={"ground_truth": {"before": unknown, "after": after}},
             notes=[*(kind.format(number) for kind in kinds), "gt: 5 pixels"],
             model=ModelRecord(name="net", spec="net"),
-            method=MethodRecord(kind="default", reason="default", networks=["net", "compact"]),
+            method=method_record("net", "compact"),
         )
         for number, weight in enumerate((0.1, 0.4, 0.1, 0.2))
     ]

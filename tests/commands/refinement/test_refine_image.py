@@ -141,7 +141,7 @@ def test_the_papers_method_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk)
     }  # fmt: skip
     one, other = frame.folder / "method.npy", frame.folder / "options.npy"
     by_name = run(frame, method="paper", output=one)
-    by_options = run(frame, **paper, output=other)
+    by_options = run(frame, **paper, method="alone", output=other)
     assert one.read_bytes() == other.read_bytes()
     assert by_name.settings == by_options.settings | {"method": "paper"}
 
@@ -150,17 +150,18 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
     second = frame.folder / "second.py"
     text = frame.model.read_text().replace('name="tiny"', 'name="second", complete=True')
     second.write_text(text)
-    with pytest.raises(UsageError, match="several networks are fused, but `propagate` fixes"):
-        run(frame, more_models=(str(second),), propagate="none")
-    method = run(frame, more_models=(str(second),), propagate=None).method
+    with pytest.raises(UsageError, match="method 'paper' refines one network, not 2"):
+        run(frame, more_models=(str(second),))
+    method = run(frame, more_models=(str(second),), method="fused", iterations=3).method
     assert method is not None
-    assert method.networks == ["tiny", "second", "compact"]
+    assert method.names == ["tiny", "second", "compact"]
+    assert [network.iterations for network in method.networks] == [3, 5, 2]  # two have their own
     own = run(frame, method="alone", overwrite=True)
     assert own.weights == {"tiny": 1.0}
 
 
 def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnDisk) -> None:
-    asked = {"uncertainty": True, "propagate": None}
+    asked = {"uncertainty": True, "method": "fused"}
     records = [run(frame, **asked, format=f, output=frame.folder / f) for f in ("png", "npy")]
     sigma, exact = (read_depth(Path(record.outputs["sigma"])).values for record in records)
     assert sigma.shape == frame.depth.shape
@@ -185,7 +186,8 @@ def write_frame(root: Path, seed: int, count: int) -> dict[str, Path]:
 def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> FrameRecord:
     """The record of the frame, refined with these options."""
     files: dict[str, Any] = write_frame(folder, 0, count)
-    return run(own, **files | {"output": folder / "out", "overwrite": True} | options)
+    fields = {"output": folder / "out", "overwrite": True, "method": "alone"}
+    return run(own, **files | fields | options)
 
 
 def test_an_image_is_moved_unless_off_or_by_the_paper(tmp_path: Path, frame: FrameOnDisk) -> None:
@@ -213,7 +215,7 @@ def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> Non
     whole = refined(tmp_path, frame, count=800).registration
     record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
     assert record.points is not None
-    assert record.points.used == 400
+    assert record.points.held_out == 400
     assert None not in (whole, record.registration)
     assert record.registration != whole
 
@@ -223,7 +225,7 @@ def test_frames_share_a_registration_none_shows_alone(tmp_path: Path, frame: Fra
     for seed in range(8):
         write_frame(tmp_path / "in", seed, 80)
     network = {"model": str(frame.model), "checkpoint": frame.checkpoint}
-    batch(tmp_path, source=tmp_path / "in", refine=network)
+    batch(tmp_path, source=tmp_path / "in", refine=network | {"method": "alone"})
     records = (tmp_path / "out").glob("0*.json")
     first, *others = (FrameRecord.read(path).registration for path in records)
     assert first is not None

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.choices import PROPAGATIONS
-from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.points import SparsePoints
 from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 
@@ -19,7 +19,7 @@ def test_a_drifting_prediction_is_put_right(kind: str, count: int, flat: str | N
     if flat == "prediction":
         prediction, rgb = torch.full(SIZE, 2.0), torch.full((3, *SIZE), 0.5)
     points = random_points(gt, max(count, 100) if flat == "prediction" else count)
-    depth = propagate(prediction, points, None if flat == "image" else rgb, kind=kind)
+    depth = ResidualField(prediction, points, None if flat == "image" else rgb).depth(kind=kind)
     assert depth.dtype == torch.float32
     assert bool((depth > 0).all())
     assert mean_log_error(depth, gt) < 0.5 * mean_log_error(prediction, gt)
@@ -30,11 +30,12 @@ def test_a_drifting_prediction_is_put_right(kind: str, count: int, flat: str | N
 @pytest.mark.parametrize("kind", PROPAGATIONS)
 def test_one_point_moves_all_by_its_factor_and_nothing_left_moves_nothing(kind: str) -> None:
     gt, rgb, prediction = scene()
-    exact = propagate(gt, random_points(gt, 50), rgb, kind=kind)
+    exact = ResidualField(gt, random_points(gt, 50), rgb).depth(kind=kind)
     assert torch.allclose(exact, gt, rtol=1e-6)
-    moved = propagate(gt / 1.5, random_points(gt, 1), rgb, kind=kind)
+    moved = ResidualField(gt / 1.5, random_points(gt, 1), rgb).depth(kind=kind)
     assert torch.allclose(moved, gt, rtol=0.01)
-    assert torch.equal(propagate(prediction, random_points(gt, 9), rgb, kind="none"), prediction)
+    as_it_is = ResidualField(prediction, random_points(gt, 9), rgb).depth(kind="none")
+    assert torch.equal(as_it_is, prediction)
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
@@ -42,7 +43,7 @@ def test_one_point_moves_all_by_its_factor_and_nothing_left_moves_nothing(kind: 
 def test_few_points_bring_no_depth_beyond_what_they_say(kind: str, count: int) -> None:
     gt, rgb, prediction = scene()
     points = random_points(gt, count)
-    factor = propagate(prediction, points, rgb, kind=kind) / prediction
+    factor = ResidualField(prediction, points, rgb).depth(kind=kind) / prediction
     ratio = points.depth / points.sample(prediction)
     assert float(ratio.min()) * (1 - 1e-5) <= float(factor.min())
     assert float(factor.max()) <= float(ratio.max()) * (1 + 1e-5)
@@ -58,7 +59,7 @@ def test_outliers_do_not_propagate(kind: str, count: int) -> None:
     off = ((0.7 + 2.3 * random) * torch.where(side < 0.5, -1, 1)).exp()
     off[torch.arange(count) % 5 > 0] = 1
     clean, disturbed = (
-        mean_log_error(propagate(prediction, p, rgb, kind=kind), gt)
+        mean_log_error(ResidualField(prediction, p, rgb).depth(kind=kind), gt)
         for p in (points, replace(points, depth=points.depth * off))
     )
     assert disturbed < 1.5 * clean + 0.01
@@ -71,16 +72,16 @@ def test_an_unknown_prediction_stays_unknown_and_its_points_have_no_effect(kind:
     unknown = prediction.clone()
     unknown[:, :20] = 0
     unknown[0, 30], unknown[0, 31] = torch.inf, torch.nan
-    depth = propagate(unknown, points, rgb, kind=kind)
+    depth = ResidualField(unknown, points, rgb).depth(kind=kind)
     known = unknown.isfinite() & (unknown > 0)
     assert torch.equal(depth != 0, known)
-    as_it_is = propagate(unknown, points, rgb, kind="none")
+    as_it_is = ResidualField(unknown, points, rgb).depth(kind="none")
     assert torch.equal(as_it_is, torch.where(known, unknown, 0))
     beside, inside = torch.tensor([[[19.5, 9.0], [20.0, 9.0]], [[20.5, 9.0], [63.0, 9.0]]])
-    assert not bool((propagate(unknown, points, rgb, beside, kind=kind) > 0)[0])
-    assert bool((propagate(unknown, points, rgb, inside, kind=kind) > 0).all())
+    assert not bool((ResidualField(unknown, points, rgb).depth(beside, kind=kind) > 0)[0])
+    assert bool((ResidualField(unknown, points, rgb).depth(inside, kind=kind) > 0).all())
     lying = replace(points, depth=torch.where(points.xy[:, 0] < 20, 99.0, points.depth))
-    assert torch.equal(propagate(unknown, lying, rgb, kind=kind), depth)
+    assert torch.equal(ResidualField(unknown, lying, rgb).depth(kind=kind), depth)
 
 
 @pytest.mark.parametrize("kind", PROPAGATIONS)
@@ -90,7 +91,7 @@ def test_points_outside_the_frame_and_farther_ones_at_one_pixel_have_no_effect(k
     xy = torch.cat([torch.tensor([[-9.0, 5.0], [70.0, 5.0]]), points.xy[:3]])
     depth = torch.cat([torch.tensor([30.0, 0.1]), 2 * points.depth[:3]])
     more = points.joined(SparsePoints(xy=xy, depth=depth, size=SIZE))
-    result, again = (propagate(prediction, p, rgb, kind=kind) for p in (points, more))
+    result, again = (ResidualField(prediction, p, rgb).depth(kind=kind) for p in (points, more))
     assert torch.equal(result, again)
 
 
@@ -101,7 +102,7 @@ def test_every_second_pixel_of_a_large_image_is_as_of_it_alone(kind: str, rtol: 
     points = random_points(prediction * (1 + 0.3 * torch.sin(x / 200)), 30)
     random = torch.rand(200, 2, generator=torch.Generator().manual_seed(6))
     pixels = 2 * (random * torch.tensor([400.0, 320.0])).round()
-    depth = propagate(prediction, points, None, kind=kind)
-    alone = propagate(prediction, points, None, pixels, kind=kind)
+    depth = ResidualField(prediction, points, None).depth(kind=kind)
+    alone = ResidualField(prediction, points, None).depth(pixels, kind=kind)
     column, row = pixels.long().unbind(1)
     assert torch.allclose(depth[row, column], alone, rtol=rtol)

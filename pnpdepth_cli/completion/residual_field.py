@@ -1,0 +1,101 @@
+"""The residual field of one prediction: what the sparse points say of it, at every pixel.
+
+The residual is r = log measured − log predicted depth. It is known at the points. Elsewhere it is
+predicted from the points that are no outliers, and exp(r) · prediction is the depth that agrees
+with them. That depth is positive, and r stays within its values at the points.
+
+A prediction of 0, or not finite, is unknown and stays 0. Points there and points outside the image
+have no effect. Of points at the same coordinates the nearest counts.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.choices import PROPAGATIONS
+from pnpdepth_cli.completion import outliers
+from pnpdepth_cli.completion.gaussian_process import Residuals, residuals_of
+from pnpdepth_cli.points import SparsePoints
+
+
+class ResidualField:
+    """The residual of one prediction, given at some points.
+
+    What several steps need, such as which points are outliers, is computed when it is first asked
+    for, and once.
+
+    Args:
+        prediction: (H, W) metres, 0 = unknown.
+        points: The points, in pixels of the image.
+        rgb: (3, H, W) in 0…1, or None.
+    """
+
+    def __init__(self, prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> None:
+        self.prediction = prediction
+        self._known = prediction.isfinite() & (prediction > 0)
+        self._rgb = rgb
+        self.points = points
+
+    def is_of(self, prediction: Tensor, points: SparsePoints) -> bool:
+        """Returns whether it is the field of these two objects."""
+        return prediction is self.prediction and points is self.points
+
+    @functools.cached_property
+    def at_points(self) -> Residuals:
+        """The residuals at the points. Raises NoPointsError if no point has a prediction."""
+        return residuals_of(self.prediction, self.points, self._rgb)
+
+    @functools.cached_property
+    def at_inliers(self) -> Residuals:
+        """The residuals at the points that are no outliers."""
+        return outliers.without_outliers(self.at_points)
+
+    @functools.cached_property
+    def outliers(self) -> Tensor:
+        """(N,) bool: which points are outliers; none unless some clearly are."""
+        keys = _coordinate_keys(self.at_points.points)
+        inliers = _coordinate_keys(self.at_inliers.points)
+        outlying = keys[~torch.isin(keys, inliers)]
+        own = _coordinate_keys(self.points.tensors())
+        return torch.isin(own, outlying).to(self.points.xy.device)
+
+    def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
+        """Returns the residual (H, W), or (M,) at the coordinates of M points.
+
+        Args:
+            queries: Points at whose coordinates the residual is wanted. None: every pixel.
+            kind: A name in `choices.PROPAGATIONS`.
+        """
+        inliers = self.at_inliers
+        residual: Tensor = PROPAGATIONS[kind](inliers, queries)
+        return residual.clamp(float(inliers.residual.min()), float(inliers.residual.max()))
+
+    def depth(self, xy: Tensor | None = None, *, kind: str = "gp") -> Tensor:
+        """Returns the prediction with its residual propagated, metres, 0 = unknown.
+
+        Args:
+            xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel, (H, W).
+            kind: A name in `choices.PROPAGATIONS`; with "none" the prediction itself is returned.
+
+        Raises:
+            NoPointsError: No point has a prediction, except with "none".
+        """
+        queries = None
+        predicted = torch.where(self._known, self.prediction, 0.0)
+        if xy is not None:
+            queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=self.points.size)
+            unknown = torch.where(self._known, self.prediction, torch.nan)
+            predicted = queries.sample(unknown).nan_to_num(0.0)
+            queries = queries.tensors()
+        if kind == "none":
+            return predicted.float()
+        residual = self.residual(queries, kind=kind)
+        return (predicted * residual.exp().to(predicted.device)).float()
+
+
+def _coordinate_keys(points: SparsePoints) -> Tensor:
+    """(N,) int64: x and y bit by bit, equal for equal coordinates."""
+    return points.xy.float().contiguous().view(torch.int64).flatten()

@@ -1,0 +1,305 @@
+"""How one frame is refined: the steps of every method, in their order, on one screen.
+
+`fused` and `alone` have all steps; with `alone` the user's networks are the only experts. `paper`
+is equation 3 alone, and leaves out what the paper does not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.outliers import far_points
+from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.frames.experts import (
+    Experts,
+    fused_experts,
+    networks_alone,
+    weighted_mean,
+    with_mirrored,
+)
+from pnpdepth_cli.frames.frame import Frame, Prediction, Refined, Validation, is_dense
+from pnpdepth_cli.frames.fuse import fit_weights, scanner_shares
+from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
+from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
+from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
+
+LEAST_PART = 0.01
+"""A network with less weight has no part in the result, which is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """Which steps a method has, besides the network's own."""
+
+    leaves_outliers_out: bool = True
+    validates: bool = True
+    fuses: bool = True
+    """Whether a network that takes a prior is fused with the others, where there is one."""
+    propagation: str | None = None
+    """How the residual is propagated; None: as the points say (`validation.whole_frame`)."""
+    unused: tuple[str, ...] = ()
+    """Settings of the user that only updates of z use."""
+
+
+def refine_frame(
+    networks: Sequence[OpenNetwork],
+    frame: Frame,
+    pipeline: Pipeline,
+    *,
+    seed: int = 0,
+    with_stages: bool = False,
+) -> Refined:
+    """Returns the frame refined.
+
+    Args:
+        networks: The networks, open, the user's first.
+        frame: The frame, its image moved to its points.
+        pipeline: The steps of the method.
+        seed: Random seed of the validation points.
+        with_stages: Whether the depth after each step is returned, too.
+
+    Raises:
+        PnpDepthError: A network gives no depth.
+    """
+    for network in networks:
+        network.next_image()
+    # Points that contradict their neighbours are outliers. The network that weighs its points
+    # judges, else the user's: a useless network does not decide which points are used.
+    judge = next((network for network in networks if network.weighs_points), networks[0])
+    if pipeline.leaves_outliers_out:
+        inliers, judged, field = without_outliers(judge, frame)
+    else:
+        inliers, judged, field = Judged(frame, judge.refine(frame))
+    # A fifth of the inliers are validation points, which every expert predicts from the others.
+    split = whole_frame(inliers, pipeline.propagation)
+    if pipeline.validates:
+        split = split_frame(split, judged.aligned, networks, seed=seed)
+    # The experts predict: the networks, z updated, and what a network makes of their depth.
+    fusing = None
+    if pipeline.fuses:
+        fusing = next((network for network in networks if network.takes_prior), None)
+    if fusing is None:
+        experts = networks_alone(networks, split, {judge: judged})
+    else:
+        experts = fused_experts(networks, fusing, split, {judge: judged})
+    # The weights that predict the validation points best, close to prior weights, fuse the depths.
+    weights = fit_weights(experts.every, split)
+    if fusing is not None:
+        experts = with_mirrored(fusing, experts, weights)
+    having = [expert for expert in experts.every if weights[expert.name] > 0]
+    fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in having])
+    # Points far from the depth of a network that weighs them are outliers, too.
+    if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
+        inliers = inliers.without(far_points(judged.aligned, inliers.points))
+    # The residual at the inliers is propagated to every pixel.
+    if field is None or not field.is_of(fused, inliers.points):
+        field = ResidualField(fused, inliers.points, inliers.rgb)
+    depth = propagated = field.depth(kind=split.propagation)
+    # On scan lines, a completion network of that scanner has most of the result.
+    shares = scanner_shares(experts.every, split, weights) if pipeline.fuses else {}
+    if shares:
+        dense = {expert.name: expert.dense for expert in experts.every}
+        depth = _with_shares(propagated, dense, shares)
+    steps = Steps(fused=fused, propagated=propagated, depth=depth, weights=weights, shares=shares)
+    result = _refined(frame, inliers, experts, split, steps, pipeline)
+    if with_stages:
+        stages = _stages(experts, inliers, split, steps)
+        result = replace(result, stages={name: each.numpy() for name, each in stages.items()})
+    return result
+
+
+class Steps(NamedTuple):
+    """What the steps of one frame gave."""
+
+    fused: Tensor  # (H, W) metres
+    propagated: Tensor  # (H, W) metres, its residual propagated
+    depth: Tensor  # (H, W) metres, with the shares of completion networks of the scanner
+    weights: Mapping[str, float]  # of the experts in `fused`
+    shares: Mapping[str, float]  # of completion networks of the scanner in `depth`
+
+    @property
+    def weights_in_depth(self) -> dict[str, float]:
+        """The weights of all experts in the result; their sum is 1."""
+        rest = 1 - sum(self.shares.values())
+        return {name: rest * w + self.shares.get(name, 0.0) for name, w in self.weights.items()}
+
+
+class Judged(NamedTuple):
+    """A frame without its outliers."""
+
+    inliers: Frame
+    prediction: Prediction
+    """What the network that judges gives for it."""
+    field: ResidualField | None = None
+    """The field that told the outliers. None: none did."""
+
+
+def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
+    """Returns the frame without its outliers, and what a network gives for it.
+
+    Outliers differ from its prediction otherwise than their neighbours do. Of many points, those
+    that contradict their neighbours by themselves are outliers too.
+
+    Raises:
+        NoPointsError: No point lies where the network predicts.
+    """
+    points = frame.points
+    suspected = ResidualField(torch.ones(points.size), points, frame.rgb).outliers
+    # A network that weighs its points is given the outliers too, once they are known.
+    again = bool(suspected.any()) and judge.weighs_points
+    consistent = frame
+    if bool(suspected.any()):
+        consistent = replace(frame, points=points.select(~suspected))
+    judged = judge.refine(consistent, updates=not again)
+    field = ResidualField(judged.aligned, points, frame.rgb)
+    outlying = field.outliers
+    if len(points) >= FEW_POINTS:
+        outlying = outlying | suspected
+    inliers = frame.without(outlying)
+    if again or not torch.equal(outlying, suspected):
+        judged = judge.refine(inliers)
+    return Judged(inliers, judged, field)
+
+
+def _propagated(depth: Tensor, frame: Frame, split: ValidatedFrame) -> Tensor:
+    """Depth (H, W) with its residual at the points propagated."""
+    return ResidualField(depth, frame.points, frame.rgb).depth(kind=split.propagation)
+
+
+def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, float]) -> Tensor:
+    """Depth (…) with the own depths of completion networks, whose shares are by name."""
+    rest = (depth, 1 - sum(shares.values()))
+    return weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
+
+
+def _refined(
+    frame: Frame,
+    inliers: Frame,
+    experts: Experts,
+    split: ValidatedFrame,
+    steps: Steps,
+    pipeline: Pipeline,
+) -> Refined:
+    """The refined frame, with what a person should know of it."""
+    own = experts.own.whole
+    notes = [*own.notes]
+    if frame.registration is not None:
+        notes.append(
+            f"image: moved to the pixel coordinates of the depth camera by {frame.registration}"
+        )
+    left_out = len(frame.points) - len(inliers.points)
+    if left_out:
+        notes.append(
+            f"outliers: {left_out:,} of {len(frame.points):,} points left out, inconsistent with"
+            " the others"
+        )
+    notes += _notes_on_networks(experts, split, steps.weights_in_depth)
+    if pipeline.unused and not own.updates:
+        names = ", ".join(f"`{name}`" for name in pipeline.unused)
+        notes.append(
+            f"{names}: not used, as z of {experts.own.name} is not updated with these points;"
+            " `iterations` updates it"
+        )
+    return Refined(
+        before=own.aligned.numpy(),
+        depth=steps.depth.numpy(),
+        used=inliers.points,
+        losses=own.losses,
+        step=own.step,
+        diverged=own.diverged,
+        alignment=own.alignment,
+        propagation=split.propagation,
+        notes=(*notes, *experts.warnings),
+        validation=_validation(experts, split, steps.shares),
+        weights=steps.weights_in_depth,
+        registration=frame.registration,
+    )
+
+
+def _stages(
+    experts: Experts, frame: Frame, split: ValidatedFrame, steps: Steps
+) -> dict[str, Tensor]:
+    """The user's network after each step of its own, and the network that takes a prior alone."""
+
+    def propagated(dense: Tensor) -> Tensor:
+        """Depth (H, W) with its residual propagated; that of the result is known."""
+        return steps.propagated if dense is steps.fused else _propagated(dense, frame, split)
+
+    own = experts.own
+    stages = {BEFORE: own.whole.aligned}
+    if own.whole.updates:
+        stages[UPDATED] = own.whole.updated
+    if own.of_scanner:
+        stages[PROPAGATED] = own.whole.updated
+    elif split.propagation != "none":
+        stages[PROPAGATED] = propagated(own.dense)
+    if experts.alone is not None:
+        stages[ALONE] = propagated(experts.alone.dense)
+    return stages
+
+
+def _validation(
+    experts: Experts, split: ValidatedFrame, shares: Mapping[str, float]
+) -> Validation | None:
+    """The stages and the result at the validation points; None without any.
+
+    Each fifth of these is predicted by weights that were fitted to the others.
+    """
+    own = experts.own
+    points = split.points
+    if not len(points):
+        return None
+    part = torch.arange(len(points)) % FOLDS
+    result = torch.empty(len(points))
+    for fold in range(FOLDS):
+        weights = fit_weights(experts.every, split, part != fold)
+        fused = weighted_mean([(expert.at, weights[expert.name]) for expert in experts.every])
+        result[part == fold] = fused[part == fold]
+    given = split.kept.points
+    if split.kept.outliers is not None:
+        given = given.joined(split.kept.outliers)
+    predicted = {BEFORE: points.sample(own.kept.aligned)}
+    if own.kept.updates:
+        predicted[UPDATED] = own.updated
+    if own.of_scanner:
+        predicted[PROPAGATED] = own.updated
+    elif split.propagation != "none":
+        predicted[PROPAGATED] = own.at
+    if experts.alone is not None:
+        predicted[ALONE] = experts.alone.at
+    updated = {expert.name: expert.updated for expert in experts.every}
+    predicted[AFTER] = _with_shares(result, updated, shares)
+    predicted[LINEAR] = linear(given, points.xy)
+    return Validation(
+        points=points,
+        kept=given,
+        network=own.kept.aligned,
+        weights=split.weights,
+        predicted=predicted,
+    )
+
+
+def _notes_on_networks(
+    experts: Experts, split: ValidatedFrame, weights: Mapping[str, float]
+) -> list[str]:
+    """Which of the user's networks have no part in the result, and why."""
+    notes = list[str]()
+    alone = experts.alone
+    for own in experts.of_users:
+        of_user = sum(weights[expert.name] for expert in experts.every if expert.user is own.user)
+        if of_user >= LEAST_PART:
+            continue
+        why = "its depth does not help to predict the points from each other"
+        if len(split.points) and alone is not None:
+            why = (
+                f"at {len(split.points):,} validation points its error is"
+                f" {split.error(own.at):.4f}, that of {alone.name} {split.error(alone.at):.4f}"
+            )
+        notes.append(f"{own.name} has no part in the result: {why}")
+    return notes

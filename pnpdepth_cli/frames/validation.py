@@ -1,0 +1,109 @@
+"""Validation points: a fifth of a frame's points, which the method predicts from the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.folds import spatial_folds
+from pnpdepth_cli.completion.outliers import inlier_weights
+from pnpdepth_cli.frames.frame import Frame, ValidationPoints
+from pnpdepth_cli.frames.open_network import OpenNetwork
+from pnpdepth_cli.scan_pattern import scan_pattern
+
+FOLDS = 5
+"""One of so many folds of the points is for validation. By convention; not tuned."""
+MIN_POINTS = 5
+"""With fewer points none is for validation: a fold would have less than one."""
+MOST_VALIDATION_POINTS = 1000
+"""Of more validation points, so many at random are predicted. It bounds the time of a LiDAR's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidatedFrame(ValidationPoints):
+    """A frame with all its inliers, and without its validation points."""
+
+    whole: Frame
+    kept: Frame
+    has_scan_lines: bool
+    """Whether the points are those of a scanner."""
+    propagation: str
+    """How the residual at the points is propagated, a name in `choices.PROPAGATIONS`, or "none"."""
+
+    def gain(self, at: Tensor, other: Tensor) -> float:
+        """Returns by how many standard errors one prediction (M,) is better than another.
+
+        In log depth; negative where it is worse.
+        """
+        truth = log_of(self.points.depth)
+        share = self.weights / self.weights.sum()
+        gain = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
+        mean = (share * gain).sum()
+        error = (share.square() * (gain - mean).square()).sum().sqrt()
+        return float(mean / error.clamp_min(1e-12))
+
+
+def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
+    """Returns the frame with all its points, none of which is for validation.
+
+    Args:
+        frame: The frame without its outliers.
+        propagation: How the residual is propagated. None: "local" for scan lines, else "gp". On
+            even KITTI frames the MAE of "local" is 1.9 % and its RMSE 1.7 % below those of "gp".
+            With points at random pixels, "gp" is 0 to 28 % below "local".
+    """
+    points = frame.points
+    has_scan_lines = scan_pattern(points.xy, points.size) is not None
+    if propagation is None:
+        propagation = "local" if has_scan_lines else "gp"
+    none = points.select(slice(0))
+    return ValidatedFrame(
+        whole=frame,
+        kept=frame,
+        points=none,
+        weights=none.depth,
+        has_scan_lines=has_scan_lines,
+        propagation=propagation,
+    )
+
+
+def split_frame(
+    whole: ValidatedFrame, judged: Tensor, networks: Sequence[OpenNetwork], *, seed: int
+) -> ValidatedFrame:
+    """Returns the frame with and without its validation points.
+
+    A frame of few points has none, nor has one whose other points a network does not see.
+
+    Args:
+        whole: The frame with all its points.
+        judged: (H, W) metres, a prediction beside which neighbours should agree. Outliers among the
+            validation points would decide the weights.
+        networks: The networks that will predict.
+        seed: Random seed of the validation points.
+    """
+    points = whole.whole.points
+    if len(points) < MIN_POINTS:
+        return whole
+    chosen = spatial_folds(points, FOLDS, seed=seed) == 0
+    kept = replace(whole.whole, points=points.select(~chosen))
+    if not bool(chosen.any()) or not all(network.sees(kept) for network in networks):
+        return whole
+    # Of many validation points some are drawn; all of them are kept from the experts.
+    (numbers,) = chosen.nonzero(as_tuple=True)
+    drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
+    validation = points.select(numbers[drawn[:MOST_VALIDATION_POINTS]])
+    # Each counts as much as it is consistent with its neighbours.
+    at = validation.sample(judged)
+    residual = validation.depth.double().log() - at.clamp_min(1e-6).double().log()
+    weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
+    if not bool(weights.any()):
+        weights = torch.ones_like(weights)
+    return replace(whole, kept=kept, points=validation, weights=weights)
+
+
+def log_of(depth: Tensor) -> Tensor:
+    """Returns the logarithm of depth in metres; unknown depth is that of a micrometre."""
+    return depth.clamp_min(1e-6).log()

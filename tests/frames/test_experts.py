@@ -1,0 +1,106 @@
+"""The experts of a frame: whom to trust, the mirrored frame, the weighted mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.frames.experts import (
+    Experts,
+    NetworkExpert,
+    trust,
+    weighted_mean,
+    with_mirrored,
+)
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
+from pnpdepth_cli.frames.validation import MIN_POINTS
+from tests.frames.scenes import (
+    SIZE,
+    Brightness,
+    Nearest,
+    compact,
+    frame_in_memory,
+    member,
+    network_expert,
+    opened,
+    split_of,
+)
+
+
+@pytest.mark.parametrize(("known", "noise"), [(4, 0.1), (5, 0.1), (40, 0.18), (40, 0.3), (40, 9)])
+def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise: float) -> None:
+    frame, rng = frame_in_memory(60), np.random.default_rng(known)
+    pixels = tuple(frame.points.xy.long().numpy().T[::-1, :known])
+    y = frame.points.depth.double().log().numpy()[:known]
+    x = 0.3 * y + noise * 0.3 * rng.normal(size=known)
+    predicted = torch.zeros(SIZE, dtype=torch.float64)
+    predicted[pixels] = torch.from_numpy(x).exp()
+    one = replace(network_expert("net", torch.ones(60)), whole=SimpleNamespace(aligned=predicted))
+    split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
+    press = total = 0.0
+    for left_out in range(known):
+        rest = np.arange(known) != left_out
+        line = np.polyfit(x[rest], y[rest], 1)
+        press += (y[left_out] - np.polyval(line, x[left_out])) ** 2
+        total += (y[left_out] - y[rest].mean()) ** 2
+    rises = np.polyfit(x, y, 1)[0] > 0 and known >= MIN_POINTS
+    expected = np.clip((1 - press / total - 0.25) / 0.5, 0, 1) if rises else 0
+    alone = network_expert("compact", torch.ones(60))
+    assert trust(member(Brightness), one, split, alone) == pytest.approx(expected, abs=1e-6)
+
+
+def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation_points() -> None:
+    depth = torch.full((50,), 2.0)
+    split, alone = split_of(depth), network_expert("compact", depth + 0.1)
+    found = [
+        trust(member(Nearest), network_expert("own", depth + off), split, alone)
+        for off in (0.05, 0.1, 0.15, 0.2, 0.4)
+    ]
+    assert found == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-4)
+
+
+def seen_twice(frame: Frame, weight: float = 1.0) -> tuple[NetworkExpert, NetworkExpert]:
+    """An expert of `compact`, before and after it sees the mirrored frame, if it does."""
+    at = frame.points.depth[:0]
+    with opened(compact()) as networks:
+        whole = networks[0].refine(frame)
+        expert = NetworkExpert(
+            name="compact",
+            at=at,
+            updated=at,
+            points=frame.points,
+            whole=whole,
+            kept=whole,
+            frame=frame,
+        )
+        experts = Experts(own=expert, alone=None, every=[expert])
+        again = with_mirrored(networks[0], experts, {"compact": weight}).own
+    return expert, again
+
+
+def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() -> None:
+    frame = frame_in_memory(count=MIRRORED_BELOW - 1)
+    once, twice = seen_twice(frame)
+    turned, _ = seen_twice(frame.mirrored())
+    left, right = once.whole.updated.numpy(), turned.whole.updated.numpy()[:, ::-1]
+    assert np.abs(left - right).max() > 1e-3
+    np.testing.assert_allclose(twice.dense, np.sqrt(left * right), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("count", "weight"), [(MIRRORED_BELOW, 1.0), (20, 0.0)])
+def test_many_points_or_no_weight_show_an_expert_the_frame_alone(count: int, weight: float) -> None:
+    once, twice = seen_twice(frame_in_memory(count), weight)
+    assert twice is once
+
+
+def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
+    one, other = torch.tensor([[4.0, 0.0, 0.0], [1.0, 3.0, 0.0]])
+    mean = weighted_mean([(one, 0.25), (other, 0.75)])
+    assert torch.allclose(mean, torch.tensor([4.0**0.25, 3.0, 0.0]))
+    alone = torch.tensor([2.0, 3.0, 7.0, 0.0])
+    assert torch.equal(weighted_mean([(alone, 0.3), (alone + 1, 0.0)]), alone)

@@ -1,0 +1,123 @@
+"""A method chooses the steps, and a setting tunes one of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.frames.frame import Refined
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.settings import Settings
+from tests.frames.scenes import Brightness, Nearest, depth_of_scene, frame_in_memory, member
+
+ONE_SETTING: tuple[dict[str, Any], ...] = (
+    {"iterations": 1},
+    {"iterations": 20},
+    {"lr": "2%"},
+    {"lr": 0.02},
+    {"loss": "l2"},
+    {"loss": "cauchy"},
+    {"update": "sgd"},
+    {"update": "adam"},
+    {"layer": "layer"},
+    {"align": "affine"},
+    {"propagate": "local"},
+)
+
+
+def refined(
+    network: type[Brightness] | type[Nearest],
+    count: int = 60,
+    *,
+    uncertainty: bool = False,
+    **asked: Any,
+) -> Refined:
+    """The scene, refined with these settings."""
+    frame = frame_in_memory(count)
+    networks = [member(network).network]
+    asked_for = Settings(**asked)
+    with Method(networks, asked_for, frame, uncertainty=uncertainty) as method:
+        return method.refine(frame, with_stages=True)
+
+
+@pytest.mark.parametrize("method", ["fused", "alone"])
+@pytest.mark.parametrize("setting", ONE_SETTING, ids=str)
+def test_a_setting_tunes_its_step_and_leaves_all_others(
+    method: str, setting: dict[str, Any]
+) -> None:
+    plain = refined(Brightness, method=method)
+    tuned = refined(Brightness, method=method, **setting)
+    assert tuned.stages.keys() == plain.stages.keys()
+    assert tuned.weights.keys() == plain.weights.keys()
+    assert tuned.alignment is not None
+    assert tuned.propagation == setting.get("propagate", "gp")
+    errors = [np.abs(each.depth - depth_of_scene().numpy()).mean() for each in (plain, tuned)]
+    assert errors[1] < 1.15 * errors[0] + 0.002
+
+
+def test_a_step_that_is_switched_off_is_the_only_one_left_out() -> None:
+    plain = refined(Brightness)
+    of_z = refined(Brightness, iterations=0)
+    assert plain.stages.keys() - of_z.stages.keys() == {"updated"}
+    residual = refined(Brightness, propagate="none")
+    assert plain.stages.keys() - residual.stages.keys() == {"propagated"}
+    assert residual.propagation == "none"
+    assert residual.alignment is not None
+    aligned = refined(Brightness, align="none")
+    assert aligned.alignment is None
+    assert aligned.stages.keys() == plain.stages.keys()
+
+
+def test_the_papers_method_is_tuned_too_and_gains_a_step_that_is_asked_for() -> None:
+    paper = refined(Brightness, method="paper")
+    assert [len(paper.losses), paper.propagation, paper.alignment] == [6, "none", None]
+    assert paper.validation is None
+    assert paper.weights == {"brightness": 1.0}
+    assert len(refined(Brightness, method="paper", iterations=9).losses) == 10
+    assert refined(Brightness, method="paper", align="affine").alignment is not None
+    assert refined(Brightness, method="paper", propagate="gp").propagation == "gp"
+
+
+def test_a_setting_that_nothing_uses_is_said() -> None:
+    def unused(refined: Refined) -> list[str]:
+        return [note for note in refined.notes if "not used" in note]
+
+    (note,) = unused(refined(Nearest, lr="3%", loss="l2"))
+    assert note.startswith("`lr`, `loss`:")
+    assert unused(refined(Nearest, lr="3%", iterations=2)) == []
+    assert unused(refined(Brightness, lr="3%")) == []
+
+
+@pytest.mark.parametrize("count", [20, 100, 500])
+@pytest.mark.parametrize("method", ["fused", "alone"])
+def test_no_residual_field_is_made_twice(
+    count: int, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Counter[tuple[bytes, bytes, bytes]]()
+    build = ResidualField.__init__
+
+    def counted(field: ResidualField, prediction: Any, points: Any, rgb: Any) -> None:
+        arrays = (prediction, points.xy, points.depth)
+        made[tuple(array.numpy().tobytes() for array in arrays)] += 1  # type: ignore[index]
+        build(field, prediction, points, rgb)
+
+    monkeypatch.setattr(ResidualField, "__init__", counted)
+    refined(Brightness, count, method=method, uncertainty=True)
+    assert made
+    assert max(made.values()) == 1
+
+
+def test_the_shipped_network_is_updated_where_the_user_says_so() -> None:
+    frame = frame_in_memory(60)
+    losses = []
+    for asked in (Settings(), Settings(iterations=3), Settings(iterations=3, method="alone")):
+        torch.manual_seed(0)
+        with Method([load_network("compact", None)], asked, frame) as method:
+            losses.append(len(method.refine(frame).losses))
+    assert losses == [1, 4, 4]  # of few points it gains nothing, so that it is not by default

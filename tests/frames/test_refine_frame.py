@@ -1,0 +1,205 @@
+"""One frame refined by every method: its steps, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.frames.experts import weighted_mean
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.fuse import OWN_SCANNER
+from pnpdepth_cli.frames.open_network import OpenNetwork
+from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame, without_outliers
+from pnpdepth_cli.frames.validation import MIN_POINTS
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import ClosedSettings
+from tests.frames.scenes import (
+    SIZE,
+    Brightness,
+    Nearest,
+    compact,
+    depth_of_scene,
+    frame_in_memory,
+    member,
+    opened,
+)
+
+UPDATES = ClosedSettings(iterations=3, lr="5%", update="sign", align="scale")
+ALIGNED = ClosedSettings(iterations=0, align="affine")
+
+
+class Exact(Nearest):
+    """The scene's own depth."""
+
+    def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        return self.layer(depth_of_scene()[None, None] + 0 * sparse)
+
+
+class Noise(Brightness):
+    """Depth that has nothing to do with the image."""
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        random = torch.rand(1, 1, *rgb.shape[2:], generator=torch.Generator().manual_seed(4))
+        return self.layer(1 + random)
+
+
+def refined(frame: Frame, *members: OpenNetwork, **options: Any) -> Refined:
+    """The frame by the default method with these networks."""
+    with opened(*members) as networks:
+        return refine_frame(networks, frame, Pipeline(), **options)
+
+
+def scan_frame() -> Frame:
+    """The scene with a scanner's lines."""
+    y, x = np.mgrid[2 : SIZE[0] : 8, 0 : SIZE[1] : 2]
+    xy = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32))
+    every = SparsePoints(xy=xy, depth=torch.ones(len(xy)), size=SIZE)
+    points = replace(every, depth=every.sample(depth_of_scene()))
+    return replace(frame_in_memory(), points=points)
+
+
+@pytest.mark.parametrize(("of_scanner", "kind"), [(False, "gp"), (True, "local")])
+def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kind: str) -> None:
+    frame, gt = scan_frame() if of_scanner else frame_in_memory(60), depth_of_scene().numpy()
+    result = refined(frame, member(Brightness, settings=UPDATES), with_stages=True)
+    assert list(result.stages) == ["before", "updated", "propagated"]
+    updated = torch.from_numpy(result.stages["updated"])
+    expected = ResidualField(updated, result.used, frame.rgb).depth(kind=kind)
+    assert np.allclose(result.depth, expected.numpy(), rtol=1e-5)
+    assert np.array_equal(result.depth, result.stages["propagated"])
+    assert np.array_equal(result.before, result.stages["before"])
+    assert result.weights == {"brightness": 1.0}
+    errors = [np.abs(depth - gt).mean() for depth in result.stages.values()]
+    assert errors[-1] < errors[0]
+
+
+def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None:
+    frame, own = frame_in_memory(60), member(Brightness, settings=ALIGNED)
+    result = refined(frame, own, compact())
+    assert sum(result.weights.values()) == pytest.approx(1)
+    assert list(result.weights) == ["brightness", "compact with brightness", "compact", "linear"]
+    with opened(own, compact()) as networks:
+        of_own = networks[0].refine(frame)
+        prior = replace(frame, prior=of_own.aligned)
+        once = [networks[1].refine(each).updated for each in (prior, frame)]
+        networks[1].next_image()
+        turned = [networks[1].refine(each.mirrored()).updated.flip(-1) for each in (prior, frame)]
+    both = [(a * b).sqrt() for a, b in zip(once, turned, strict=True)]
+    depths = [of_own.updated, *both, linear(frame.points)]
+    fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
+    expected = ResidualField(fused, frame.points, frame.rgb).depth()
+    assert np.allclose(result.depth, expected.numpy(), rtol=1e-4)
+
+
+def test_a_useless_network_has_no_part_which_is_said() -> None:
+    frame = frame_in_memory(100)
+    useless = refined(frame, member(Noise, settings=ALIGNED), compact())
+    alone = refined(frame, compact())
+    assert useless.weights["noise"] < 0.01
+    assert np.allclose(useless.depth, alone.depth, rtol=1e-4)
+    (note,) = [note for note in useless.notes if note.startswith("noise has no part")]
+    checked = useless.validation
+    for stage in ("propagated", "alone"):
+        off = (checked.predicted[stage] - checked.points.depth).abs().numpy()
+        assert f"{np.average(off, weights=checked.weights.numpy()):.4f}" in note
+    assert not [note for note in alone.notes if "no part" in note]
+
+
+def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None:
+    frame = frame_in_memory(60)
+    members = (member(Brightness, settings=ALIGNED), compact())
+    first = refined(frame, *members).validation
+    held = (frame.points.xy[:, None] == first.points.xy[None]).all(dim=2).any(dim=1)
+    numbers = held.nonzero(as_tuple=True)[0]
+    changed = frame.points.depth.clone()
+    changed[numbers[0]] *= 1.01
+    other = replace(frame, points=replace(frame.points, depth=changed))
+    again = refined(other, *members).validation
+    assert torch.equal(again.points.xy, first.points.xy)
+    one = (again.points.xy == frame.points.xy[numbers[0]]).all(dim=1)
+    for name in ("before", "propagated", "alone", "linear", "after"):
+        assert torch.allclose(again.predicted[name][one], first.predicted[name][one], rtol=1e-3)
+
+
+def test_an_image_of_another_scene_is_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
+    frame = frame_in_memory(400)
+    stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
+    right, wrong = refined(frame, compact()), refined(replace(frame, rgb=stripes), compact())
+    assert not any(note.startswith("warning: the image") for note in right.notes)
+    (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
+    assert "80 validation points" in note
+    assert "compact without the image" in wrong.weights
+    assert "alone" not in wrong.validation.predicted  # there is nothing but compact
+    stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
+    assert "compact without the image" not in stated.weights
+    assert not any(note.startswith("warning: the image") for note in stated.notes)
+
+
+def test_a_completion_network_of_the_scanner_has_most_of_the_result() -> None:
+    frame = scan_frame()
+    poor, good = (refined(frame, member(each), compact()) for each in (Nearest, Exact))
+    assert poor.weights["nearest"] == 0
+    assert good.weights["exact"] == pytest.approx(OWN_SCANNER)
+    assert sum(good.weights.values()) == pytest.approx(1)
+    assert np.abs(good.depth - depth_of_scene().numpy()).max() < 0.25
+
+
+def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> None:
+    result = refined(frame_in_memory(4), member(Brightness), member(Nearest))
+    assert result.weights == {"brightness": 0.5, "nearest": 0.5}
+
+
+@pytest.mark.parametrize("weighs", [True, False])
+def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: bool) -> None:
+    frame, generator = frame_in_memory(100), torch.Generator().manual_seed(0)
+    noise = 0.26 * torch.rand(SIZE, generator=generator) - 0.13
+    frame = replace(frame, rgb=(depth_of_scene() * noise.exp() - 1).expand(3, -1, -1))
+    track = (frame.points.xy - 60).norm(dim=1) < 20  # points that agree with each other
+    wrong = replace(frame.points, depth=torch.where(track, 1.5, 1.0) * frame.points.depth)
+    blind = member(Brightness, weighs_points=weighs)  # sees the image alone
+    result = refined(replace(frame, points=wrong), blind)
+    assert int(track.sum()) > 5
+    assert torch.equal(result.used.xy, wrong.select(~(track & weighs)).xy)
+    assert any("outliers: " in note for note in result.notes) == weighs
+
+
+@pytest.mark.parametrize("count", [1, MIN_POINTS - 1, MIN_POINTS, 7])
+@pytest.mark.parametrize("positions", [1, 2, 3, 7])
+def test_few_points_at_few_positions_are_enough(count: int, positions: int) -> None:
+    frame = frame_in_memory(count)
+    at = torch.arange(count) % positions
+    close = frame.points.xy[at] + 0.01 * torch.arange(count)[:, None]
+    points = replace(frame.points, xy=close, depth=frame.points.depth[at])
+    result = refined(replace(frame, points=points), member(Brightness))
+    assert (result.validation is None) == (count < MIN_POINTS)
+    off = (torch.from_numpy(result.depth) / depth_of_scene()).log().abs()
+    assert float(off.mean()) < 0.5
+
+
+def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> None:
+    frames = [frame_in_memory(60), frame_in_memory(60, seed=2)]
+    with opened(member(Brightness, settings=UPDATES), compact()) as networks:
+        first, _, again = (refine_frame(networks, frames[n], Pipeline()) for n in (0, 1, 0))
+    assert np.array_equal(first.depth, again.depth)
+    assert np.array_equal(first.depth, refined(frames[0], *networks).depth)
+
+
+def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
+    frame, bad = frame_in_memory(60), torch.arange(60) % 5 == 0
+    depth = torch.where(bad, 2.5, 1.0) * frame.points.depth
+    with member(Brightness) as judge:
+        clean = without_outliers(judge, frame).inliers
+        frame = replace(frame, points=replace(frame.points, depth=depth))
+        inliers = without_outliers(judge, frame).inliers
+    assert torch.equal(inliers.outliers.xy, frame.points.xy[bad])
+    assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
+    assert clean.outliers is None
+    assert len(clean.points) == 60

@@ -1,0 +1,39 @@
+"""Validation points, and by how much one prediction of them is better than another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pnpdepth_cli.frames.validation import FOLDS, split_frame, whole_frame
+from tests.frames.scenes import depth_of_scene, frame_in_memory, split_of
+
+
+def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
+    rng = np.random.default_rng(0)
+    (truth, at, other), shares = rng.uniform(1, 4, (3, 50)), rng.uniform(size=50)
+    split = replace(split_of(torch.from_numpy(truth)), weights=torch.from_numpy(shares))
+    gains = np.abs(np.log(other / truth)) - np.abs(np.log(at / truth))
+    mean = np.average(gains, weights=shares)
+    error = np.sqrt((shares**2 * (gains - mean) ** 2).sum()) / shares.sum()
+    found = split.gain(torch.from_numpy(at), torch.from_numpy(other))
+    assert found == pytest.approx(mean / error)
+
+
+@pytest.mark.parametrize("count", [60, 5500])
+def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> None:
+    frame, judged = frame_in_memory(count), depth_of_scene()
+    judged[:, 100:] = 0
+    split = split_frame(whole_frame(frame, None), judged, [], seed=0)
+    kept, held, whole = (
+        {tuple(xy) for xy in points.xy.tolist()}
+        for points in (split.kept.points, split.points, frame.points)
+    )
+    assert len(kept) == count - count // FOLDS
+    assert len(held) == min(count // FOLDS, 1000)
+    assert kept | held <= whole
+    assert not kept & held
+    assert torch.equal(split.weights != 0, split.points.xy[:, 0] < 100)  # where a depth is known
