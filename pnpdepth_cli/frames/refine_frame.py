@@ -98,15 +98,20 @@ def refine_frame(
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.aligned, inliers.points))
     # The residual at the inliers is propagated to every pixel.
-    if field is None or not field.is_of(fused, inliers.points):
-        field = ResidualField(fused, inliers.points, inliers.rgb)
-    depth = propagated = field.depth(kind=split.propagation)
+    depth = propagated = _propagated(fused, inliers, split, field)
     # On scan lines, a completion network of that scanner has most of the result.
     shares = scanner_shares(experts.every, split, weights) if pipeline.fuses else {}
     if shares:
         dense = {expert.name: expert.dense for expert in experts.every}
         depth = _with_shares(propagated, dense, shares)
-    steps = Steps(fused=fused, propagated=propagated, depth=depth, weights=weights, shares=shares)
+    steps = Steps(
+        judged=field,
+        fused=fused,
+        propagated=propagated,
+        depth=depth,
+        weights=weights,
+        shares=shares,
+    )
     result = _refined(frame, inliers, experts, split, steps, pipeline)
     if with_stages:
         stages = _stages(experts, inliers, split, steps)
@@ -117,6 +122,7 @@ def refine_frame(
 class Steps(NamedTuple):
     """What the steps of one frame gave."""
 
+    judged: ResidualField | None  # that told the outliers. None: none did
     fused: Tensor  # (H, W) metres
     propagated: Tensor  # (H, W) metres, its residual propagated
     depth: Tensor  # (H, W) metres, with the shares of completion networks of the scanner
@@ -167,9 +173,21 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
     return Judged(inliers, judged, field)
 
 
-def _propagated(depth: Tensor, frame: Frame, split: ValidatedFrame) -> Tensor:
-    """Depth (H, W) with its residual at the points propagated."""
-    return ResidualField(depth, frame.points, frame.rgb).depth(kind=split.propagation)
+def _propagated(
+    depth: Tensor, frame: Frame, split: ValidatedFrame, known: ResidualField | None
+) -> Tensor:
+    """Depth (H, W) with its residual at the points propagated.
+
+    Args:
+        depth: (H, W) metres.
+        frame: The frame without its outliers.
+        split: How the residual is propagated.
+        known: A field of the frame, which may be that of this depth.
+    """
+    field = known
+    if field is None or not field.is_of(depth, frame.points):
+        field = ResidualField(depth, frame.points, frame.rgb)
+    return field.depth(kind=split.propagation)
 
 
 def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, float]) -> Tensor:
@@ -229,7 +247,9 @@ def _stages(
 
     def propagated(dense: Tensor) -> Tensor:
         """Depth (H, W) with its residual propagated; that of the result is known."""
-        return steps.propagated if dense is steps.fused else _propagated(dense, frame, split)
+        if dense is steps.fused:
+            return steps.propagated
+        return _propagated(dense, frame, split, steps.judged)
 
     own = experts.own
     stages = {BEFORE: own.whole.aligned}
