@@ -204,7 +204,7 @@ def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> dict[str, tu
     seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
     gt = torch.where(seen, gt, 0.0)
     scores = {name: score(depth, gt) for name, depth in depths.items()}
-    return {name: (s.mae, s.rmse) for name, s in scores.items()}
+    return {name: (s["mae"], s["rmse"]) for name, s in scores.items()}
 
 
 def table_row(*cells: object, head: bool = False) -> str:

@@ -100,7 +100,7 @@ def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
     for depth, truth in frames():
         measures = by_depth(MEASURES, 3.0, 12.0)
         tensors = (torch.from_numpy(each.copy()) for each in (depth, truth))
-        found = list(score(*tensors, measures).values.values())
+        found = list(score(*tensors, measures).values())
         parts = (truth < 3, (truth >= 3) & (truth < 12), truth >= 12)
         expected = [brute(depth, np.where(part, truth, 0))[key] for part in parts for key in MAIN]
         assert found == pytest.approx(expected, abs=1e-9, nan_ok=True)

@@ -110,4 +110,4 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
         assert (done.returncode, message in done.stderr) == (exit_code, True), done.stderr
         assert Path(done.stdout.splitlines()[0]).is_relative_to(installed)
     files = (empty / "out/rgb_depth.png", sample / "gt.png")
-    assert pnp.score(*(read_depth(path).values for path in files)).mae < 0.2
+    assert pnp.score(*(read_depth(path).values for path in files))["mae"] < 0.2

@@ -65,7 +65,7 @@ def test_arrays_are_refined_like_files(network: pnp.Network, frame: Frame, tmp_p
     assert run(["refine", *files, "-o", str(tmp_path / "depth.npy")]) == 0
     assert np.array_equal(refined.depth, np.load(tmp_path / "depth.npy"))
     truth = read_depth(SAMPLE / "gt.png").values[PART]
-    assert pnp.score(refined.depth, truth).mae < pnp.score(refined.before, truth).mae
+    assert pnp.score(refined.depth, truth)["mae"] < pnp.score(refined.before, truth)["mae"]
 
 
 def test_a_refiner_takes_maps_rows_and_points_alike(network: pnp.Network, frame: Frame) -> None:
@@ -108,7 +108,7 @@ def test_integers_are_scaled_by_their_type_or_unit(network: pnp.Network, frame: 
     rows = np.column_stack([np.argwhere(codes)[:, ::-1], codes[codes > 0]])
     assert np.array_equal(pnp.refine(network, image, rows, settings, unit="mm").depth, expected)
     truth = np.full((2, 2), 1500, np.int32)
-    assert pnp.score(np.full((2, 2), 1.25), truth, unit="mm").mae == 0.25
+    assert pnp.score(np.full((2, 2), 1.25), truth, unit="mm")["mae"] == 0.25
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -12,29 +12,32 @@ from pnpdepth_cli.measures import MEASURES, Measure
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scores:
+class Scores(Mapping[str, float]):
     """Errors of a prediction over the pixels with known ground truth and valid prediction.
 
-    Each measure of `pnpdepth_cli.measures.MEASURES` is an attribute, such as `scores.rmse`.
+    A mapping from the keys of `pnpdepth_cli.measures.MEASURES`, such as `scores["rmse"]`.
     """
 
-    values: Mapping[str, float]
+    values_by_key: Mapping[str, float]
     """The measures by key; NaN where no pixel is scored."""
     pixels: int
     """Number of scored pixels."""
     coverage: float
     """Scored pixels over pixels with known ground truth."""
 
-    def __getattr__(self, key: str) -> float:
+    def __getitem__(self, key: str) -> float:
         """Returns the measure with this key."""
-        values: Mapping[str, float] = self.__dict__.get("values", {})
-        if key not in values:
-            raise AttributeError(f"there is no measure {key!r}")
-        return values[key]
+        return self.values_by_key[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_by_key)
+
+    def __len__(self) -> int:
+        return len(self.values_by_key)
 
     def to_json(self) -> dict[str, int | float | None]:
         """Returns the measures, the number of pixels and the coverage by their names."""
-        return {**self.values, "pixels": self.pixels, "coverage": self.coverage}
+        return {**self, "pixels": self.pixels, "coverage": self.coverage}
 
 
 def score(
@@ -51,7 +54,11 @@ def score(
     scored = known & predicted.isfinite() & (predicted > 0)
     p, g = predicted[scored].double(), ground_truth[scored].double()
     return Scores(
-        values={each.key: float(each.of_pixels(p, g)) for each in measures if each.of_pixels},
+        values_by_key={
+            measure.key: float(measure.of_pixels(p, g))
+            for measure in measures
+            if measure.of_pixels is not None
+        },
         pixels=len(g),
         coverage=len(g) / int(known.sum()) if known.any() else math.nan,
     )

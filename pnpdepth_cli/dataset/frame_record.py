@@ -169,7 +169,7 @@ class FrameRecord:
     settings: dict[str, str | int | float | None] = field(default_factory=dict)
     """The settings of the user's network, with nothing left open."""
     weights: dict[str, float] = field(default_factory=dict)
-    """Weights of the experts of the default method, by name."""
+    """Weights of the experts in the result, by name."""
     registration: dict[str, float] | None = None
     """How the image was moved to the points. None: it was not."""
     alignment: dict[str, str | int | float | list[float] | None] | None = None

@@ -60,7 +60,7 @@ class Refiner:
             The values are for the first network, if there are several.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         registration: Whether images are moved to their points: "auto", if their depth edges show
-        that they are not registered; "off"; or by (zoom, right, down), pixels.
+            that they are not registered; "off"; or by (zoom, right, down), pixels.
         adapt: Frames of the same sequence, (image, sparse) each. Before the first frame is refined,
             the weights of `network`, which must take points, learn from them. The new weights are
             used while the refiner is open, if points hidden from its input show that they are

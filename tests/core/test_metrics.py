@@ -52,7 +52,7 @@ def test_scores_are_those_of_plain_numpy(pairs: list[tuple[float, float]]) -> No
 def test_nothing_to_score_is_not_a_number() -> None:
     scores = score(torch.zeros(2, 2), torch.zeros(2, 2))
     assert scores.pixels == 0
-    assert isnan(scores.rmse)
+    assert isnan(scores["rmse"])
     assert isnan(scores.coverage)
     assert score(torch.zeros(2), torch.ones(2)).coverage == 0
 
@@ -60,7 +60,7 @@ def test_nothing_to_score_is_not_a_number() -> None:
 def test_every_measure_is_a_score_with_a_unit() -> None:
     scores = score(torch.ones(2), torch.ones(2))
     assert [*scores.to_json()] == [*(m.key for m in MEASURES), "pixels", "coverage"]
-    assert scores.delta3 == 1
+    assert scores["delta3"] == 1
     with pytest.raises(AttributeError):
         _ = scores.delta4
     assert pickle.loads(pickle.dumps(scores)) == scores
@@ -73,4 +73,4 @@ def test_every_measure_is_a_score_with_a_unit() -> None:
 def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
     predicted, gt = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
     scores = score(predicted, gt, with_thresholds([1.01, 1.01**2, 1.01**3]))
-    assert (scores.delta1, scores.delta2, scores.delta3) == (0.25, 0.5, 0.75)
+    assert (scores["delta1"], scores["delta2"], scores["delta3"]) == (0.25, 0.5, 0.75)

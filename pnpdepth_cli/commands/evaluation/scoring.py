@@ -129,7 +129,7 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     """The measures of depth (H, W) against the scored ground truth."""
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}
-    of_pixels = score(torch.from_numpy(depth), torch.from_numpy(truth), request.measures).values
+    of_pixels = score(torch.from_numpy(depth), torch.from_numpy(truth), request.measures)
     of_images = {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
     return {**of_pixels, **of_images}
 
