@@ -6,6 +6,7 @@ A network's definition, the command line, the Python API and the records have th
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, asdict, dataclass, field, fields, replace
@@ -94,6 +95,16 @@ class Settings:
     seed: int = option(
         0, "Random seed.", metavar="N", least=0, most=LARGEST_SEED, show_default=True
     )
+
+    def __new__(cls, *_: object, **values: object) -> Settings:
+        known = [each.name for each in fields(cls)]
+        for name in values.keys() - {*known}:
+            likely = difflib.get_close_matches(name, known, n=1)
+            meant = (
+                f"; did you mean {likely[0]!r}?" if likely else f"; there are {', '.join(known)}"
+            )
+            raise UsageError(f"there is no setting {name!r}{meant}")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name, value in self.given().items():

@@ -98,6 +98,46 @@ def test_threads_share_one_refiner_but_two_no_network(network: pnp.Network, fram
     )
 
 
+def test_a_closed_refiner_refines_nothing_and_its_network_is_free(
+    network: pnp.Network, frame: Frame
+) -> None:
+    with pnp.Refiner(network) as refiner:
+        refiner.refine(*frame)
+    with pytest.raises(pnp.UsageError, match="closed"):
+        refiner.refine(*frame)
+    assert pnp.refine(network, *frame).depth.shape == frame[1].shape
+
+
+def test_the_depth_after_each_step_is_returned_if_it_is_asked_for(frame: Frame) -> None:
+    network = pnp.load_network("fcrn-tiny")
+    assert pnp.refine(network, *frame).stages == {}
+    stages = pnp.refine(network, *frame, stages=True).stages
+    assert [*stages] == ["before", "updated", "propagated", "alone"]
+
+
+def test_a_network_that_takes_intrinsics_is_given_the_camera(frame: Frame) -> None:
+    class OfCamera(nn.Module):
+        def forward(self, rgb: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:
+            return rgb.mean(1, keepdim=True) + camera[0, 0, 0] / 100
+
+    module = OfCamera()
+    definition = pnp.ModelDefinition(
+        name="of-camera",
+        input_kind="rgb",
+        size=pnp.Multiple(1),
+        takes_intrinsics=True,
+        layers=("",),
+        build=lambda: module,
+    )
+    network = pnp.load_network(module, definition=definition)
+    settings = pnp.Settings(method="paper", iterations=0, layer="")
+    intrinsics = np.array([[150.0, 0, 80], [0, 150, 64], [0, 0, 1]])
+    with pytest.raises(pnp.UsageError, match="intrinsics"):
+        pnp.refine(network, *frame, settings)
+    refined = pnp.refine(network, *frame, settings, camera=intrinsics)
+    assert refined.depth == pytest.approx(frame[0].mean(axis=2) + 1.5, abs=1e-5)
+
+
 def test_integers_are_scaled_by_their_type_or_unit(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     settings = pnp.Settings(iterations=0, align="scale")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -46,6 +48,14 @@ def test_settings_that_only_updates_use_are_those_of_equation_3() -> None:
     assert Settings().of_updates == Settings(seed=3, align="auto", propagate="gp").of_updates == []
     asked = Settings(method="paper", lr="3%", layer="0.5", iterations=2)
     assert asked.of_updates == ["layer", "iterations", "lr"]
+
+
+def test_a_setting_that_does_not_exist_is_refused_with_the_likely_one() -> None:
+    with pytest.raises(UsageError, match="did you mean 'iterations'"):
+        Settings(iteration=3)
+    with pytest.raises(UsageError, match="there are method, layer"):
+        Settings(x=3)
+    assert copy.copy(Settings(lr="3%")) == pickle.loads(pickle.dumps(Settings(lr="3%")))
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,8 @@ class Refined:
     step: float
     """Step size of the updates as a number."""
     diverged: DivergedError | None
-    """Why the updates of z stopped early. None if they did not."""
+    """Why the updates of z stopped early. None if they did not. `refine` raises it, with this frame
+    as its `last_good`."""
     alignment: Alignment | None = None
     """Alignment of the network's output with the points. None where the output is in metres."""
     propagation: str

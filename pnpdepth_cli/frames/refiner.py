@@ -90,6 +90,8 @@ class Refiner:
         self._register = registration_to_make(registration, self._asked)
         self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
         self._method: Method | None = None
+        self._is_closed = False
+        self._moved: dict[tuple[int, int], set[str]] = {}  # how images were moved, by their size
         self._stack = ExitStack()
         self._lock = threading.Lock()
         check_combination(self._asked, len(self._networks))
@@ -104,7 +106,8 @@ class Refiner:
         return f"Refiner({', '.join(map(repr, self._networks))})"
 
     def close(self) -> None:
-        """Restores the networks."""
+        """Restores the networks. No frame can be refined afterwards."""
+        self._is_closed = True
         self._method = None
         self._stack.close()
 
@@ -132,13 +135,21 @@ class Refiner:
 
         Raises:
             InputError: Image, points or camera cannot be used.
-            DivergedError: The loss became non-finite; `last_good` is the Refined before that.
+            DivergedError: The loss became non-finite. Its `last_good` is the Refined of the updates
+                before that, whose `diverged` is this error's message.
+            UsageError: The refiner is closed.
         """
         frame = frame_of_arrays(image, sparse, self._register, unit, camera)
         with self._lock:
             method = self._method_for(frame)
             refined = method.refine(frame, with_stages=stages)
-        refined = replace(refined, notes=(*method.own.network.notes, *frame.notes, *refined.notes))
+        notes = [*method.own.network.notes, *frame.notes, *refined.notes]
+        if self._register == "auto" and self._differs(frame, refined):
+            notes.append(
+                "note: images of this size were moved to their points in different ways;"
+                " `share_registration` decides once for a sequence"
+            )
+        refined = replace(refined, notes=tuple(notes))
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
@@ -159,8 +170,18 @@ class Refiner:
             with self._lock:
                 self._method_for(read[0]).share_registration(read)
 
+    def _differs(self, frame: Frame, refined: Refined) -> bool:
+        """Whether this image was moved otherwise than the earlier ones of its size."""
+        if frame.image is None:
+            return False
+        moved = self._moved.setdefault(frame.size, set())
+        moved.add(str(refined.registration))
+        return len(moved) > 1
+
     def _method_for(self, first: Frame) -> Method:
         """The method, which this frame decides if it is the first."""
+        if self._is_closed:
+            raise UsageError("this Refiner is closed; make another one, or stay inside its `with`")
         if self._method is None:
             with ExitStack() as opening:
                 opening.enter_context(_opened([each.module for each in self._networks]))
