@@ -97,13 +97,13 @@ class Settings:
     )
 
     def __new__(cls, *_: object, **values: object) -> Settings:
-        known = [each.name for each in fields(cls)]
+        """Raises UsageError for a name that is no setting, with the likely one."""
+        known = [setting.name for setting in fields(cls)]
         for name in values.keys() - {*known}:
             likely = difflib.get_close_matches(name, known, n=1)
-            meant = (
-                f"; did you mean {likely[0]!r}?" if likely else f"; there are {', '.join(known)}"
-            )
-            raise UsageError(f"there is no setting {name!r}{meant}")
+            if likely:
+                raise UsageError(f"there is no setting {name!r}; did you mean {likely[0]!r}?")
+            raise UsageError(f"there is no setting {name!r}; there are {', '.join(known)}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
