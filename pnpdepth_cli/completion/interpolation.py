@@ -94,12 +94,8 @@ class Triangulation:
 
     @functools.cached_property
     def _triangles(self) -> Numbers:
-        """(T, 3) numbers of the points at the corners of all triangles outside squares."""
-        triangles = self._rim[delaunay(self._xy[self._rim])]
-        if self._grid is None:
-            return triangles
-        inside, _, _ = self._grid.squares(self._xy[triangles].mean(axis=1))
-        return triangles[~inside]
+        """(T, 3) numbers of the points at the corners; in squares they are of no account."""
+        return self._rim[delaunay(self._xy[self._rim])]
 
     def _triangles_at(self, xy: Floats) -> Numbers:
         """Those of the same triangles that hold any of the positions (M, 2)."""
