@@ -28,7 +28,8 @@ class InlierWeights(nn.Module):
     """A weight 0..1 for every point from its agreement with the points around it.
 
     A small graph network: every point has a state, and `Messages` of its nearest neighbours and
-    the mean state of the image update it. A message depends on the differences of the two log
+    the mean state of the image update it. A point of dense ones has the weight of the point that
+    stands for it (`cloud.thinned`). A message depends on the differences of the two log
     depths and of the two colours and on where the neighbour is.
     """
 
@@ -44,7 +45,8 @@ class InlierWeights(nn.Module):
     def forward(self, points: Points, cloud: Cloud) -> Tensor:
         """The weights (B, 1, H, W), 1 away from the points; the cloud is of these points."""
         with torch.autocast(points.mask.device.type, enabled=False):
-            images = torch.split(self.log_odds(cloud), list(cloud.counts))
+            log_odds = self.log_odds(cloud)[cloud.stand_in]
+        images = torch.split(log_odds, list(cloud.of_images))
         log_odds = torch.cat([logits + self._margin(logits) for logits in images])
         weights = torch.sigmoid(STEEPNESS * (log_odds - THRESHOLD))
         return torch.ones_like(points.mask).masked_scatter(points.mask > 0, weights)
@@ -90,8 +92,14 @@ class Messages(nn.Module):
         parts = zip(chunks(cloud), pairs, strict=True)
         messages = [self._received(sent, cloud, some, part) for some, part in parts]
         received = torch.cat(messages) if messages else state.new_zeros((0, 2 * WIDTH))
-        each = torch.split(state, list(cloud.counts))
-        images = [states.mean(0, keepdim=True).expand_as(states) for states in each]
+        images = [
+            states[sends].mean(0, keepdim=True).expand_as(states)
+            for states, sends in zip(
+                torch.split(state, list(cloud.counts)),
+                torch.split(cloud.sends, list(cloud.counts)),
+                strict=True,
+            )
+        ]
         hidden = self.update(torch.cat([state, received, torch.cat(images)], 1))
         return state + cast(Tensor, self.change(F.relu(hidden)))
 

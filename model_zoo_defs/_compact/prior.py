@@ -65,21 +65,22 @@ class Prior:
 def explains(residual: Tensor, known: Tensor, points: Points, cloud: Cloud) -> Tensor:
     """Whether a prior lowers the leave-one-out error at the points, 0 or 1 (B, 1, 1, 1).
 
-    Every point is predicted from its neighbours, as their mean with weights of 1 / squared distance
-    times inlier weight: once its log depth, once its residual against the prior. 1 for an image
-    without two neighbouring points.
+    Every point that sends messages is predicted from its neighbours, as their mean with weights of
+    1 / squared distance times inlier weight: once its log depth, once its residual against the
+    prior. 1 for an image without two neighbouring points.
 
     Args:
-        residual: Log depth of the points minus that of the prior (n,).
-        known: Whether the prior is known there (n,).
+        residual: Log depth of the N points minus that of the prior (N,).
+        known: Whether the prior is known there (N,).
         points: The points.
         cloud: The same points with their neighbours.
     """
-    weight, near = points.at(points.weight), cloud.near
+    weight, near = points.at(points.weight)[cloud.chosen], cloud.near
+    residual, known = residual[cloud.chosen], known[cloud.chosen]
     square = (cloud.position[near] - cloud.position.unsqueeze(1)).square().sum(2)
     share = cloud.found * known[near] * weight[near] / (square + 0.1)
     share = share / share.sum(1, keepdim=True).clamp(min=1e-6)
-    predicted = known * share.sum(1) * weight
+    predicted = cloud.sends * known * share.sum(1) * weight
 
     def error(value: Tensor) -> Tensor:
         per_point = predicted * (value - (share * value[near]).sum(1)).abs()

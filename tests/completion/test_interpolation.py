@@ -1,18 +1,31 @@
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.interpolate import LinearNDInterpolator
 from torch import Tensor
 
 from pnpdepth_cli.choices import SPACES
+from pnpdepth_cli.completion import interpolation
 from pnpdepth_cli.completion.alignment import from_space
-from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest, pixels_of
+from pnpdepth_cli.completion.interpolation import (
+    Triangulation,
+    in_hull,
+    linear,
+    nearest,
+    pixels_of,
+)
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
+from tests.completion.test_triangles import POINTS, all_delaunay, holds
 
 FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
     "nearest": nearest,
@@ -68,6 +81,95 @@ def test_linear_is_scipys_in_its_space_inside_the_hull_and_nearest_outside(space
     assert 0.5 < float(inside.double().mean()) < 1
     assert torch.allclose(dense[inside].double(), theirs[inside], rtol=1e-5)
     assert torch.equal(dense[~inside], nearest(points)[~inside])
+
+
+def depth_map(height: int, width: int, known: float, seed: int = 0) -> SparsePoints:
+    """The known pixels of a depth map with two holes, and others missing at random."""
+    rng = np.random.default_rng(seed)
+    depth = (1 + 9 * rng.random((height, width))).astype(np.float32)
+    depth[rng.random((height, width)) > known] = 0
+    depth[2:9, 3:12] = depth[height // 2 :, width // 2 : width // 2 + 6] = 0
+    rows, columns = depth.nonzero()
+    return points_at(np.stack([columns, rows], axis=1), depth[rows, columns], (height, width))
+
+
+@settings(max_examples=40)
+@given(POINTS, st.randoms())
+def test_depth_is_linear_in_a_triangle_that_delaunay_allows_and_nearest_outside(
+    xy: list[tuple[float, float]], random: random.Random
+) -> None:
+    depth = [1 + 9 * random.random() for _ in xy]
+    points = points_at(xy, depth, (6, 7))
+    dense, closest = linear(points).flatten(), nearest(points).flatten()
+    at, of_points = np.array(xy), points.depth.double().numpy()
+    triangles = all_delaunay(at)
+    for pixel, found, alone in zip(pixels_of(points.size).numpy(), dense, closest, strict=True):
+        possible = list[float]()
+        for corners in map(list, triangles):
+            if holds(at, tuple(corners), pixel):
+                shares = np.linalg.solve(np.vstack([at[corners].T, np.ones(3)]), [*pixel, 1])
+                possible.append(float(shares @ of_points[corners]))
+        possible = possible or [float(alone)]
+        assert min(possible) * (1 - 1e-6) <= float(found) <= max(possible) * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("known", [1.0, 0.8, 0.05])
+def test_a_plane_is_a_plane_between_any_points_in_its_space(space: str, known: float) -> None:
+    points = depth_map(40, 60, known)
+    x, y = pixels_of(points.size).T
+    plane = from_space(0.5 + 0.003 * x + 0.004 * y, space).reshape(points.size).float()
+    points = points_at(points.xy, points.sample(plane), points.size)
+    xy = torch.rand(200, 2) * torch.tensor([50.0, 30.0]) + 4
+    expected = from_space(0.5 + xy.double() @ torch.tensor([0.003, 0.004]).double(), space)
+    triangulation = Triangulation(points)
+    inside = torch.zeros(points.size, dtype=torch.bool)
+    inside[5:35, 5:55] = True
+    assert torch.allclose(triangulation.dense(space)[inside], plane[inside], rtol=2e-6)
+    assert torch.allclose(triangulation.at(xy, space), expected.float(), rtol=2e-6)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("known", [1.0, 0.8])
+def test_of_a_depth_map_the_holes_are_as_if_all_its_pixels_were_triangulated(
+    space: str, known: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = depth_map(40, 60, known)
+    dense = linear(points, space=space)
+    monkeypatch.setattr(interpolation, "_NODES", 0)
+    assert torch.allclose(linear(points, space=space), dense, rtol=1e-6)
+    assert torch.allclose(points.sample(dense), points.depth, rtol=1e-6)
+
+
+def test_of_a_small_depth_map_in_a_large_frame_squares_are_bilinear() -> None:
+    small = 1 + 9 * torch.rand(12, 16, generator=torch.Generator().manual_seed(0))
+    x, y = pixels_of((12, 16)).T
+    points = points_at(torch.stack([x, y], dim=1), small.flatten(), (12, 16)).resized(30, 48)
+    expected = F.interpolate(small[None, None], (30, 48), mode="bilinear")[0, 0]
+    inside = in_hull(points)
+    inside[[0, -1]], inside[:, [0, -1]] = False, False
+    assert torch.allclose(linear(points)[inside], expected[inside], rtol=1e-5)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("points", [scattered(300), scattered(2), depth_map(40, 60, 0.8)])
+def test_at_a_pixel_depth_is_that_of_the_dense_map_however_few_are_asked_for(
+    points: SparsePoints, space: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    triangulation = Triangulation(points)
+    dense, pixels = triangulation.dense(space).flatten(), pixels_of(points.size).float()
+    assert torch.allclose(triangulation.at(pixels, space), dense, rtol=1e-6)
+    monkeypatch.setattr(interpolation, "_FEW", 0)
+    some = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(1))[:40]
+    assert torch.allclose(triangulation.at(pixels[some], space), dense[some], rtol=1e-6)
+    assert torch.allclose(linear(points, pixels[some], space=space), dense[some], rtol=1e-6)
+    assert triangulation.at(pixels[:0], space).shape == (0,)
+
+
+@pytest.mark.parametrize("points", [scattered(200, on_grid=True), depth_map(40, 60, 0.9)])
+def test_the_order_of_the_points_has_no_effect(points: SparsePoints) -> None:
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(linear(points.select(order)), linear(points))
 
 
 @pytest.mark.parametrize(

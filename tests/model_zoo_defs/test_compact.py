@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from model_zoo_defs._compact.cloud import Cloud
+from model_zoo_defs._compact.cloud import CELLS, SAME_DEPTH, Cloud, thinned
 from model_zoo_defs._compact.points import Points
+from model_zoo_defs._compact.prior import Prior
 from model_zoo_defs.compact import Compact, definitions
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.models.network import load_network
@@ -96,3 +97,68 @@ def test_the_shipped_inlier_weights_detect_outliers_on_a_slope() -> None:
     assert float(clean[known].mean()) > 0.98
     assert float(mixed[known & ~outlier].mean()) > 0.95
     assert float(mixed[outlier].mean()) < 0.3
+
+
+def dense_frame(*, outliers: float) -> tuple[Tensor, Tensor]:
+    """The depth (1, 1, 240, 320) of two slopes with a jump between them, and which are outliers."""
+    generator = torch.Generator().manual_seed(5)
+    rows, columns = torch.meshgrid(torch.arange(240.0), torch.arange(320.0), indexing="ij")
+    truth = 2.0 + 0.005 * rows + 0.003 * columns + (columns > 150) * 1.5
+    outlier = torch.rand(truth.shape, generator=generator) < outliers
+    return torch.where(outlier, 2.0 * truth, truth)[None, None], outlier[None, None]
+
+
+def test_every_point_of_a_dense_map_has_one_of_its_depth_and_of_its_place_that_stands_for_it() -> (
+    None
+):
+    depth, _ = dense_frame(outliers=0.05)
+    value, (rows, columns) = depth.log().flatten(), torch.nonzero(depth[0, 0]).T
+    chosen, stand_in, sends = thinned(rows, columns, value, len(value))
+    of = chosen[stand_in]
+    assert len(value) / 16 <= int(sends.sum()) <= CELLS
+    assert int(sends.sum()) < len(chosen) < len(value) / 2
+    assert torch.equal(of[chosen], chosen)
+    assert int((rows[of] - rows).abs().max()) < 4
+    assert int((columns[of] - columns).abs().max()) < 4
+    assert float((value[of] - value).abs().max()) < 3 * SAME_DEPTH
+
+
+def test_of_points_that_are_not_dense_each_stands_for_itself() -> None:
+    _, sparse = frame(3000)
+    rows, columns = torch.nonzero(sparse[0, 0]).T
+    chosen, stand_in, sends = thinned(rows, columns, sparse[sparse > 0].log(), sparse.numel())
+    assert torch.equal(chosen, torch.arange(3000))
+    assert torch.equal(stand_in, chosen)
+    assert bool(sends.all())
+
+
+def test_the_shipped_inlier_weights_detect_outliers_of_a_dense_map_beside_a_jump() -> None:
+    network = load_network("compact", None).module
+    grey = torch.zeros(1, 3, 240, 320)
+    depth, outlier = dense_frame(outliers=0.2)
+    clean, _ = dense_frame(outliers=0.0)
+    with torch.no_grad():
+        of_clean, mixed = (
+            network.inlier_weights(points, Cloud.of(points, grey))
+            for points in map(Points, (clean, depth))
+        )
+    assert float(of_clean.mean()) > 0.999
+    assert float(mixed[~outlier].mean()) > 0.95
+    assert float(mixed[outlier].mean()) < 0.05
+
+
+def test_a_dense_map_has_the_same_weights_and_trust_in_a_prior_in_a_batch(network: Compact) -> None:
+    dense, _ = dense_frame(outliers=0.1)
+    sparse = dense * (torch.rand(dense.shape, generator=torch.Generator().manual_seed(0)) < 0.01)
+    both, rgb = torch.cat([sparse, dense, sparse]), torch.zeros(3, 3, 240, 320)
+    points = Points(both)
+    cloud = Cloud.of(points, rgb)
+    points.weigh(network.inlier_weights(points, cloud))
+    valid = Prior.of(both.clamp_min(2.5), points, cloud).valid
+    for number in range(3):
+        alone = Points(both[number : number + 1])
+        of_one = Cloud.of(alone, rgb[:1])
+        alone.weigh(network.inlier_weights(alone, of_one))
+        torch.testing.assert_close(alone.weight[0], points.weight[number], rtol=1e-4, atol=1e-4)
+        prior = Prior.of(both[number : number + 1].clamp_min(2.5), alone, of_one)
+        assert torch.equal(prior.valid[0], valid[number])

@@ -1,0 +1,213 @@
+"""Delaunay's triangles of points in the plane, and which of them holds a position.
+
+All arrays are float64 coordinates (…, 2), x and y. Of points on one circle, as those of a grid are,
+Delaunay leaves the choice. It is made by moving every point by up to `_MOVED_PX`, by a number made
+of its own coordinates. So the triangles at a place depend on the points around it alone, neither on
+their order nor on points elsewhere. All values are interpolated at the points' true coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.intp]
+
+_MOVED_PX = 1e-6  # below what float32 tells apart from 16 px on
+_SLIVER_PX = 1e-6  # height of a triangle that is left out; its place is its neighbours'
+_THIN_PX = 1e-3  # height of a triangle that holds only what no other one holds
+_SPANS = 1 << 19  # that are made at once: bounds the memory
+_NEAREST = 16  # points around a position whose triangles are tried,
+_TRIALS = 8  # with as many more, so often; then all points are triangulated
+_EMPTY = 1e-10  # of a circle's radius, that a point may be within it by rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class Positions:
+    """Where triangles are sought: nodes of a grid of M positions or more, row after row."""
+
+    columns: Floats
+    """(C,) ascending x."""
+    rows: Floats
+    """(R,) ascending y."""
+    nodes: Numbers | None = None
+    """(M,) ascending row · C + column of the positions. None: all nodes."""
+
+    @classmethod
+    def of(cls, xy: Floats) -> tuple[Positions, Numbers]:
+        """Returns the positions (M', 2) without repetition, and the number (M,) of each of xy."""
+        columns, column = np.unique(xy[:, 0], return_inverse=True)
+        rows, row = np.unique(xy[:, 1], return_inverse=True)
+        nodes, number = np.unique(row * len(columns) + column, return_inverse=True)
+        return cls(columns=columns, rows=rows, nodes=nodes), number
+
+    def __len__(self) -> int:
+        return len(self.columns) * len(self.rows) if self.nodes is None else len(self.nodes)
+
+    def first_after(self, row: Numbers, column: Numbers) -> Numbers:
+        """Returns the number of the first position at or behind these nodes."""
+        node = row * len(self.columns) + column
+        number: Numbers = node if self.nodes is None else np.searchsorted(self.nodes, node)
+        return number
+
+
+class Spans(NamedTuple):
+    """Runs of positions in a row that a triangle holds."""
+
+    triangle: Numbers
+    """(S,) number of the triangle."""
+    first: Numbers
+    """(S,) the run's first position."""
+    length: Numbers
+    """(S,) how many positions it has."""
+
+    def expanded(self) -> tuple[Numbers, Numbers]:
+        """Returns all positions, run after run, and the triangle of each."""
+        starts = self.length.cumsum() - self.length
+        position = np.repeat(self.first - starts, self.length) + np.arange(self.length.sum())
+        return position, np.repeat(self.triangle, self.length)
+
+
+def delaunay(xy: Floats) -> Numbers:
+    """Returns the points' numbers (T, 3) at the corners of Delaunay's triangles.
+
+    None of fewer than three points, or of points on one line. Thin triangles come first.
+    """
+    try:
+        triangles: Numbers = Delaunay(moved(xy)).simplices.astype(np.intp)
+    except QhullError:
+        return np.empty((0, 3), np.intp)
+    a, b, c = np.moveaxis(xy[triangles], 1, 0)
+    longest = np.sqrt(np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0))
+    height = np.abs(_cross(b - a, c - a)) / longest
+    return np.concatenate(
+        [
+            triangles[(height > _SLIVER_PX) & (height <= _THIN_PX)],
+            triangles[height > _THIN_PX],
+        ]
+    )
+
+
+def delaunay_at(xy: Floats, positions: Floats) -> Numbers:
+    """Returns those of Delaunay's triangles (T, 3) that hold any of a few positions (M, 2).
+
+    The points around the positions are triangulated, with the hull's. A triangle whose circle holds
+    no other of all points is Delaunay's; where one's does, more points around it are taken.
+    """
+    shifted = moved(xy)
+    tree = cKDTree(shifted)
+    try:
+        chosen = ConvexHull(shifted).vertices.astype(np.intp)
+    except QhullError:
+        return np.empty((0, 3), np.intp)
+    places = positions
+    where, _ = Positions.of(positions)
+    for trial in range(1, _TRIALS + 1):
+        near = tree.query(places, np.arange(1, min(trial * _NEAREST, len(xy)) + 1), workers=-1)[1]
+        chosen = np.union1d(chosen, near)
+        triangles = chosen[delaunay(xy[chosen])]
+        number = cover(xy[triangles], where)
+        triangles = triangles[np.unique(number[number >= 0])]
+        centre, radius = circles(shifted[triangles])
+        distance, _ = tree.query(centre, workers=-1)
+        is_empty = distance >= radius * (1 - _EMPTY)
+        if is_empty.all():
+            return triangles
+        places = np.concatenate([centre[~is_empty], xy[triangles[~is_empty]].mean(axis=1)])
+    return delaunay(xy)
+
+
+def moved(xy: Floats) -> Floats:
+    """Returns the coordinates (N, 2), each moved by a number made of both, at random to the eye."""
+    bits = (xy.astype(np.float32) + np.float32(0)).view(np.uint32).astype(np.uint64)
+    state = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) + bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
+    for _ in range(2):
+        state = (state ^ (state >> np.uint64(31))) * np.uint64(0xBF58476D1CE4E5B9)
+    both = np.stack([state >> np.uint64(32), state & np.uint64(0xFFFFFFFF)], axis=1)
+    return xy + _MOVED_PX * (both.astype(np.float64) / 2**32 - 0.5)
+
+
+def cover(corners: Floats, positions: Positions) -> Numbers:
+    """Returns (M,) the number of a triangle (T, 3, 2) that holds each position; −1 for none.
+
+    A position on an edge is in either triangle. One that lies beside all of them by rounding, or in
+    one that was left out, is in one at most `_SLIVER_PX` away. Of several the last holds it.
+    """
+    number = np.full(len(positions), -1)
+    for spans in _spans(corners, positions):
+        position, triangle = spans.expanded()
+        number[position] = triangle
+    return number
+
+
+def barycentric(corners: Floats, xy: Floats) -> Floats:
+    """Returns the barycentric coordinates (M, 3), 0…1, of positions (M, 2) in triangles (M, 3, 2).
+
+    Those beside their triangle by rounding are on its edge.
+    """
+    a, b, c = np.moveaxis(corners - xy[:, None], 1, 0)
+    areas = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+    areas = (areas * np.sign(areas.sum(axis=1, keepdims=True))).clip(min=0.0)
+    shares: Floats = areas / areas.sum(axis=1, keepdims=True)
+    return shares
+
+
+def circles(corners: Floats) -> tuple[Floats, Floats]:
+    """Returns the centre (T, 2) and the radius (T,) of the circles through triangles (T, 3, 2)."""
+    a = corners[:, 0]
+    b, c = corners[:, 1] - a, corners[:, 2] - a
+    square_b, square_c = (b**2).sum(axis=1), (c**2).sum(axis=1)
+    x = c[:, 1] * square_b - b[:, 1] * square_c
+    y = b[:, 0] * square_c - c[:, 0] * square_b
+    centre = np.stack([x, y], axis=1) / (2 * _cross(b, c))[:, None]
+    return a + centre, np.hypot(*centre.T)
+
+
+def _spans(corners: Floats, positions: Positions) -> Iterator[Spans]:
+    """The positions in triangles (T, 3, 2), larger by `_SLIVER_PX` on each side; some at once."""
+    # The corners of each, from the top.
+    order = corners[:, :, 1].argsort(axis=1)
+    (x0, y0), (x1, y1), (x2, y2) = np.moveaxis(
+        np.take_along_axis(corners, order[:, :, None], axis=1), 0, 2
+    )
+    # How far its edges go to the right from row to row.
+    whole, upper, lower = (
+        np.divide(dx, dy, out=np.zeros_like(dx), where=dy > 0)
+        for dx, dy in ((x2 - x0, y2 - y0), (x1 - x0, y1 - y0), (x2 - x1, y2 - y1))
+    )
+    # Which rows of positions it reaches.
+    top = np.searchsorted(positions.rows, y0 - _SLIVER_PX)
+    rows = np.searchsorted(positions.rows, y2 + _SLIVER_PX, "right") - top
+    total = rows.cumsum()
+    parts = np.searchsorted(total, np.arange(_SPANS, total[-1] if len(total) else 0, _SPANS))
+    for some in np.split(np.arange(len(corners)), parts):
+        # In each row, from where to where its edges cross it.
+        t = np.repeat(some, rows[some])
+        row = np.arange(len(t)) + np.repeat(
+            top[some] - rows[some].cumsum() + rows[some], rows[some]
+        )
+        y = positions.rows[row].clip(y0[t], y2[t])
+        on_upper = x0[t] + (y - y0[t]) * upper[t]
+        on_lower = x1[t] + (y - y1[t]) * lower[t]
+        of_two, of_one = np.where(y < y1[t], on_upper, on_lower), x0[t] + (y - y0[t]) * whole[t]
+        left, right = (
+            np.minimum(of_one, of_two) - _SLIVER_PX,
+            np.maximum(of_one, of_two) + _SLIVER_PX,
+        )
+        # Which positions are between.
+        first = positions.first_after(row, np.searchsorted(positions.columns, left))
+        behind = positions.first_after(row, np.searchsorted(positions.columns, right, "right"))
+        found = behind > first
+        yield Spans(t[found], first[found], (behind - first)[found])
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """The area (…) that vectors (…, 2) span, positive where b is to the left of a."""
+    area: Floats = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return area
