@@ -76,8 +76,8 @@ class Settings:
     option."""
     align: str | None = option(
         None,
-        "Fit the network's output to the points by scale, or scale and shift."
-        "  [default: the network's own]",
+        "Fit the network's output to the points by scale, or scale and shift (affine); or read it"
+        " as depth, disparity, ….  [default: the network's own]",
         choices=choices.ALIGNMENTS,
     )
     propagate: str | None = option(

@@ -42,7 +42,7 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     outlier = torch.arange(40) % 10 == 3
     points = replace(points, depth=torch.where(outlier, 5 * points.depth, points.depth))
     prediction = gt * torch.linspace(0.6, 1.5, gt.shape[1])
-    x = align_prediction(prediction, points, kind="auto", space="depth").double()
+    x = align_prediction(prediction, points, kind="affine").double()
     at_points, y = points.sample(x).numpy(), points.depth.double().numpy()
     mean, std = at_points.mean(), at_points.std()
     inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
