@@ -33,7 +33,10 @@ from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
 BEYOND = 5.0
-"""Aligned depth is clamped to this factor in front of the nearest and behind the farthest point."""
+"""Aligned depth is clamped to this factor in front of the nearest and behind the farthest point.
+
+With N points it is 1 + 1/N times of it, since a few do not show the range of the scene.
+"""
 
 _BEST = 0.7
 """Fraction of the points that `Alignment.error` is measured on."""
@@ -188,9 +191,8 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
     """Returns the alignment of the network's numbers with the points.
 
     Of several candidates it is the best by BIC, so that a fit with more parameters must be worth
-    them. Where the points contradict what is stated,
-    because every candidate's scale would have the wrong sign or the numbers are the same
-    everywhere, the scale is 0: depth is the same everywhere.
+    them. Where the points contradict the sign that is stated, the scale can be 0: depth is the same
+    everywhere.
 
     Args:
         x: (N,) the network's numbers at the points.
@@ -214,11 +216,9 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
             f"alignment {kind!r} needs 2 sparse points where the network sees them, here is"
             f" {len(x)}; 'scale' needs only one"
         )
-    if kind == "affine" and tried[0].sign:
-        return _level(x, d, tried[0])
     raise ModelError(
-        f"alignment {kind!r} is not possible: the network's output is the same at all"
-        f" {len(x)} sparse points, or zero"
+        f"alignment {kind!r} as {tried[0].reading} is not possible: the network's output is the"
+        f" same at all {len(x)} sparse points, or not above 0"
     )
 
 
@@ -264,13 +264,17 @@ def _has(reading: str, kind: str) -> bool:
 
 
 def _fit(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment | None:
-    """The fit of a candidate; None where the x do not determine it, or contradict its sign."""
-    line = _line(x, d, candidate.reading, candidate.kind)
+    """The fit of a candidate; None where the x do not allow it.
+
+    Where they contradict the sign that is stated, the best line is level.
+    """
+    line = _scale_and_shift(x, d, candidate.reading, candidate.kind)
     if line is None or not all(map(math.isfinite, line)):
         return None
-    if line[0] == 0 or line[0] * candidate.sign < 0:
-        return None
-    return _with_errors(x, d, candidate, line)
+    if candidate.sign and line[0] * candidate.sign <= 0:
+        has_level = candidate.kind == "affine" and len(x) > 1
+        return _level(x, d, candidate) if has_level else None
+    return _with_errors(x, d, candidate, line) if line[0] else None
 
 
 def _level(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment:
@@ -304,8 +308,8 @@ def _with_errors(
     )
 
 
-def _line(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
-    """Scale and shift of a reading; None where the x do not determine them."""
+def _scale_and_shift(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
+    """The line of a reading, level where the x are all the same; None where there is no line."""
     if kind == "none":
         return 1.0, 0.0
     if kind != "affine":
@@ -315,7 +319,7 @@ def _line(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] 
         return None
     x = to_space(x, output)
     if float(x.max() - x.min()) <= _DISTINCT * float(x.abs().max()):
-        return None
+        return 0.0, 0.0
     low, high = sorted(to_space(_bounds(d), space).tolist())
     return fit_line(x, to_space(d, space), space, (low, high))
 
@@ -347,7 +351,8 @@ def _bic(fit: Alignment) -> float:
 
 def _bounds(d: Tensor) -> Tensor:
     """(nearest, farthest) metres that aligned depth can have."""
-    return torch.stack([d.min() / BEYOND, d.max() * BEYOND])
+    factor = BEYOND * (1 + 1 / len(d))
+    return torch.stack([d.min() / factor, d.max() * factor])
 
 
 def _held(value: Tensor, low: float, high: float = math.inf) -> Tensor:
