@@ -154,7 +154,15 @@ UNKNOWN = ("keep", "zero")  # depth that no points support, in the depth file
 POSE_KINDS = ("camera-to-world", "world-to-camera", "opengl")  # what rows of poses are
 METHODS = ("fused", "alone", "paper")  # without and with the included network; the paper's
 SCHEDULES = ("constant", "linear")  # of the step size over the updates
-ALIGNMENTS = ("none", "median", "scale", "affine", "auto")  # of the output with the points
+
+FITS = ("none", "median", "scale", "affine")
+"""Parameters of the fit of a network's output to the points."""
+
+READINGS = ("depth", "disparity", "log", "inverted-disparity", "power")
+"""What a network's output can be read as: `pnpdepth_cli.completion.alignment`."""
+
+ALIGNMENTS = (*FITS, "auto", *READINGS)
+"""What can be stated of the alignment; the points decide what is not."""
 
 # Networks
 Space = Literal["depth", "inverse", "log"]

@@ -81,8 +81,9 @@ class Settings:
     option."""
     align: str | None = option(
         None,
-        "Fit the network's output to the points by scale, or scale and shift."
-        "  [default: the network's own, auto where that is none, none with the paper's method]",
+        "Fit the network's output to the points by scale, or scale and shift (affine); or read it"
+        " as depth, disparity, ….  [default: the network's own, auto where that is none, none with"
+        " the paper's method]",
         choices=choices.ALIGNMENTS,
     )
     propagate: str | None = option(

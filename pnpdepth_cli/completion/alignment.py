@@ -1,47 +1,95 @@
 """Alignment: what a network's numbers mean in metres, fitted to the sparse points.
 
-A network gives depth, inverse depth or log depth, often only up to a scale, or a scale and a
-shift. The fit is made in the network's own space: with x its output at a point of depth d,
+With x a network's output at a point of depth d, it is read as
 
-    depth:    d     = scale·x + shift
-    inverse:  1/d   = scale·x + shift
-    log:      log d = scale·x + shift
+    depth:               d     = scale·x + shift
+    disparity:           1/d   = scale·x + shift
+    log:                 log d = scale·x + shift
+    inverted-disparity:  1/d   = scale/x + shift
+    power:               log d = scale·log x + shift
 
-`scale` keeps the shift at 0. In log space, where a factor of depth is an addend, it keeps the scale
-at 1. `median` is the same by the median of the points' own ratios. The fit is robust to outliers.
-Of lines through many pairs of points, the one with the smallest median residual is the start
-(LMedS, Rousseeuw 1984) of reweighted least squares with Tukey's biweight.
+A network of √d is read as a power. The kind of a fit is the parameters that it has. `affine` has
+both, `scale` keeps the shift at 0, and `none` has neither. Of log, where a factor of depth is an
+addend, `scale` keeps the scale at 1. `median` is `scale` by the median of the points' own factors.
+
+All errors are of log depth: far points do not count more than near ones, and a fit of disparity
+does not let far depth fly away. Outliers count little (`robust_line`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.choices import FITS, READINGS
+from pnpdepth_cli.completion.robust_line import fit_line, fit_location, mean_error
 from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-BEYOND = 10.0
-"""Aligned depth is clamped to this factor in front of the nearest and behind the farthest point."""
+BEYOND = 5.0
+"""Aligned depth is clamped to this factor in front of the nearest and behind the farthest point.
 
-_PAIRS = 1024
-_SCORED = 1024
-_BIWEIGHT = 4.685  # of Tukey's weights: 95 % efficient for normal errors (Holland, Welsch 1977)
-_BEST = 0.7  # fraction of the points that `error` is measured on
-_MAX_ERROR = 1.0  # |log| error above which a point counts no more
-_MIN_ERROR = 1e-3  # relative errors below this do not distinguish alignments
+With N points it is 1 + 1/N times of it, since a few do not show the range of the scene.
+"""
+
+_BEST = 0.7
+"""Fraction of the points that `Alignment.error` is measured on."""
+
+_LEAST_ERROR = 1e-3
+"""Errors of log depth below this do not distinguish fits."""
+
+_UNTESTED = 0.2
+"""Error of log depth that is assumed of a fit with as many parameters as points."""
+
+_GROSS = 0.05
+"""Errors of log depth below this are no outliers."""
+
+_DISTINCT = 1e-9
+"""Range of x over its largest size below which x is the same at all points."""
+
+
+class Candidate(NamedTuple):
+    """A fit that is tried: a reading, its parameters, and the sign that its scale must have."""
+
+    reading: str  # of `choices.READINGS`
+    kind: str  # of `choices.FITS`
+    sign: int = 0  # 1 or -1; 0 for either
+
+
+class _Reading(NamedTuple):
+    title: str  # in a sentence
+    output: str  # of `choices.SPACES`: the scale is that of x, of 1/x or of log x
+    space: str  # of `choices.SPACES`: the quantity of depth that the line gives
+
+
+_READINGS = {
+    "depth": _Reading("depth", "depth", "depth"),
+    "disparity": _Reading("disparity", "depth", "inverse"),
+    "log": _Reading("log depth", "depth", "log"),
+    "inverted-disparity": _Reading("the inverse of a disparity", "inverse", "inverse"),
+    "power": _Reading("a power of depth", "log", "log"),
+}
+_OF_KIND = {"depth": "depth", "inverse": "disparity", "log": "log"}
+"""The reading of a definition's `output_kind`."""
+
+_OF_SCALE = {"affine": ("affine",), "scale": ("scale", "affine")}
+"""Kinds of fits by a definition's `output_scale`; those of the others are `_ALL`."""
+
+_ALL = ("none", "scale", "affine")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
     """How the network's numbers are converted to metres."""
 
-    space: str  # quantity in which the line is fitted, one of `choices.SPACES`
-    kind: str  # kind of the fit, one of `choices.ALIGNMENTS`
+    reading: str  # what the numbers are, one of `choices.READINGS`
+    kind: str  # kind of the fit, one of `choices.FITS`
     scale: float
     shift: float
     bounds: tuple[float, float]
@@ -57,42 +105,98 @@ class Alignment:
         The gradient is that of the unclamped depth, so that a loss still pulls back a pixel that
         is outside.
         """
-        line, (low, high) = self.scale * x + self.shift, self._limits
-        clamped = line.clamp(low, high)
-        if x.requires_grad:
-            clamped = clamped.detach() + (line - line.detach())
-        return from_space(clamped, self.space)
+        low, high = self._limits
+        line = self._line(_held(x, low=self._least_output))
+        return from_space(_held(line, low, high), _READINGS[self.reading].space)
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
-        line, (low, high) = self.scale * x.cpu() + self.shift, self._limits
-        return float(((line < low) | (line > high)).double().mean())
+        x = x.cpu().double()
+        low, high = self._limits
+        least = self._least_output
+        line = self._line(x.clamp(min=least))
+        return float(((x < least) | (line < low) | (line > high)).double().mean())
+
+    def _line(self, x: Tensor) -> Tensor:
+        return self.scale * to_space(x, _READINGS[self.reading].output) + self.shift
 
     @property
-    def _limits(self) -> list[float]:
+    def _limits(self) -> tuple[float, float]:
         """The bounds of the line in its space, the lower one first."""
         bounds = torch.tensor(self.bounds, dtype=torch.float64)
-        return sorted(to_space(bounds, self.space).tolist())
+        low, high = sorted(to_space(bounds, _READINGS[self.reading].space).tolist())
+        return low, high
+
+    @property
+    def _least_output(self) -> float:
+        """The x at which depth comes to a bound, below which 1/x or log x must not go."""
+        output = _READINGS[self.reading].output
+        if output == "depth":
+            return -math.inf
+        ends = [(limit - self.shift) / self.scale for limit in self._limits]
+        if output == "log":
+            return math.exp(min(max(min(ends), -60.0), 60.0))
+        return 1 / max(ends) if max(ends) > 0 else math.inf
 
     def __str__(self) -> str:
-        read_as = {"depth": "depth", "inverse": "inverse depth", "log": "log depth"}[self.space]
-        sense = "nearer" if (self.scale < 0) != (self.space == "inverse") else "farther"
+        if self.scale == 0:
+            return "the network's output is read as one depth everywhere"
+        title = _READINGS[self.reading].title
+        if self.reading == "power" and self.scale < 0:
+            title = "a power of disparity"
+        elif self.scale < 0:
+            title = f"negated {title}"
+        farther = (self.scale < 0) == (self.reading == "disparity")
         fitted = {"none": "not fitted", "affine": "fitted by scale and shift"}.get(
             self.kind, f"fitted by {self.kind}"
         )
-        read_as = f"negated {read_as}" if self.scale < 0 else read_as
-        return f"the network's output is read as {read_as} (larger is {sense}), {fitted}"
+        if self.reading == "power":
+            fitted = f"fitted by factor and exponent {self.scale:.3g}"
+        sense = "farther" if farther else "nearer"
+        return f"the network's output is read as {title} (larger is {sense}), {fitted}"
 
 
-def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -> Alignment:
+def candidates(
+    asked: str, output_kind: str = "unknown", output_scale: str = "unknown"
+) -> tuple[Candidate, ...]:
+    """Returns the fits that an alignment can have.
+
+    What is stated fixes the sign of the scale and the fewest parameters. An open kind can be any
+    reading, with either sign.
+
+    Args:
+        asked: One of `choices.ALIGNMENTS`, but "none". A reading is obeyed, whatever the definition
+            states; "auto" leaves all to the definition and the points.
+        output_kind: What a definition states, of `choices.OutputKind`.
+        output_scale: What a definition states, of `choices.OutputScale`.
+    """
+    stated = _OF_KIND.get(output_kind)
+    if asked in READINGS and asked != stated:
+        output_scale = "unknown"
+    reading = asked if asked in READINGS else stated
+    kinds = (asked,) if asked in FITS else _OF_SCALE.get(output_scale, _ALL)
+    if reading is None:
+        return tuple(
+            Candidate(name, kind) for name in READINGS for kind in kinds if _has(name, kind)
+        )
+    sign = 0 if reading == "power" else 1
+    found = tuple(Candidate(reading, kind, sign) for kind in kinds if _has(reading, kind))
+    # Networks stretch or compress the range, which a power of what they state shows.
+    if asked == "auto" and reading != "log":
+        found += (Candidate("power", "affine", -1 if reading == "disparity" else 1),)
+    return found
+
+
+def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignment:
     """Returns the alignment of the network's numbers with the points.
 
-    With several spaces, or with kind "auto", it is the best by BIC of a Laplace model of the
-    relative errors, so that a fit with more parameters must be worth them.
+    Of several candidates it is the best by BIC, so that a fit with more parameters must be worth
+    them. Where the points contradict the sign that is stated, the scale can be 0: depth is the same
+    everywhere.
 
     Args:
         x: (N,) the network's numbers at the points.
-        spaces: Quantities that the network may predict, of `choices.SPACES`.
+        tried: The candidates, that of what is stated first.
 
     Raises:
         NoPointsError: There are too few points.
@@ -103,35 +207,39 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
     if not bool(good.any()):
         raise ModelError("the network's output is not finite at any sparse point; nothing to align")
     x, d = x[good], d[good]
-    kinds = ("none", "scale", "affine") if kind == "auto" else (kind,)
-    fits = [fit for s in spaces for k in kinds if (fit := _fit(x, d, s, k)) is not None]
-    if not fits and len(x) < 2:
-        fact = f"alignment {kind!r} needs 2 sparse points where the network sees them"
-        raise NoPointsError(f"{fact}, here is {len(x)}; 'scale' needs only one")
-    if not fits:
-        raise ModelError(
-            f"alignment {kind!r} is not possible: the network's output is the same at all"
-            f" {len(x)} sparse points, or zero"
+    fits = [fit for candidate in tried if (fit := _fit(x, d, candidate)) is not None]
+    if fits:
+        return min(fits, key=_bic)
+    kind = tried[0].kind
+    if len(x) < 2:
+        raise NoPointsError(
+            f"alignment {kind!r} needs 2 sparse points where the network sees them, here is"
+            f" {len(x)}; 'scale' needs only one"
         )
-    return min(fits, key=_bic)
+    raise ModelError(
+        f"alignment {kind!r} as {tried[0].reading} is not possible: the network's output is the"
+        f" same at all {len(x)} sparse points, or not above 0"
+    )
 
 
 def align_prediction(
-    prediction: Tensor, points: SparsePoints, *, kind: str, space: str = "depth"
+    prediction: Tensor, points: SparsePoints, *, kind: str, reading: str = "depth"
 ) -> Tensor:
     """Returns the prediction aligned with the points, (H, W) float32 metres, 0 = unknown.
 
     Args:
         prediction: (H, W) depth, metric or not; not positive or not finite is unknown.
-        space: Quantity in which the line is fitted, one of `choices.SPACES`.
+        kind: Kind of the fit, one of `choices.FITS`.
+        reading: What the line is fitted to, "depth", or "disparity" for the inverse of both.
 
     Raises:
         NoPointsError: No point has a prediction.
         ModelError: The prediction is the same at all points, or zero, so that no line fits.
     """
     known, points = where_predicted(prediction, points)
-    x = to_space(torch.where(known, prediction, 1.0), space)
-    fit = align(points.sample(x), points, (space,), kind)
+    x = torch.where(known, prediction, 1.0)
+    x = x.reciprocal() if reading == "disparity" else x
+    fit = align(points.sample(x), points, [Candidate(reading, kind)])
     return torch.where(known, fit.depth(x), 0.0)
 
 
@@ -150,90 +258,107 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
     return known, seen
 
 
-def _fit(x: Tensor, d: Tensor, space: str, kind: str) -> Alignment | None:
-    y = to_space(d, space)
-    line = _line(x, y, space, kind)
-    if line is None or not all(map(math.isfinite, line)) or line[0] == 0:
+def _has(reading: str, kind: str) -> bool:
+    """Whether a reading has fits of this kind: those of one factor are depth's or disparity's."""
+    return kind == "affine" or reading in ("depth", "disparity", "log")
+
+
+def _fit(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment | None:
+    """The fit of a candidate; None where the x do not allow it.
+
+    Where they contradict the sign that is stated, the best line is level.
+    """
+    line = _scale_and_shift(x, d, candidate.reading, candidate.kind)
+    if line is None or not all(map(math.isfinite, line)):
         return None
-    bounds = (float(d.min()) / BEYOND, float(d.max()) * BEYOND)
+    if candidate.sign and line[0] * candidate.sign <= 0:
+        has_level = candidate.kind == "affine" and len(x) > 1
+        return _level(x, d, candidate) if has_level else None
+    return _with_errors(x, d, candidate, line) if line[0] else None
+
+
+def _level(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment:
+    """The best line whose scale is 0: depth is the same everywhere."""
+    reading = candidate.reading if _READINGS[candidate.reading].output == "depth" else "depth"
+    depth = d.new_tensor(fit_location(d.log())).exp()
+    level = float(to_space(depth, _READINGS[reading].space))
+    return _with_errors(x, d, candidate._replace(reading=reading), (0.0, level))
+
+
+def _with_errors(
+    x: Tensor, d: Tensor, candidate: Candidate, line: tuple[float, float]
+) -> Alignment:
+    nearest, farthest = _bounds(d).tolist()
     fit = Alignment(
-        space=space, kind=kind, scale=line[0], shift=line[1], bounds=bounds, points=len(x)
+        reading=candidate.reading,
+        kind=candidate.kind,
+        scale=line[0],
+        shift=line[1],
+        bounds=(nearest, farthest),
+        points=len(x),
     )
     off = (fit.depth(x).log() - d.log()).abs()
-    error = float(off.sort().values[: max(1, round(_BEST * len(off)))].mean())
-    gross = max(3 * MAD_TO_STD * float(off.median()), 0.05)
-    misfit = float(off.clamp_max(_MAX_ERROR).mean())
-    return replace(fit, error=error, misfit=misfit, outliers=float((off > gross).double().mean()))
+    best = off.sort().values[: max(1, round(_BEST * len(off)))]
+    gross = max(3 * MAD_TO_STD * float(off.median()), _GROSS)
+    return replace(
+        fit,
+        error=float(best.mean()),
+        misfit=mean_error(off),
+        outliers=float((off > gross).double().mean()),
+    )
+
+
+def _scale_and_shift(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
+    """The line of a reading, level where the x are all the same; None where there is no line."""
+    if kind == "none":
+        return 1.0, 0.0
+    if kind != "affine":
+        return _factor(x, d, reading, kind)
+    output, space = _READINGS[reading][1:]
+    if output != "depth" and not bool((x > 0).all()):
+        return None
+    x = to_space(x, output)
+    if float(x.max() - x.min()) <= _DISTINCT * float(x.abs().max()):
+        return 0.0, 0.0
+    low, high = sorted(to_space(_bounds(d), space).tolist())
+    return fit_line(x, to_space(d, space), space, (low, high))
+
+
+def _factor(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
+    """Scale and shift of a reading whose one parameter is a factor of depth."""
+    if reading == "log":
+        addends = d.log() - x
+    else:
+        # Numbers of the rarer sign, or 0, give no depth at any factor.
+        sign = 1.0 if float(x.median()) >= 0 else -1.0
+        used = sign * x > 0
+        if not bool(used.any()):
+            return None
+        log_x = (sign * x[used]).log()
+        addends = d[used].log() - (log_x if reading == "depth" else -log_x)
+    addend = float(addends.median()) if kind == "median" else fit_location(addends)
+    if reading == "log":
+        return 1.0, addend
+    return sign * math.exp(addend if reading == "depth" else -addend), 0.0
 
 
 def _bic(fit: Alignment) -> float:
+    """The Bayesian information criterion of a fit, for Laplace's distribution of the errors."""
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
-    error = max(fit.misfit, _MIN_ERROR)
-    # A parameter can fit outliers: on rendered frames, with and without outliers, twice BIC's
-    # price of a parameter chose best.
-    return 2 * (fit.points * math.log(error) + parameters * math.log(max(2, fit.points)))
+    error = max(fit.misfit, _LEAST_ERROR) if fit.points > parameters else _UNTESTED
+    return 2 * fit.points * math.log(error) + parameters * math.log(fit.points)
 
 
-def _line(x: Tensor, y: Tensor, space: str, kind: str) -> tuple[float, float] | None:
-    """Scale and shift of y = scale·x + shift; None where the x do not determine them."""
-    if kind == "none":
-        return 1.0, 0.0
-    if kind == "affine":
-        if float(x.max() - x.min()) <= 1e-9 * float(x.abs().max()):
-            return None
-        return _fit_reweighted(x, y, _least_median(x, y), shifted=True)
-    if space == "log":  # where a factor of depth is an addend
-        x, y = torch.ones_like(x), y - x
-    used = x != 0
-    if not bool(used.any()):
-        return None
-    factor = float((y[used] / x[used]).median())
-    if kind == "scale":
-        factor, _ = _fit_reweighted(x, y, (factor, 0.0), shifted=False)
-    return (1.0, factor) if space == "log" else (factor, 0.0)
+def _bounds(d: Tensor) -> Tensor:
+    """(nearest, farthest) metres that aligned depth can have."""
+    factor = BEYOND * (1 + 1 / len(d))
+    return torch.stack([d.min() / factor, d.max() * factor])
 
 
-def _least_median(x: Tensor, y: Tensor) -> tuple[float, float]:
-    """The line through two of the points with the smallest median residual; the seed is fixed."""
-    generator = torch.Generator().manual_seed(0)
-    if len(x) > _SCORED:
-        kept = torch.randperm(len(x), generator=generator)[:_SCORED]
-        x, y = x[kept], y[kept]
-    first, second = torch.triu_indices(len(x), len(x), 1)
-    if len(first) > _PAIRS:
-        drawn = torch.randperm(len(first), generator=generator)[:_PAIRS]
-        first, second = first[drawn], second[drawn]
-    apart = x[first] != x[second]
-    if not bool(apart.any()):  # hardly any value differs and no pair drawn has two
-        first, second, apart = x.argmin()[None], x.argmax()[None], torch.ones(1, dtype=torch.bool)
-    first, second = first[apart], second[apart]
-    slope = (y[first] - y[second]) / (x[first] - x[second])
-    shift = y[first] - slope * x[first]
-    residual = (slope[:, None] * x + shift[:, None] - y).abs().median(dim=1).values
-    best = residual.argmin()
-    return float(slope[best]), float(shift[best])
-
-
-def _fit_reweighted(
-    x: Tensor, y: Tensor, start: tuple[float, float], *, shifted: bool
-) -> tuple[float, float]:
-    """Least squares of y = a·x + b from a start; points far off the line have no weight."""
-    a, b = start
-    least = 1e-9 * float(y.abs().median()) + torch.finfo(y.dtype).tiny
-    for _ in range(30):
-        residual = (y - a * x - b).abs()
-        cutoff = _BIWEIGHT * max(MAD_TO_STD * float(residual.median()), least)
-        w = (1 - (residual / cutoff).square()).clamp_min(0).square()
-        total = w.sum()
-        mx, my = ((w * x).sum() / total, (w * y).sum() / total) if shifted else (0.0, 0.0)
-        power = (w * (x - mx).square()).sum()
-        if not float(total) > 0 or not float(power) > 0:
-            break
-        slope = float((w * (x - mx) * (y - my)).sum() / power)
-        before, a, b = a, slope, float(my - slope * mx)
-        if abs(a - before) <= 1e-12 * abs(a):
-            break
-    return a, b
+def _held(value: Tensor, low: float, high: float = math.inf) -> Tensor:
+    """The value clamped, with the gradient of the value as it is."""
+    clamped = value.clamp(low, high)
+    return clamped.detach() + (value - value.detach()) if value.requires_grad else clamped
 
 
 def to_space(depth: Tensor, space: str) -> Tensor:

@@ -13,7 +13,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.alignment import align, align_prediction, where_predicted
+from pnpdepth_cli.completion.alignment import (
+    Candidate,
+    align,
+    align_prediction,
+    where_predicted,
+)
 from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
@@ -38,7 +43,8 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     known, points = where_predicted(prediction, points)
     points = distinct(points)
     x = torch.where(known, prediction, 1.0).double()
-    aligned = align(points.sample(x), points, ("depth",), "auto")
+    kinds = ("none", "scale", "affine")
+    aligned = align(points.sample(x), points, [Candidate("depth", kind) for kind in kinds])
     start, reading = aligned.scale * x + aligned.shift, replace(aligned, scale=1.0, shift=0.0)
     at_points = points.sample(start)
     std = at_points.std(correction=0) + 1e-9 * at_points.abs().mean()
@@ -50,9 +56,11 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     return torch.where(known, depth, 0.0).float().to(device)
 
 
-def _aligned(kind: str, space: str = "depth") -> Baseline:
+def _aligned(kind: str, reading: str = "depth") -> Baseline:
     """The baseline that aligns the prediction."""
-    return lambda points, prediction: align_prediction(prediction, points, kind=kind, space=space)
+    return lambda points, prediction: align_prediction(
+        prediction, points, kind=kind, reading=reading
+    )
 
 
 TABLE: dict[str, Baseline] = {
@@ -62,7 +70,7 @@ TABLE: dict[str, Baseline] = {
     "median": _aligned("median"),
     "scale": _aligned("scale"),
     "affine": _aligned("affine"),
-    "scale-disparity": _aligned("scale", "inverse"),
-    "affine-disparity": _aligned("affine", "inverse"),
+    "scale-disparity": _aligned("scale", "disparity"),
+    "affine-disparity": _aligned("affine", "disparity"),
     "local": align_locally,
 }

@@ -8,8 +8,6 @@ from dataclasses import replace
 import torch
 
 from pnpdepth_cli import errors
-from pnpdepth_cli.choices import SPACES
-from pnpdepth_cli.completion.alignment import align
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
 from pnpdepth_cli.models.cut_layers import default_layer
@@ -19,7 +17,7 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Normalisation,
 )
-from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.network import Network, align_output
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 
@@ -200,8 +198,7 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
 
     Frames without points in the network's view are left out; infinite where the network fails.
     """
-    stated, misfits = network.definition.output_kind, list[float]()
-    spaces = (stated,) if stated in SPACES else ("depth", "inverse")
+    definition, misfits = network.definition, list[float]()
     for frame in frames:
         try:
             prepared = prepare(network, frame)
@@ -210,7 +207,7 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
             lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
-            misfits.append(align(at_points, points, spaces, "auto").error + lost)
+            misfits.append(align_output(definition, at_points, points, "auto").error + lost)
         except errors.NoPointsError:
             continue
         except errors.ModelError:

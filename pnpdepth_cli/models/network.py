@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.budget import check_claim, max_pixels
-from pnpdepth_cli.choices import SPACES
-from pnpdepth_cli.completion.alignment import Alignment, align
+from pnpdepth_cli.choices import FITS
+from pnpdepth_cli.completion.alignment import Alignment, align, candidates
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.tensors import tensors_in
 from pnpdepth_cli.errors import (
@@ -33,9 +33,11 @@ FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
 
 _OFF = 1.5  # a prediction that is this factor off the points at the median gets a word of warning
-_NO_BETTER = 0.98
+_NO_BETTER = 0.95
 """Misfit over that of a constant from which on a network is said to know nothing of the scene."""
 _ENOUGH = 20  # fewer points do not say so
+_MANY_OUTLIERS = 0.25
+"""Fraction of the points that may be far off the aligned prediction without a warning."""
 _MOST_LOST = 0.5
 """Fraction of the points that may lie where the prediction is unknown, without a warning."""
 _SUGGESTION_SIDE = 128  # pixels of the synthetic frame that suggests layers
@@ -237,9 +239,8 @@ class AlignedDepth:
         if self._kind == "none":
             self.notes += self._plain_notes(at_points)
             return
-        stated = self._network.definition.output_kind
-        spaces = (stated,) if stated in SPACES else ("depth", "inverse")
-        self.alignment = align(at_points, self._points, spaces, self._kind)
+        definition = self._network.definition
+        self.alignment = align_output(definition, at_points, self._points, self._kind)
         self.notes += self._notes(self.alignment, raw)
 
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
@@ -255,7 +256,7 @@ class AlignedDepth:
         return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
     def _notes(self, fit: Alignment, raw: Tensor) -> tuple[str, ...]:
-        decided = " (decided from the points)" if self._kind == "auto" else ""
+        decided = " (decided from the points)" if self._kind not in FITS else ""
         notes = [
             f"alignment: {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
             f" over the best 70 %, {fit.outliers:.0%} outliers"
@@ -267,11 +268,17 @@ class AlignedDepth:
                 f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
                 f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
             )
-        stated = self._network.definition.output_kind in SPACES
-        if stated and fit.scale < 0:
+        if fit.outliers > _MANY_OUTLIERS:
             notes.append(
-                "warning: the network's output falls where its kind says it should rise; is it"
-                f" {fit.space!r}? its definition can say otherwise"
+                f"warning: {fit.outliers:.0%} of {fit.points:,} points are far off the aligned"
+                " prediction; are they in metres, in the frame of this image, and is the network's"
+                " output read as what it is? --align can state it"
+            )
+        if fit.scale == 0:
+            notes.append(
+                f"warning: at the {fit.points:,} points the network's output does not follow the"
+                " depth in the direction that is stated, so it reads as one depth everywhere; check"
+                " the network, the points, and whether it gives depth or disparity"
             )
         # What the misfit is for the median depth of the points everywhere.
         log_depth = self._points.depth.cpu().double().log()
@@ -292,6 +299,27 @@ class AlignedDepth:
             f"warning: the prediction is {ratio:.3g} × the sparse depth at the median; align auto"
             " fits its scale (and shift) to the points",
         )
+
+
+def align_output(
+    definition: ModelDefinition, x: Tensor, points: SparsePoints, asked: str
+) -> Alignment:
+    """Returns the alignment of a network's numbers with the points, of all that it can have.
+
+    Args:
+        definition: What is stated of the numbers.
+        x: (N,) the numbers at the points.
+        points: The points.
+        asked: One of `choices.ALIGNMENTS`, but "none".
+
+    Raises:
+        NoPointsError: There are too few points.
+        ModelError: The numbers do not vary, or are not finite.
+    """
+    if asked == "auto" and len(points) == 1:
+        asked = "scale"  # one point shows no shift
+    tried = candidates(asked, definition.output_kind, definition.output_scale)
+    return align(x, points, tried)
 
 
 def load_network(

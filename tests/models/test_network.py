@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
 from pnpdepth_cli.errors import DeviceError, ModelError
 from pnpdepth_cli.models.definition import Multiple, Normalisation
@@ -67,19 +67,61 @@ def test_the_only_tensor_of_a_structure_is_the_output_and_several_need_a_choice(
     assert torch.equal(chosen.depth_of({"a": 2 * depth, "b": [depth]}), depth)
 
 
+def frame_of_depth(count: int) -> tuple[Tensor, SparsePoints]:
+    """Depth (1, 1, 40, 40) in metres, and some points of it."""
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.exp(torch.rand(1, 1, 40, 40, generator=generator) * 2)
+    xy = torch.randint(0, 40, (count, 2), generator=generator)
+    points = SparsePoints(xy=xy.float(), depth=depth[0, 0, xy[:, 1], xy[:, 0]], size=(40, 40))
+    return depth, points
+
+
 @pytest.mark.parametrize(
     ("of_depth", "of_noise", "count", "said"),
     [(0.0, 1.0, 200, True), (0.3, 0.0, 200, False), (0.3, 0.5, 200, False), (0.0, 1.0, 10, False)],
 )
 def test_a_blind_network_is_named(of_depth: float, of_noise: float, count: int, said: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    depth = torch.exp(torch.rand(1, 1, 40, 40, generator=generator) * 2)
-    unrelated = torch.rand(1, 1, 40, 40, generator=generator)
-    xy = torch.randint(0, 40, (count, 2), generator=generator)
-    points = SparsePoints(xy=xy.float(), depth=depth[0, 0, xy[:, 1], xy[:, 0]], size=(40, 40))
+    depth, points = frame_of_depth(count)
+    unrelated = torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(1))
     reader = AlignedDepth(network(output_scale="affine"), points, "auto")
     reader(of_depth * depth + of_noise * unrelated)
     assert any("network 'n' says nothing about" in note for note in reader.notes) == said
+
+
+def test_a_network_of_the_wrong_direction_is_one_depth_everywhere_and_named() -> None:
+    depth, points = frame_of_depth(50)
+    reader = AlignedDepth(network(output_kind="inverse", output_scale="affine"), points, "auto")
+    aligned = reader(depth)
+    assert float(aligned.max() - aligned.min()) == pytest.approx(0, abs=1e-5)
+    assert any(note.startswith("warning: at the 50 points") for note in reader.notes)
+
+
+@pytest.mark.parametrize(("wrong", "said"), [(0.2, False), (0.4, True)])
+def test_more_than_a_quarter_of_outliers_is_a_warning(wrong: float, said: bool) -> None:
+    depth, points = frame_of_depth(200)
+    count = round(200 * wrong)
+    factors = torch.cat([torch.tensor([0.2, 4.0]).repeat(count // 2), torch.ones(200 - count)])
+    spoiled = replace(points, depth=points.depth * factors)
+    reader = AlignedDepth(network(output_scale="affine"), spoiled, "auto")
+    reader(2 * depth + 1)
+    assert any("of 200 points are far off" in note for note in reader.notes) == said
+
+
+@pytest.mark.parametrize("asked", ["auto", "disparity"])
+def test_a_reading_can_be_stated_for_a_network_without_a_definition(asked: str) -> None:
+    depth, points = frame_of_depth(50)
+    open_kind = network(output_kind="unknown", output_scale="unknown")
+    reader = AlignedDepth(open_kind, points, asked)
+    assert torch.allclose(reader(3 / depth + 1), depth, rtol=1e-3)
+    assert reader.alignment is not None
+    assert reader.alignment.reading == "disparity"
+    assert any("read as disparity" in note for note in reader.notes)
+
+
+def test_one_point_shows_the_factor_of_a_relative_network() -> None:
+    depth, points = frame_of_depth(1)
+    reader = AlignedDepth(network(output_scale="affine"), points, "auto")
+    assert torch.allclose(reader(depth / 7), depth, rtol=1e-3)
 
 
 def test_weights_come_from_the_named_file_or_the_definition_never_by_chance(tmp_path: Path) -> None:
