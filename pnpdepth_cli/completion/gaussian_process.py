@@ -92,6 +92,12 @@ class Residuals:
         """The residuals with the kernel of smallest leave-one-out error."""
         return fit(self)
 
+    @functools.cached_property
+    def leave_one_out_error(self) -> float:
+        """The mean |error| of log depth at points, each predicted from the others."""
+        error, _ = leave_one_out(self.fitted, neighbourhoods(self, _MAX_EXACT))
+        return float(error.abs().mean())
+
     def scaled(self, features: Tensor) -> Tensor:
         """Returns features (..., 3 or 6) divided by their length scales."""
         lengths = [1.0, 1.0, self.depth_length]

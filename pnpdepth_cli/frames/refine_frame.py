@@ -18,13 +18,14 @@ from pnpdepth_cli.completion.outliers import far_points
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.experts import (
     Experts,
+    Judged,
     fused_experts,
     networks_alone,
     weighted_mean,
     with_mirrored,
 )
-from pnpdepth_cli.frames.frame import Frame, Prediction, Refined, Validation, is_dense
-from pnpdepth_cli.frames.fuse import fit_weights, scanner_shares
+from pnpdepth_cli.frames.frame import Frame, Refined, Validation, is_dense
+from pnpdepth_cli.frames.fuse import Share, fit_weights, shares_on_lines, with_shares
 from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
 from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
@@ -73,21 +74,22 @@ def refine_frame(
     # judges, else the user's: a useless network does not decide which points are used.
     judge = next((network for network in networks if network.weighs_points), networks[0])
     if pipeline.leaves_outliers_out:
-        inliers, judged, field = without_outliers(judge, frame)
+        judged = without_outliers(judge, frame)
     else:
-        inliers, judged, field = Judged(frame, judge.refine(frame))
+        judged = Judged(judge, frame, judge.refine(frame))
+    inliers = judged.inliers
     # A fifth of the inliers are validation points, which every expert predicts from the others.
     split = whole_frame(inliers, pipeline.propagation)
     if pipeline.validates:
-        split = split_frame(split, judged.aligned, networks, seed=seed)
+        split = split_frame(split, judged.prediction.aligned, networks, seed=seed)
     # The experts predict: the networks, z updated, and what a network makes of their depth.
     fusing = None
     if pipeline.fuses:
         fusing = next((network for network in networks if network.takes_prior), None)
     if fusing is None:
-        experts = networks_alone(networks, split, {judge: judged})
+        experts = networks_alone(networks, split, judged)
     else:
-        experts = fused_experts(networks, fusing, split, {judge: judged})
+        experts = fused_experts(networks, fusing, split, judged)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts.every, split)
     if fusing is not None:
@@ -96,16 +98,16 @@ def refine_frame(
     fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in having])
     # Points far from the depth of a network that weighs them are outliers, too.
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
-        inliers = inliers.without(far_points(judged.aligned, inliers.points))
+        inliers = inliers.without(far_points(judged.prediction.aligned, inliers.points))
     # The residual at the inliers is propagated to every pixel.
-    depth = propagated = _propagated(fused, inliers, split, field)
-    # On scan lines, a completion network of that scanner has most of the result.
-    shares = scanner_shares(experts.every, split, weights) if pipeline.fuses else {}
-    if shares:
-        dense = {expert.name: expert.dense for expert in experts.every}
-        depth = _with_shares(propagated, dense, shares)
+    depth = propagated = _propagated(fused, inliers, split, judged.field)
+    # On scan lines, validation points do not show what some networks are worth.
+    shares = list[Share]()
+    if pipeline.fuses and split.has_scan_lines:
+        shares = shares_on_lines(experts, split, inliers, weights)
+        depth = with_shares(propagated, [(share.dense, share.part) for share in shares])
     steps = Steps(
-        judged=field,
+        judged=judged.field,
         fused=fused,
         propagated=propagated,
         depth=depth,
@@ -125,25 +127,18 @@ class Steps(NamedTuple):
     judged: ResidualField | None  # that told the outliers. None: none did
     fused: Tensor  # (H, W) metres
     propagated: Tensor  # (H, W) metres, its residual propagated
-    depth: Tensor  # (H, W) metres, with the shares of completion networks of the scanner
+    depth: Tensor  # (H, W) metres, with the shares of single networks
     weights: Mapping[str, float]  # of the experts in `fused`
-    shares: Mapping[str, float]  # of completion networks of the scanner in `depth`
+    shares: list[Share]  # of single networks in `depth`
 
     @property
     def weights_in_depth(self) -> dict[str, float]:
         """The weights of all experts in the result; their sum is 1."""
-        rest = 1 - sum(self.shares.values())
-        return {name: rest * w + self.shares.get(name, 0.0) for name, w in self.weights.items()}
-
-
-class Judged(NamedTuple):
-    """A frame without its outliers."""
-
-    inliers: Frame
-    prediction: Prediction
-    """What the network that judges gives for it."""
-    field: ResidualField | None = None
-    """The field that told the outliers. None: none did."""
+        rest = 1 - sum(share.part for share in self.shares)
+        weights = {name: rest * weight for name, weight in self.weights.items()}
+        for share in self.shares:
+            weights[share.name] += share.part
+        return weights
 
 
 def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
@@ -156,21 +151,22 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
         NoPointsError: No point lies where the network predicts.
     """
     points = frame.points
-    suspected = ResidualField(torch.ones(points.size), points, frame.rgb).outliers
+    constant = ResidualField(torch.ones(points.size), points, frame.rgb)
+    suspected = constant.outliers
     # A network that weighs its points is given the outliers too, once they are known.
     again = bool(suspected.any()) and judge.weighs_points
     consistent = frame
     if bool(suspected.any()):
         consistent = replace(frame, points=points.select(~suspected))
-    judged = judge.refine(consistent, updates=not again)
-    field = ResidualField(judged.aligned, points, frame.rgb)
+    prediction = judge.refine(consistent, updates=not again)
+    field = ResidualField(prediction.aligned, points, frame.rgb)
     outlying = field.outliers
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     if again or not torch.equal(outlying, suspected):
-        judged = judge.refine(inliers)
-    return Judged(inliers, judged, field)
+        prediction = judge.refine(inliers)
+    return Judged(judge, inliers, prediction, field, constant)
 
 
 def _propagated(
@@ -188,12 +184,6 @@ def _propagated(
     if field is None or not field.is_of(depth, frame.points):
         field = ResidualField(depth, frame.points, frame.rgb)
     return field.depth(kind=split.propagation)
-
-
-def _with_shares(depth: Tensor, own: Mapping[str, Tensor], shares: Mapping[str, float]) -> Tensor:
-    """Depth (…) with the own depths of completion networks, whose shares are by name."""
-    rest = (depth, 1 - sum(shares.values()))
-    return weighted_mean([rest, *((own[name], share) for name, share in shares.items())])
 
 
 def _refined(
@@ -218,6 +208,12 @@ def _refined(
             " the others"
         )
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
+    not_updated = experts.own.not_updated
+    if not_updated > 0:
+        notes.append(
+            f"{experts.own.name} is strong: its depth makes points predict each other far better;"
+            f" {not_updated:.0%} of it is without updates of z"
+        )
     if pipeline.unused and not own.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
         notes.append(
@@ -253,7 +249,7 @@ def _stages(
 
     own = experts.own
     stages = {BEFORE: own.whole.aligned}
-    if own.whole.updates:
+    if own.whole.updates and own.not_updated < 1:
         stages[UPDATED] = own.whole.updated
     if own.of_scanner:
         stages[PROPAGATED] = own.whole.updated
@@ -265,7 +261,7 @@ def _stages(
 
 
 def _validation(
-    experts: Experts, split: ValidatedFrame, shares: Mapping[str, float]
+    experts: Experts, split: ValidatedFrame, shares: Sequence[Share]
 ) -> Validation | None:
     """The stages and the result at the validation points; None without any.
 
@@ -293,8 +289,7 @@ def _validation(
         predicted[PROPAGATED] = own.at
     if experts.alone is not None:
         predicted[ALONE] = experts.alone.at
-    updated = {expert.name: expert.updated for expert in experts.every}
-    predicted[AFTER] = _with_shares(result, updated, shares)
+    predicted[AFTER] = with_shares(result, [(share.at, share.part) for share in shares])
     predicted[LINEAR] = linear(given, points.xy)
     return Validation(
         points=points,

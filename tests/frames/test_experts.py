@@ -9,21 +9,28 @@ import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.experts import (
     Experts,
+    Judged,
     NetworkExpert,
+    strength,
     trust,
     weighted_mean,
     with_mirrored,
 )
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
+from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
 from pnpdepth_cli.frames.validation import MIN_POINTS
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import ClosedSettings
 from tests.frames.scenes import (
     SIZE,
     Brightness,
     Nearest,
     compact,
+    depth_of_scene,
     frame_in_memory,
     member,
     network_expert,
@@ -104,3 +111,45 @@ def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
     assert torch.allclose(mean, torch.tensor([4.0**0.25, 3.0, 0.0]))
     alone = torch.tensor([2.0, 3.0, 7.0, 0.0])
     assert torch.equal(weighted_mean([(alone, 0.3), (alone + 1, 0.0)]), alone)
+
+
+def judged_with(points: SparsePoints) -> Judged:
+    """A frame of these points whose outliers were sought beside a constant depth."""
+    network = member(Brightness)
+    frame = replace(frame_in_memory(), points=points)
+    constant = ResidualField(torch.ones(SIZE), points, frame.rgb)
+    return Judged(network, frame, network_expert("net", points.depth).whole, None, constant)
+
+
+def test_a_network_is_strong_as_far_as_its_depth_predicts_points_from_each_other() -> None:
+    frame = frame_in_memory(100)
+    split = replace(split_of(frame.points.depth), whole=frame)
+    judged = judged_with(frame.points)
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.randn(SIZE, generator=generator)
+    found = [
+        strength(depth_of_scene() * (error * noise).exp(), split, judged)
+        for error in (0.0, 0.002, 0.5)
+    ]
+    assert found[0] == 1
+    assert found[0] >= found[1] > found[2] == 0
+    few = replace(split, whole=replace(frame, points=frame.points.select(slice(MIN_POINTS - 1))))
+    lines = replace(split, has_scan_lines=True)
+    assert [strength(depth_of_scene(), each, judged) for each in (few, lines)] == [0, 0]
+
+
+@pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])
+def test_z_of_a_strong_network_is_updated_only_if_the_user_says_so(
+    stated: bool, updates: int
+) -> None:
+    class Exact(Brightness):
+        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+            return self.layer(depth_of_scene()[None, None] + 0 * rgb[:, :1])
+
+    frame = frame_in_memory(60)
+    settings = ClosedSettings(iterations=3, lr="5%", align="scale")
+    network = member(Exact, settings=settings, always_updated=stated)
+    with opened(network, compact()) as networks:
+        result = refine_frame(networks, frame, Pipeline())
+    assert len(result.losses) - 1 == updates
+    assert result.weights["exact"] > 0.3

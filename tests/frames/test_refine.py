@@ -30,7 +30,7 @@ PAPER = pipeline_of(Settings(method="paper"))
 def refined(
     build: type[Brightness], frame: Frame, settings: ClosedSettings = SETTINGS, **definition: object
 ) -> Refined:
-    with opened(member(build, settings=settings, **definition)) as (network,):
+    with opened(member(build, settings=settings, always_updated=True, **definition)) as (network,):
         return refine_frame([network], frame, PAPER)
 
 

@@ -68,7 +68,8 @@ def scan_frame() -> Frame:
 @pytest.mark.parametrize(("of_scanner", "kind"), [(False, "gp"), (True, "local")])
 def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kind: str) -> None:
     frame, gt = scan_frame() if of_scanner else frame_in_memory(60), depth_of_scene().numpy()
-    result = refined(frame, member(Brightness, settings=UPDATES), with_stages=True)
+    own = member(Brightness, settings=UPDATES, always_updated=True)
+    result = refined(frame, own, with_stages=True)
     assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
     expected = ResidualField(updated, result.used, frame.rgb).depth(kind=kind)
