@@ -69,9 +69,10 @@ def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
         seconds = time.process_time() - start
         prior = depth_with_prior(method, inputs, refined)
     depths = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+    depths.setdefault(UPDATED, depths[BEFORE])  # of a network whose z was not updated
     depths |= {
         WITH_PRIOR: prior,
-        AFTER: torch.from_numpy(refined.after),
+        AFTER: torch.from_numpy(refined.depth),
         LINEAR: linear(inputs.points),
     }
     errors = errors_of(depths, torch.from_numpy(frame.gt))
@@ -122,8 +123,8 @@ def weights_by_kind(network: str, refined: Refined) -> dict[str, float]:
 def within_sigma(refined: Refined, gt: np.ndarray[Any, Any]) -> float:
     """The part of the truth that is within two standard deviations of the result."""
     assert refined.sigma is not None
-    known = (gt > 0) & (refined.after > 0)
-    error = np.abs(gt - refined.after)[known]
+    known = (gt > 0) & (refined.depth > 0)
+    error = np.abs(gt - refined.depth)[known]
     return float((error <= SIGMAS * refined.sigma[known]).mean())
 
 
