@@ -1,0 +1,212 @@
+"""What the default makes of networks of any strength: `python -m benchmarks.strong --data PATH`.
+
+Rows are stored predictions of strong networks (`strong/` in PATH), networks of 2, 4 and 9 % error
+that are simulated on frames with truth, FastDepth, the tiny networks, and networks of random
+weights. Each is given 5 to 500 points at random pixels, or scan lines.
+
+For each row, set and number of points the table has geometric means over frames and seeds of the
+MAE in metres: the network aligned with the points, its z updated, its residual propagated;
+`compact` alone, and with the aligned depth as its prior; the result; linear interpolation. All are
+scored on the same pixels, those with ground truth. Below are the mean weights in the result, and
+the part of the truth within ± 2σ.
+
+    python -m benchmarks.strong --data PATH --groups stored --points 20 100 500
+
+`--json FILE` keeps every run. `--tables FILE ...` prints the tables of such files and measures
+nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.frames import drawn_inputs, errors_of, print_row
+from benchmarks.strong_maps import GROUPS, StrongFrame, can_draw, strong_frames, with_lines
+from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.completion.propagation import propagate
+from pnpdepth_cli.frames import fuse
+from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.scan_pattern import scan_pattern
+from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
+
+COUNTS = (5, 10, 20, 50, 100, 500)
+LINES = "lines"
+WITH_PRIOR = "with prior"
+"""A column of the table: `compact` with the aligned depth as its prior."""
+STAGES = (BEFORE, UPDATED, PROPAGATED, ALONE, WITH_PRIOR, AFTER, LINEAR)
+HEADS = ("aligned", "z updated", "propagated", "compact", "with prior", "**result**", "linear")
+OWN = ("network", "network as prior", "compact", "no image")
+"""Kinds of experts, whose weights are shown."""
+ALL = "all"
+"""Instead of a set: every frame of the row."""
+SIGMAS = 2
+
+Run = dict[str, Any]
+"""One frame, network, number of points and seed: MAE by stage, weights by kind of expert."""
+
+
+def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
+    """The run of one frame with so many points; None: scan lines."""
+    frame = case.frame if count is not None else with_lines(case.frame)
+    inputs = drawn_inputs(frame, count, seed)
+    start = time.process_time()
+    with Method([case.network], Settings(seed=seed), inputs, uncertainty=True) as method:
+        refined = method.refine(inputs)
+        seconds = time.process_time() - start
+        prior = depth_with_prior(method, inputs, refined)
+    depths = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+    depths.setdefault(UPDATED, depths[BEFORE])  # of a network whose z was not updated
+    depths |= {
+        WITH_PRIOR: prior,
+        AFTER: torch.from_numpy(refined.depth),
+        LINEAR: linear(inputs.points),
+    }
+    errors = errors_of(depths, torch.from_numpy(frame.gt))
+    return {
+        "row": case.row,
+        "set": case.set,
+        "frame": frame.name,
+        "network": case.network.definition.name,
+        "points": LINES if count is None else count,
+        "seed": seed,
+        "mae": {stage: errors[stage][0] for stage in STAGES},
+        "rmse": {stage: errors[stage][1] for stage in STAGES},
+        "weights": weights_by_kind(case.network.definition.name, refined),
+        "within": within_sigma(refined, frame.gt),
+        "cpu_s": seconds,
+    }
+
+
+def depth_with_prior(method: Method, inputs: Frame, refined: Refined) -> Tensor:
+    """(H, W) metres: what `compact` alone makes of the network's aligned depth as its prior.
+
+    It is not updated, sees the mirrored frame as well where the points are few, and its residual is
+    propagated, as in the default method.
+    """
+    (compact,) = (member for member in method.members if member.takes_prior)
+    prior = torch.from_numpy(refined.before)
+    frame = replace(inputs.registered(), points=refined.used.tensors(), prior=prior)
+    compact.next_image()
+    depths = [(fuse.predict(compact, frame, updates=False).after, 1.0)]
+    if len(frame.points) < fuse.MIRRORED_BELOW:
+        compact.next_image()
+        turned = fuse.predict(compact, frame.mirrored(), updates=False)
+        depths.append((turned.after.flip(-1), 1.0))
+    has_lines = scan_pattern(frame.points.xy, frame.points.size) is not None
+    kind = "local" if has_lines else "gp"
+    return propagate(fuse.weighted_mean(depths), frame.points, frame.rgb, kind=kind)
+
+
+def weights_by_kind(network: str, refined: Refined) -> dict[str, float]:
+    """The weights of the result, by the kinds of `OWN`."""
+    kinds = {network: OWN[0], f"compact with {network}": OWN[1], "compact": OWN[2]}
+    weights = dict.fromkeys(OWN, 0.0)
+    for name, weight in refined.weights.items():
+        weights[kinds.get(name, OWN[3])] += weight
+    return weights
+
+
+def within_sigma(refined: Refined, gt: np.ndarray[Any, Any]) -> float:
+    """The part of the truth that is within two standard deviations of the result."""
+    assert refined.sigma is not None
+    known = (gt > 0) & (refined.depth > 0)
+    error = np.abs(gt - refined.depth)[known]
+    return float((error <= SIGMAS * refined.sigma[known]).mean())
+
+
+def print_tables(runs: Sequence[Run]) -> None:
+    """Prints the MAE of every row, set and number of points, and the weights and σ below."""
+    cases = defaultdict[tuple[str, str, Any], list[Run]](list)
+    for run in runs:
+        cases[run["row"], run["set"], run["points"]].append(run)
+    # Rows of several sets have a line of all their frames, too.
+    for row in {row for row, _, _ in cases}:
+        names = {name for other, name, _ in cases if other == row}
+        for run in [run for run in runs if run["row"] == row and len(names) > 1]:
+            cases[row, ALL, run["points"]].append(run)
+    order = {number: place for place, number in enumerate((*COUNTS, LINES))}
+    first = list(dict.fromkeys((run["row"], run["set"]) for run in runs))
+    places = {case: place for place, case in enumerate(first)}
+    last_of_row = {row: place for (row, _), place in places.items()}
+
+    def place(case: tuple[str, str, Any]) -> tuple[float, float]:
+        row, name, points = case
+        at = last_of_row[row] + 0.5 if name == ALL else places[row, name]
+        return at, order.get(points, points)
+
+    ordered = sorted(cases, key=place)
+    print_row("network", "set", "runs", "points", *HEADS, "result / best of one", head=True)
+    for row, name, points in ordered:
+        mean = {stage: geometric_mean(cases[row, name, points], stage) for stage in STAGES}
+        best = min(mean[stage] for stage in STAGES if stage != AFTER)
+        cells = [f"{mean[stage]:.4f}" for stage in STAGES]
+        cells[STAGES.index(AFTER)] = f"**{mean[AFTER]:.4f}**"
+        runs_of = len(cases[row, name, points])
+        print_row(row, name, runs_of, points, *cells, f"{mean[AFTER] / best - 1:+.1%}")
+    print()
+    print_row("network", "set", "points", *OWN, "within ± 2σ", "CPU s", head=True)
+    for row, name, points in ordered:
+        some = cases[row, name, points]
+        weights = [f"{np.mean([run['weights'][kind] for run in some]):.0%}" for kind in OWN]
+        within = np.mean([run["within"] for run in some])
+        seconds = np.median([run["cpu_s"] for run in some])
+        print_row(row, name, points, *weights, f"{within:.1%}", f"{seconds:.1f}")
+
+
+def geometric_mean(runs: Sequence[Run], stage: str) -> float:
+    """The geometric mean of the MAE of a stage over runs."""
+    return float(np.exp(np.mean([np.log(run["mae"][stage]) for run in runs])))
+
+
+def count_of(text: str) -> int | None:
+    """The number of points, or None for scan lines."""
+    return None if text == LINES else int(text)
+
+
+def main() -> None:
+    """Measure, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, help="the folder of real frames")
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=GROUPS)
+    parser.add_argument("--sets", nargs="+", help="only these")
+    parser.add_argument("--rows", nargs="+", help="only these rows, such as 'simulated, 2 %%'")
+    parser.add_argument("--points", nargs="+", default=[*map(str, COUNTS), LINES])
+    parser.add_argument("--frames", type=int, default=3, help="frames of each set with truth")
+    parser.add_argument("--seeds", type=int, default=1, help="draws of the points of each frame")
+    parser.add_argument("--json", type=Path, help="file that every run is written to")
+    parser.add_argument("--tables", type=Path, nargs="+", help="print the runs of such files only")
+    args = parser.parse_args()
+    if args.tables:
+        print_tables([run for file in args.tables for run in json.loads(file.read_text())])
+        return
+    if args.data is None:
+        parser.error("--data is needed to measure")
+    runs = list[Run]()
+    for case in strong_frames(args.data, args.groups, args.sets, args.frames):
+        if args.rows and case.row not in args.rows:
+            continue
+        for count in map(count_of, args.points):
+            for seed in range(args.seeds if can_draw(case.frame, count) else 0):
+                runs.append(measure(case, count, seed))
+                if args.json:
+                    args.json.write_text(json.dumps(runs))
+        print(f"{len(runs)} runs, the last {case.row}, {case.frame.name}", file=sys.stderr)
+    print_tables(runs)
+
+
+if __name__ == "__main__":
+    main()
