@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.frames import MORE_SETS, OUTLIERS, SETS, EvalFrame, opened, print_row
 from benchmarks.alignment_outputs import as_outputs, simulated_depth
+from benchmarks.frames import MORE_SETS, OUTLIERS, SETS, EvalFrame, opened, print_row
 from pnpdepth_cli.completion import alignment, robust_line
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates, to_space
 from pnpdepth_cli.errors import PnpDepthError

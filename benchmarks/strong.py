@@ -35,11 +35,11 @@ from torch import Tensor
 from benchmarks.frames import drawn_inputs, errors_of, print_row
 from benchmarks.strong_maps import GROUPS, StrongFrame, can_draw, strong_frames, with_lines
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.completion.propagation import propagate
-from pnpdepth_cli.frames import fuse
+from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.frames.experts import weighted_mean
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.scan_pattern import scan_pattern
+from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
 from pnpdepth_cli.settings import Settings
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
@@ -65,7 +65,7 @@ def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
     inputs = drawn_inputs(frame, count, seed)
     start = time.process_time()
     with Method([case.network], Settings(seed=seed), inputs, uncertainty=True) as method:
-        refined = method.refine(inputs)
+        refined = method.refine(inputs, with_stages=True)
         seconds = time.process_time() - start
         prior = depth_with_prior(method, inputs, refined)
     depths = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
@@ -101,14 +101,13 @@ def depth_with_prior(method: Method, inputs: Frame, refined: Refined) -> Tensor:
     prior = torch.from_numpy(refined.before)
     frame = replace(inputs.registered(), points=refined.used.tensors(), prior=prior)
     compact.next_image()
-    depths = [(fuse.predict(compact, frame, updates=False).after, 1.0)]
-    if len(frame.points) < fuse.MIRRORED_BELOW:
+    depths = [(compact.refine(frame, updates=False).updated, 1.0)]
+    if len(frame.points) < MIRRORED_BELOW:
         compact.next_image()
-        turned = fuse.predict(compact, frame.mirrored(), updates=False)
-        depths.append((turned.after.flip(-1), 1.0))
-    has_lines = scan_pattern(frame.points.xy, frame.points.size) is not None
-    kind = "local" if has_lines else "gp"
-    return propagate(fuse.weighted_mean(depths), frame.points, frame.rgb, kind=kind)
+        turned = compact.refine(frame.mirrored(), updates=False)
+        depths.append((turned.updated.flip(-1), 1.0))
+    field = ResidualField(weighted_mean(depths), frame.points, frame.rgb)
+    return field.depth(kind=refined.propagation)
 
 
 def weights_by_kind(network: str, refined: Refined) -> dict[str, float]:
