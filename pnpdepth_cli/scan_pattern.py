@@ -64,7 +64,8 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
 def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
     """The median distance in pixels from a point to the next in its row or a row beside it."""
     width = int(column.max()) + 1
-    pixels = np.unique(row * width + column)
+    pixels = np.sort(row * width + column)
+    pixels = pixels[np.diff(pixels, prepend=-1) > 0]  # np.unique takes 100 times as long
     row, column = np.divmod(pixels, width)
     gaps = np.full(len(pixels), np.inf)
     for beside in row - 1, row, row + 1:

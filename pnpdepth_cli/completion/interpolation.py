@@ -92,7 +92,8 @@ class Triangulation:
     def dense(self, space: str = "depth") -> Tensor:
         """Returns depth (H, W) float32 metres at every pixel, computed once."""
         if space not in self._dense:
-            depth = self._depth(self._pixels(), space)
+            pixels = pixels_of(self._points.size).numpy()
+            depth = self._depth(pixels, self._pixels(), space)
             self._dense[space] = depth.reshape(self._points.size)
         return self._dense[space]
 
@@ -102,7 +103,7 @@ class Triangulation:
         positions, number = Positions.of(here)
         few = len(self._rim) > _FEW * len(here)
         triangles = self._triangles_at(here) if few else self._triangles
-        return self._depth(self._located(here, triangles, positions, number), space)
+        return self._depth(here, self._located(here, triangles, positions, number), space)
 
     @functools.cached_property
     def _rim(self) -> Numbers:
@@ -122,7 +123,7 @@ class Triangulation:
         return self._rim[delaunay_at(self._xy[self._rim], xy)]
 
     def _pixels(self) -> _Located:
-        """Every pixel, row after row."""
+        """Where each pixel lies, row after row."""
         rows, columns = (np.arange(float(count)) for count in self._points.size)
         pixels = pixels_of(self._points.size).numpy()
         return self._located(pixels, self._triangles, Positions(columns=columns, rows=rows))
@@ -134,7 +135,7 @@ class Triangulation:
         positions: Positions,
         number: Numbers | slice = slice(None),  # of the position of each of xy
     ) -> _Located:
-        """Positions (M, 2) with the triangles, squares and nearest points that hold them."""
+        """In which triangle or square, or near which point, each position (M, 2) lies."""
         held = cover(self._xy[triangles], positions)[number]
         if self._grid is not None:
             held = np.where(self._grid.squares(xy)[0], _IN_SQUARE, held)
@@ -142,21 +143,21 @@ class Triangulation:
         nearest = np.empty(0, np.intp)
         if len(outside):
             nearest = nearest_points(self._points, outside, 1)[1][:, 0].numpy()
-        return _Located(xy, triangles, held, nearest)
+        return _Located(triangles, held.astype(np.int32), nearest)
 
-    def _depth(self, where: _Located, space: str) -> Tensor:
-        """(M,) metres at located positions."""
+    def _depth(self, xy: Floats, where: _Located, space: str) -> Tensor:
+        """(M,) metres at positions (M, 2) that are located."""
         depth = self._points.depth.cpu().double()
-        value, result = to_space(depth, space).numpy(), np.empty(len(where.xy))
+        value, result = to_space(depth, space).numpy(), np.empty(len(xy))
         for first in range(0, len(result), _CHUNK):
             some = slice(first, first + _CHUNK)
-            xy, number, part = where.xy[some], where.number[some], result[some]
+            at, number, part = xy[some], where.number[some], result[some]
             in_triangle = number >= 0
             corners = where.triangles[number[in_triangle]]
-            shares = barycentric(self._xy[corners], xy[in_triangle])
+            shares = barycentric(self._xy[corners], at[in_triangle])
             part[in_triangle] = (shares * value[corners]).sum(axis=1)
             if self._grid is not None:
-                in_square, corners, shares = self._grid.squares(xy)
+                in_square, corners, shares = self._grid.squares(at)
                 part[in_square] = (shares * value[corners]).sum(axis=1)
         dense = from_space(torch.from_numpy(result), space)
         dense[torch.from_numpy(where.number == _OUTSIDE)] = depth[torch.from_numpy(where.nearest)]
@@ -164,13 +165,11 @@ class Triangulation:
 
 
 class _Located(NamedTuple):
-    """Positions, and where each lies."""
+    """Where M positions lie."""
 
-    xy: Floats
-    """(M, 2) pixel coordinates."""
     triangles: Numbers
     """(T, 3) numbers of the points at the corners of triangles."""
-    number: Numbers
+    number: NDArray[np.int32]
     """(M,) of the triangle that holds the position, or `_IN_SQUARE`, or `_OUTSIDE`."""
     nearest: Numbers
     """Number of the point nearest to each position outside."""
