@@ -264,12 +264,15 @@ def table(of: Sequence[Case], outliers: str | None) -> None:
         print_row(*group, *("" if mean is None else f"{math.exp(mean):.2f}" for mean in means))
 
 
+SHIPPED_BIC = alignment._bic
+
+
 def _bic(price: float) -> Callable[[alignment.Alignment], float]:
     """BIC with another price of a parameter."""
 
     def criterion(fit: alignment.Alignment) -> float:
-        none = replace(fit, kind="none")
-        return alignment._bic(none) + price * (alignment._bic(fit) - alignment._bic(none))
+        none = SHIPPED_BIC(replace(fit, kind="none"))
+        return none + price * (SHIPPED_BIC(fit) - none)
 
     return criterion
 
@@ -292,12 +295,12 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
     "bounds": (alignment, "BEYOND", {"2": 2.0, "3": 3.0, "5": 5.0, "10": 10.0}),
     "width of the loss": (
         *(robust_line, "_CAUCHY"),
-        {"1": 1.0, "2.385": 2.385, "5": 5.0, "1000 (least squares)": 1000.0},
+        {"0.5": 0.5, "1": 1.0, "1.5": 1.5, "2.385": 2.385, "1000 (least squares)": 1000.0},
     ),
     "price of a parameter": (
         *(alignment, "_bic"),
         {
-            "BIC": alignment._bic,
+            "BIC": SHIPPED_BIC,
             "half of it": _bic(0.5),
             "twice of it": _bic(2.0),
             "error by degree of freedom": _error_by_freedom,
@@ -311,11 +314,12 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
 """By constant: where it is, and the values that are tried."""
 
 
-def trial(of: Sequence[Case], outliers: Sequence[str | None]) -> None:
+def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str | None]) -> None:
     """Prints the value of each constant that is chosen with each set and network left out."""
     of = [case for case in of if case.set != "strong" and not case.set.startswith("tum")]
     print_row("constant", "value", "ratio to the shipped value, by left out", head=True)
-    for constant, (module, attribute, values) in TRIALS.items():
+    for constant in constants:
+        module, attribute, values = TRIALS[constant]
         found = dict[str, dict[tuple, float]]()
         for value_name, value in values.items():
             with patch.object(module, attribute, value):
@@ -350,12 +354,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--rendered", type=Path, help="folder of rendered shards")
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
-    parser.add_argument("--trial", action="store_true", help="choose the constants again")
+    parser.add_argument("--trial", nargs="+", choices=TRIALS, help="choose these constants again")
     parser.add_argument("--every", type=int, default=1, help="only every nth case")
     args = parser.parse_args()
     of = list(cases(args.data, args.rendered))[:: args.every]
     if args.trial:
-        trial(of, (None, args.outliers) if args.outliers else (None,))
+        trial(of, args.trial, (None, args.outliers) if args.outliers else (None,))
     else:
         table(of, args.outliers)
 

@@ -35,7 +35,8 @@ FARTHEST_DEPTH = 1e4
 _OFF = 1.5  # a prediction that is this factor off the points at the median gets a word of warning
 _NO_BETTER = 0.95
 """Misfit over that of a constant from which on a network is said to know nothing of the scene."""
-_ENOUGH = 20  # fewer points do not say so
+_ENOUGH = 20
+"""Points from which on the errors there say that a network knows nothing, or that many are off."""
 _MANY_OUTLIERS = 0.25
 """Fraction of the points that may be far off the aligned prediction without a warning."""
 _MOST_LOST = 0.5
@@ -268,7 +269,7 @@ class AlignedDepth:
                 f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
                 f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
             )
-        if fit.outliers > _MANY_OUTLIERS:
+        if fit.points >= _ENOUGH and fit.outliers > _MANY_OUTLIERS:
             notes.append(
                 f"warning: {fit.outliers:.0%} of {fit.points:,} points are far off the aligned"
                 " prediction; are they in metres, in the frame of this image, and is the network's"

@@ -120,6 +120,9 @@ def test_far_depth_does_not_fly_away_where_near_points_are_many() -> None:
         (lambda d: 2 + d.log(), ("log", "scale")),
         (lambda d: 2 - 0.3 * d.log(), ("log", "affine")),
         (lambda d: 5 * d.sqrt(), ("power", "affine")),
+        (lambda d: 3 / d.sqrt(), ("power", "affine")),
+        (lambda d: d.square() / 7, ("power", "affine")),
+        (lambda d: d.log10(), ("log", "affine")),
         (lambda d: 1 / (9 / d + 3), ("inverted-disparity", "affine")),
     ],
 )
