@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,7 +250,7 @@ def _read_run(text: str) -> Run:
         scores = [frame.errors[GT][stage] for frame in scored]
         if not scores:
             raise InputError(f"{path}: no frame has scores; refine or evaluate with ground truth")
-        measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
+        measures = [_read_measure(entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
@@ -265,6 +266,14 @@ def _read_run(text: str) -> Run:
         why = f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))})"
         hint = "give what eval --json printed, or the summary of a batch with ground truth"
         raise InputError(f"{why}; {hint}") from error
+
+
+def _read_measure(entry: Mapping[str, Any]) -> Measure:
+    """The measure of an entry that `Measure.to_json` gave; an error of Python's if it is none."""
+    measure = Measure(**entry)
+    if not (isinstance(measure.key, str) and measure.heading and measure.text(1.0)):
+        raise ValueError(f"{measure.key!r} is no measure")
+    return measure
 
 
 def comparison_table(comparison: Comparison) -> Table:

@@ -169,6 +169,24 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
         assert "ValueError" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"better": None}, {"better": []}, {"decimals": "x"}, {"shown_factor": ""}, {"key": 5}]
+)
+def test_a_file_whose_measures_cannot_be_shown_is_refused(
+    tmp_path: Path, wrong: dict[str, object]
+) -> None:
+    frame(tmp_path, [[11, 11]], [[10, 10]])
+    good = scored(tmp_path).to_json()
+    measures = good["measures"]
+    assert isinstance(measures, list)
+    for name, first in (("good", measures[0]), ("bad", measures[0] | wrong)):
+        write_json(tmp_path / f"{name}.json", good | {"measures": [first, *measures[1:]]})
+    paths = [str(tmp_path / f"{name}.json") for name in ("good", "bad")]
+    compare([paths[0], paths[0]])
+    with pytest.raises(InputError, match=r"bad\.json"):
+        compare(paths)
+
+
 def refined(folder: Path, mae: float, **varied: str) -> str:
     """A batch of one frame whose MAE was 1 m before refinement."""
     stages: dict[str, Scores] = {"before": {"mae": 1.0}, "after": {"mae": mae}}
