@@ -185,6 +185,22 @@ def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path)
     assert list(own.parent.iterdir()) == [own]
 
 
+def test_the_users_own_files_beside_frames_stay_and_a_folder_is_named(tmp_path: Path) -> None:
+    folder, bag = tmp_path / "frames", write_bag(tmp_path / "drive.mcap", without="/tf_static")
+    written(bag, folder)
+    name = next((folder / "rgb").iterdir()).stem
+    own = [f"rgb/{name}.txt", "rgb/mine.png", f"sparse/{name}_mask.png", "poses.txt", "notes.md"]
+    touch(*(folder / each for each in own))
+    written(bag, folder, between=(1, 1), overwrite=True)
+    assert all((folder / each).exists() for each in own)
+    assert not (folder / f"rgb/{name}.png").exists()
+    (folder / "rgb/more").mkdir()
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    with pytest.raises(OutputError, match="more"):
+        written(bag, folder, overwrite=True)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("part", [0.0, 0.5])
 def test_a_bag_that_is_cut_short_is_one_line(kind: str, part: float, tmp_path: Path) -> None:
