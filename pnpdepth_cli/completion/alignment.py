@@ -101,7 +101,10 @@ def align(x: Tensor, points: SparsePoints, spaces: tuple[str, ...], kind: str) -
     x, d = x.detach().cpu().double(), points.depth.detach().cpu().double()
     good = x.isfinite()
     if not bool(good.any()):
-        raise ModelError("the network's output is not finite at any sparse point; nothing to align")
+        raise ModelError(
+            f"the network's prediction is not finite at any of {len(x):,} sparse points; are its"
+            " weights, its input range (`normalise`) and precision right?"
+        )
     x, d = x[good], d[good]
     kinds = ("none", "scale", "affine") if kind == "auto" else (kind,)
     fits = [fit for s in spaces for k in kinds if (fit := _fit(x, d, s, k)) is not None]
