@@ -184,18 +184,19 @@ def cloud(**values: Any) -> None:
     click.echo(f"wrote {what}: {values['output']}")
 
 
-@click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
+@click.command(short_help="Write depth for COLMAP, Nerfstudio, 3DGS, ROS.")
 @click.argument("results", type=options.FILE)
 @click.option("--to", type=click.Choice(list(EXPORTS)), required=True, help="The program.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
 @options.overwrite
 def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
-    """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program.
+    """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program or a viewer.
 
     \b
     pnpdepth export out/ --to nerfstudio -o scene/
     pnpdepth export out/ --to colmap -o dense/               # the undistorted project
     pnpdepth export out/ --to gaussian-splatting -o dense/
+    pnpdepth export out/ --to mcap -o bag/
 
     \b
     colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
@@ -203,6 +204,8 @@ def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
                         start.ply
     gaussian-splatting  inverse_depths/ (its option -d), sparse/0/depth_params.json,
                         and images/ and a model in sparse/0/ unless they are there
+    mcap                a bag of ROS 2, also for Foxglove and Rerun: image, camera_info, depth
+                        (32FC1), sigma, points used, cloud, poses as /tf; needs the extra ros
 
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.

@@ -210,3 +210,44 @@ def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -
     ):
         with pytest.raises(error, match=named):
             export_results(source, output, to="colmap")
+
+
+def test_a_bag_of_frames_without_times_has_steps_and_names_what_it_lacks(root: Path) -> None:
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    _, notes = export_results(results(root), root / "bag", to="mcap")
+    assert "0.1 s" in notes[0]
+    with rosbags.AnyReader([root / "bag"]) as reader:
+        topics = {topic: info.msgcount for topic, info in reader.topics.items()}
+        times = sorted({time_ns for _, time_ns, _ in reader.messages()})
+    assert np.diff(times).tolist() == [10**8] * 2
+    assert topics["/camera/depth/image"] == topics["/tf"] == 3
+    assert "/camera/depth/sigma" not in topics
+    assert sorted(path.name for path in (root / "bag").iterdir()) == [
+        "metadata.yaml",
+        "results.mcap",
+    ]
+    with pytest.raises(OutputError, match="--overwrite"):
+        export_results(root / "out", root / "bag", to="mcap")
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "count"),
+    [("PINHOLE", "plumb_bob", 5), ("OPENCV_FISHEYE", "equidistant", 4)],
+)
+def test_a_bag_has_the_lens_as_ros_names_it(
+    root: Path, tmp_path: Path, camera: str, model: str, count: int
+) -> None:
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    other = tmp_path / "other"
+    other.mkdir()
+    project(other, camera)
+    export_results(results(other), other / "bag", to="mcap")
+    with rosbags.AnyReader([other / "bag"]) as reader:
+        wanted = [each for each in reader.connections if each.topic == "/camera/camera_info"]
+        _, _, data = next(reader.messages(connections=wanted))
+        info = reader.deserialize(data, wanted[0].msgtype)
+    assert (info.distortion_model, len(info.d)) == (model, count)
+    of_record = FrameRecord.read(other / "out/a.json").camera
+    assert of_record is not None
+    expected = [*of_record.distortion, *[0.0] * count][:count]
+    assert info.d.tolist() == expected
