@@ -59,7 +59,7 @@ def read_neighbours(
         )
     own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
     scans, records, notes = dict[int, list[accumulation.Scan]](), list[FileRecord](), list[str]()
-    basis = ""
+    basis, estimated = "", list[str]()
     for each in files.neighbours:
         # The neighbour's points, and the motion that the images show where it is of use.
         source = each.files.sparse or each.files.gt
@@ -77,6 +77,8 @@ def read_neighbours(
             shown, basis = accumulation.motion_of_images(*seen, points, camera)
         # Its motion is that, or of poses, which must not contradict the images.
         motion, poses, off_px = shown, f"{each.poses}: {basis}", 0.0
+        if each.motion is None and motion is not None:
+            estimated.append(f"{_name_of(each.files)} ({basis})")
         if each.motion is not None:
             motion, poses = np.array(each.motion), each.poses
             off_px = 0.0 if shown is None else _distance_px(motion, shown, points, camera)
@@ -109,6 +111,11 @@ def read_neighbours(
         raise InputError(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({basis}); give"
             " --poses, or leave out --accumulate"
+        )
+    if estimated:
+        notes.append(
+            "note: the motion of accumulated points is estimated from the images, from"
+            f" {' and '.join(estimated)}; --poses gives a known one"
         )
     return accumulation.accumulate(own, scans, camera).tensors(), records, notes
 
