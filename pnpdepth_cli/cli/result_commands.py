@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.choices import EXPORTS, UNKNOWN
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
@@ -188,8 +188,15 @@ def cloud(**values: Any) -> None:
 @click.argument("results", type=options.FILE)
 @click.option("--to", type=click.Choice(list(EXPORTS)), required=True, help="The program.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
+@click.option(
+    "--unknown",
+    type=click.Choice(UNKNOWN),
+    default="keep",
+    show_default=True,
+    help="Of 3DGS, which reads no masks: pixels that are not valid keep a depth, or have zero.",
+)
 @options.overwrite
-def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
+def export(results: Path, output: Path, **values: Any) -> None:
     """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program or a viewer.
 
     \b
@@ -214,6 +221,6 @@ def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
     from pnpdepth_cli.commands.exports import export_results
 
     with progress_bar("export", "frame") as show:
-        what, notes = export_results(results, output, to=to, overwrite=overwrite, show=show)
+        what, notes = export_results(results, output, show=show, **values)
     print_notes(notes)
     click.echo(f"wrote {what}: {output}")
