@@ -168,7 +168,7 @@ def _table(
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
     last = stages.AFTER if stages.AFTER in by_stage else stages.PROPAGATED
-    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {}).get("mae")
+    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
@@ -184,8 +184,14 @@ def _table(
         own = by_stage[stage]
         style: Style = "bold" if stage == last else ""
         texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
-        against = "" if stage == stages.LINEAR else change(linear, own.get("mae"))
-        rows.append([*((text, style) for text in (titles[stage], *texts)), against])
+        title = titles[stage]
+        if own.get("frames") != scores.get("frames"):
+            title += f" (over {own['frames']:,} frames)"
+        against: Cell = ("", "")
+        if stage != stages.LINEAR:
+            of_same = own.get("frames") == linear.get("frames")
+            against = change(linear.get("mae") if of_same else None, own.get("mae"))
+        rows.append([*((text, style) for text in (title, *texts)), against])
     return Table(
         title=f"{about}: errors {stages.BASES[basis]}{remark}, {count}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],

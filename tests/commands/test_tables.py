@@ -99,6 +99,21 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
     assert tables.means_tables({}, "m", {}) == []
 
 
+def test_a_mean_over_fewer_frames_says_so_and_is_not_compared() -> None:
+    stages: dict[str, Scores] = {
+        "before": {"mae": 2.0, "frames": 2},
+        "after": {"mae": 1.0, "frames": 3},
+        "linear": {"mae": 4.0, "frames": 3},
+    }
+    titles = tables.stage_titles(record_of("net", weights={"net": 1.0}))
+    (table,) = tables.means_tables({"ground_truth": stages}, "m", titles, ("mae",))
+    assert texts(table) == [
+        ["net, aligned with the points (over 2 frames)", "2.0000 m", "–"],
+        ["fused (net 100%)", "1.0000 m", "-75.0%"],
+        ["linear interpolation of all points", "4.0000 m", ""],
+    ]
+
+
 def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:
     table = Table(columns=["name", MEASURES[0]], rows=[["a,b", -1.5], ["c", None]])
     assert table.csv() == 'name,rmse\n"a,b",-1.5\nc,\n'

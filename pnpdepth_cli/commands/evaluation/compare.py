@@ -138,18 +138,19 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [_means(of_run.tolist(), keys) for of_run in values]
     gains = [{}, *_gains(values, means, measures, clusters)]
+    before = np.array([run.rows(names, keys, BEFORE) for run in runs], np.float64)
     is_unique = len({run.name for run in runs}) == len(runs)
     compared = [
         ComparedRun(
             name=run.name if is_unique else run.path,
             path=run.path,
             mean=mean,
-            before=_means(run.rows(names, keys, BEFORE), keys),
+            before=_means(np.where(known, of_run, math.nan).tolist(), keys),
             varied=run.varied,
             coverage=_means(run.rows(names, [COVERAGE.key]), [COVERAGE.key])[COVERAGE.key],
             gains=of_first,
         )
-        for run, mean, of_first in zip(runs, means, gains, strict=True)
+        for run, mean, of_run, of_first in zip(runs, means, before, gains, strict=True)
     ]
     found = Comparison(
         frames=names,

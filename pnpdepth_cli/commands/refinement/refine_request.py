@@ -34,7 +34,8 @@ class RefineRequest:
     model: str = option(
         "compact",
         "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
-        " FILE.py[:ATTR], which is Python code and is run.",
+        " FILE.py[:ATTR], which is Python code and is run. FILE:[1] or FILE:[z] is a part of its"
+        " output.",
         metavar="NETWORK",
     )
     more_models: tuple[str, ...] = ()

@@ -156,6 +156,16 @@ def test_a_batch_is_compared_with_what_it_started_from_by_groups(tmp_path: Path)
     assert comparison.notes[-1].startswith("warning: 3 groups of frames are too few")
 
 
+def test_errors_before_are_averaged_over_the_frames_of_those_after(tmp_path: Path) -> None:
+    frames: list[dict[str, Scores]] = [
+        {"before": {"mae": before}, "after": {"mae": after}}
+        for before, after in ((2.0, 1.0), (4.0, 3.0), (90.0, None))
+    ]
+    one, two = (saved(tmp_path / name, *frames) for name in ("one", "two"))
+    (first, _) = compare([one, two], columns=["mae"]).runs
+    assert (first.before["mae"], first.mean["mae"]) == (3, 2)
+
+
 BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '{"measures": []}']
 
 
