@@ -97,7 +97,8 @@ def evaluate(
     "--latex",
     type=options.FILE,
     metavar="FILE|-",
-    help="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
+    help="Write a tabular of runs × measures: the best in bold, * where p < 0.05; it needs the"
+    " package booktabs.",
 )
 @options.overwrite
 @options.as_json
@@ -132,7 +133,7 @@ def compare(
 
     A RUN is the output of `pnpdepth eval --json`, or the folder or summary.json of a batch.
     FILE:before takes the depth before refinement. Gains are in per cent of the first run, and
-    positive if the other run is better.
+    positive if the other run is better. Runs of a study are listed in the order of its values.
 
     p is the p-value of a paired permutation test over groups of frames: manifest column group,
     sequence or folder. In a single sequence the groups are blocks as long as its errors are
@@ -150,7 +151,8 @@ def compare(
     print_notes(comparison.notes)
     table = command.comparison_table(comparison)
     methods = command.methods_table(comparison)
-    to_stdout = write_tables({csv: table.csv(), latex: methods.latex()})
+    values = command.comparison_values(comparison)
+    to_stdout = write_tables({csv: values.csv(), latex: methods.latex()})
     if as_json:
         print_json(comparison.to_json())
     elif not to_stdout:

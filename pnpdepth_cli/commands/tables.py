@@ -71,10 +71,10 @@ class Table:
         return [list(map(_cell, row)) for row in self.rows]
 
     def csv(self) -> str:
-        """Returns the cells as they are, None as nothing, below the keys of the measures."""
+        """Returns the cells as they are, None and NaN empty, below the keys of the measures."""
         buffer = io.StringIO()
         keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
-        rows = [[each[0] if isinstance(each, tuple) else each for each in row] for row in self.rows]
+        rows = [list(map(_plain_cell, row)) for row in self.rows]
         csv.writer(buffer, lineterminator="\n").writerows([keys, *rows])
         return buffer.getvalue()
 
@@ -86,6 +86,7 @@ class Table:
         )
         lines = (
             f"% {' '.join(self.title.split())}",
+            r"% needs \usepackage{booktabs}",
             rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
             *(r"\toprule", header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", ""),
         )
@@ -98,6 +99,12 @@ def _cell(value: object) -> Cell:
     if isinstance(value, str):
         return value, ""
     return "" if value is None else f"{value:,}", ""
+
+
+def _plain_cell(value: object) -> object:
+    """A cell without its style; None for what is no number."""
+    plain = value[0] if isinstance(value, tuple) else value
+    return None if isinstance(plain, float) and math.isnan(plain) else plain
 
 
 def _in_latex(text: str, style: Style) -> str:
@@ -172,9 +179,9 @@ def _table(
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
-    count = f"{scores.get('points'):,} points" if "points" in scores else ""
+    count = count_of(scores["points"] or 0, "point") if "points" in scores else ""
     if "frames" in scores:
-        count = f"{scores['frames']:,} frames"
+        count = count_of(scores["frames"] or 0, "frame")
     elif "coverage" in scores:
         count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
     remark = ", where a change proves nothing" * (basis == stages.USED)
