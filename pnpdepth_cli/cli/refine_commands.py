@@ -96,8 +96,9 @@ def refine(as_json: bool, **values: Any) -> None:
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 
-    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and, with
-    ground truth, <name>_improvement.png (blue better, orange worse).
+    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and
+    <name>_improvement.png (blue better, orange worse): with ground truth at each pixel, else at
+    held-out or validation points.
     """
     from pnpdepth_cli.cli.printing import print_refinement
     from pnpdepth_cli.commands.refinement.refine_image import refine_image

@@ -65,7 +65,7 @@ class Records:
     def outputs_of(self, frame: FrameFiles) -> Outputs:
         """Returns the files of a frame's result."""
         output, refine = self.request.output, self.request.refine
-        return refine.outputs_in(output, frame.name, with_gt=frame.gt is not None)
+        return refine.outputs_in(output, frame.name)
 
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
