@@ -90,8 +90,8 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     wanted = layer if layer is not None else definition.default_layer
     if wanted is None:
         raise errors.UsageError(
-            f"network {definition.name!r} has no default layer; `pnpdepth layers --all` lists those"
-            " that --layer can name"
+            f"network {definition.name!r} has no default layer; name one of those that"
+            " `pnpdepth layers` lists"
         )
     try:
         fraction = float(wanted)

@@ -174,14 +174,14 @@ class Network:
         if len(tensors) != 1:
             paths = ", ".join(".".join(path) for path, _ in tensors)
             fact = f"gives a {type(output).__name__} with {len(tensors)} tensors in it ({paths})"
-            way_out = "pick the depth as FILE:[0] behind --model, or by `output` of its definition"
+            way_out = "pick the depth as FILE:[0], or by `output` of its definition"
             raise ModelError(f"{name} {fact}; {way_out}")
         # One map, with or without axes of batch and channel.
         tensor = tensors[0][1].float()
         shape = tuple(tensor.shape)
         if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
             fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
-            way_out = "pick a channel as FILE:[0], z of points as FILE:[z], behind --model"
+            way_out = "pick a channel as FILE:[0], z of points as FILE:[z]"
             raise ModelError(f"{name} {fact}; {way_out}, or by `output` of its definition")
         tensor = tensor.reshape(1, 1, *shape[-2:])
         # Where it is not finite, it is NaN, and no gradient comes from there.
