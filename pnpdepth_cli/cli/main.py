@@ -62,7 +62,10 @@ class _Commands(click.Group):
 
 
 @click.group(
-    cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
+    cls=_Commands,
+    epilog=_EXIT_CODES,
+    # Every command knows both; where the two differ, a command has its own --help-all.
+    context_settings={"help_option_names": ["-h", "--help", "--help-all"]},
 )
 @click.version_option(__version__, prog_name="pnpdepth")
 @click.option(

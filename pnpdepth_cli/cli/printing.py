@@ -119,7 +119,8 @@ def print_batch(summary: BatchSummary, said: set[str]) -> None:
     say(", ".join(parts))
     # Warnings and notes of several frames, each once, weights and files.
     for note, names in summary.frame_notes.items():
-        first = ", ".join([*names[:_NAMED], *["…"] * (len(names) > _NAMED)])
+        first = ", ".join(tables.short_names(names[:_NAMED]))
+        first += ", …" if len(names) > _NAMED else ""
         kind = "warning" if note.startswith("warning") else "note"
         count = tables.count_of(len(names), "frame")
         line = f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}"

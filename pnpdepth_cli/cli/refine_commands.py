@@ -167,7 +167,8 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
 
     The layout of a folder is recognised from its content. The simplest layout has files of the same
     stem in rgb/, sparse/, gt/ (optional) and calib/ (optional). A list has a header with image,
-    sparse, gt, calib, name, …; paths are relative to the list.
+    sparse, gt, calib, name, …; paths are relative to the list. The frames of a BAG are written to
+    OUTPUT_frames/, beside OUTPUT, and stay there for the next run.
 
     Each frame gets the files that `pnpdepth refine` writes. A frame that cannot be refined is
     reported and skipped (exit code 7). The same command run again refines only frames that are

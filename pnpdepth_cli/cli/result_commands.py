@@ -54,10 +54,10 @@ def evaluate(
     pnpdepth eval out/ gt/ --json > runs/a.json
     pnpdepth eval out/ gt/ --protocol eigen --max-depth 50
 
-    Files in folders are matched by name; x_depth.png belongs to x.png, and beside such files all
-    others are left out. GT can also be a data set in a known layout. Frames of GT without a
-    prediction are counted, and the exit code is 7. Options override single settings of the
-    protocol.
+    Files in folders are matched by name; x_depth.png belongs to x.png. A folder PRED with such
+    files has no other predictions. GT can also be a data set in a known layout. Frames of GT
+    without a prediction are counted, and the exit code is 7. Options override single settings of
+    the protocol.
 
     \b
     paper         all known ground truth; mean over images

@@ -47,6 +47,8 @@ _LATEX = str.maketrans(
     }
 )  # fmt: skip
 _NAMED = 5  # of a long list
+_SEPARATOR = re.compile(r"([_/\-])")  # of the parts of a frame's name
+_LEAST_SAVED = 8  # characters for which a name is shortened
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
@@ -125,6 +127,27 @@ def some_names(names: Iterable[str]) -> str:
     return f"{text} and {more:,} more" if more > 0 else text
 
 
+def short_names(names: Sequence[str]) -> list[str]:
+    """Returns the first name in full, and others with … for what they share with it.
+
+    What is shared ends at a separator, so that numbers stay whole.
+    """
+    parts = [_SEPARATOR.split(name) for name in names]
+    start = _shared_parts(parts)
+    end = _shared_parts([own[:start:-1] for own in parts])
+    inner = ["".join(own[start : len(own) - end]) for own in parts]
+    short = [f"{'…' * (start > 0)}{text}{'…' * (end > 0)}" for text in inner]
+    if len(names) < 2 or len(short[0]) + _LEAST_SAVED > len(names[0]):
+        return [*names]
+    return [names[0], *short[1:]]
+
+
+def _shared_parts(names: Sequence[Sequence[str]]) -> int:
+    """How many parts, from the first on, are the same in all names."""
+    same = [len({*parts}) == 1 for parts in zip(*names, strict=False)]
+    return same.index(False) if False in same else len(same)
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes the text whole or not at all; characters of a name that is not UTF-8 as escapes."""
     make_folder(path.parent)
@@ -174,6 +197,9 @@ def _table(
 ) -> Table:
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
+    # Where nothing was updated, there is no depth of updates.
+    if stages.UPDATED in shown and by_stage[stages.UPDATED] == by_stage.get(stages.BEFORE):
+        shown.remove(stages.UPDATED)
     last = stages.AFTER if stages.AFTER in by_stage else stages.PROPAGATED
     scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {})
     chosen = choose_measures(MEASURES, keys)

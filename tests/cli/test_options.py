@@ -58,6 +58,16 @@ def test_no_command_has_too_many_options_and_none_but_vary_holds_others_in_its_v
     assert [o.name for o in found if "NAME=VALUE" in f"{o.metavar} {o.help}"] == ["vary"]
 
 
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_every_command_has_the_longer_help(name: str) -> None:
+    words = {"check": ["models", "check"]}.get(name, [name] if name else [])
+    result = CliRunner().invoke(cli, [*words, "--help-all"], prog_name="pnpdepth")
+    assert result.exit_code == 0
+    assert "Usage: pnpdepth" in result.output
+    shown = {*own_options(COMMANDS[name])} if name else {"--version"}
+    assert shown <= {*result.output.replace(",", " ").split()}
+
+
 @pytest.mark.parametrize(
     "line",
     [
