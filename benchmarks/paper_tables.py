@@ -107,7 +107,7 @@ def frame_figures(entry: Entry, frame: EvalFrame, number: int) -> dict[str, Any]
     # A step of 100 % is what the engine takes for the standard deviation of z_0.
     moved = refined(entry.network, layer, replace(paper, iterations=1, lr="100%"), inputs)
     depths = {"linear": linear(inputs.points).numpy(), "before": results["paper"].before}
-    depths |= {state: result.after for state, result in results.items()}
+    depths |= {state: result.depth for state, result in results.items()}
     scores, coverage = scores_of(depths, frame.gt)
     return {
         "points": len(inputs.points),

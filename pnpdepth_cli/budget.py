@@ -16,6 +16,9 @@ _MOST_FILE_BYTES = 1 << 30
 _FILE_BYTES_PER_PIXEL = 4
 _DECODED_BYTES_PER_PIXEL = 8  # of four channels of 16 bits
 _BYTES_PER_PIXEL = 64  # of memory that reading and drawing takes at most
+_MOST_NETWORK_PIXELS = 4096 * 4096
+"""The largest input of a published depth network is 1536×1536 (Depth Pro)."""
+_BYTES_PER_NETWORK_PIXEL = 1024  # of memory: 64 channels in float32, their gradients, and copies
 _UNBACKED_VALUES = 1 << 25
 _VALUES_PER_BYTE = 1032  # the highest ratio of deflate; no codec read here is far above it
 
@@ -23,6 +26,11 @@ _VALUES_PER_BYTE = 1032  # the highest ratio of deflate; no codec read here is f
 def max_pixels() -> int:
     """Most pixels of an image, and rows or elements of any other array of numbers."""
     return _chosen or min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
+
+
+def max_network_pixels() -> int:
+    """Most pixels of the one image size that a network takes, by its file."""
+    return _chosen or min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
 
 
 def max_file_bytes() -> int:
@@ -62,13 +70,18 @@ def check_claim(
 
 
 def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
-    """Raises ModelError if a file of a network, or of its weights, is missing or too large.
+    """Raises ModelError unless a file of a network, or of its weights, is there and may be read.
 
-    The kind names the file in the message, as in "checkpoint".
+    A device, a pipe and an empty file may not, nor may a file that is too large. The kind names the
+    file in the message, as in "checkpoint".
     """
-    if not path.is_file():
+    if not path.exists():
         raise ModelError(f"{kind} {path} does not exist")
+    if not path.is_file():
+        raise ModelError(f"{kind} {path} is no regular file; save its content to a file first")
     size, most = path.stat().st_size, most or max_decoded_bytes()
+    if not size:  # also of what /proc shows as files, some of which never end
+        raise ModelError(f"{kind} {path} is empty (0 bytes); copy or create it again")
     check_claim(f"{kind} {path} has {size:,} bytes", size, most, error=ModelError)
 
 

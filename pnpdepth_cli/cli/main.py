@@ -9,6 +9,7 @@ import io
 import os
 import sys
 import traceback
+import warnings
 from typing import NoReturn
 
 import click
@@ -61,7 +62,10 @@ class _Commands(click.Group):
 
 
 @click.group(
-    cls=_Commands, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]}
+    cls=_Commands,
+    epilog=_EXIT_CODES,
+    # Every command knows both; where the two differ, a command has its own --help-all.
+    context_settings={"help_option_names": ["-h", "--help", "--help-all"]},
 )
 @click.version_option(__version__, prog_name="pnpdepth")
 @click.option(
@@ -89,7 +93,10 @@ def run(arguments: list[str]) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
-        return cli.main(arguments, prog_name="pnpdepth", standalone_mode=False) or 0
+        with warnings.catch_warnings():
+            # What NumPy says of inf and NaN is no sentence for a user; own checks say theirs.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return cli.main(arguments, prog_name="pnpdepth", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show()
         return error.exit_code

@@ -16,7 +16,17 @@ from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
-FILE = click.Path(path_type=Path)
+
+class _File(click.Path):
+    """A path; an empty text is none, where pathlib takes it for the current folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("an empty text names no file", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+FILE = _File(path_type=Path)
 _WITHOUT = (None, False, 0, math.inf)  # defaults that are no value to show
 _NAME_COLUMN = 22
 _HELP = ("--help", "--help-all")

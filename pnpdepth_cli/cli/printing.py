@@ -99,12 +99,16 @@ def print_refinement(record: FrameRecord) -> None:
     say(f"wrote {'  '.join(record.outputs.values())}")
 
 
-def print_batch(summary: BatchSummary) -> None:
-    """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files."""
+def print_batch(summary: BatchSummary, said: set[str]) -> None:
+    """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files.
+
+    Notes that are in `said` are not printed again; those that are printed are added to it.
+    """
     counts = summary.counts
     for table in tables.means_tables(summary.errors, summary.unit, summary.titles, summary.columns):
         print_table(table, err=True)
-    print_notes(summary.notes)
+    print_notes([note for note in summary.notes if note not in said])
+    said.update(summary.notes)
     # Counts of frames.
     parts = [f"{counts['done']:,} of {tables.count_of(counts['frames'], 'frame')} done"]
     for kind in ("diverged", "failed", "pending", "with_warnings"):
@@ -116,10 +120,14 @@ def print_batch(summary: BatchSummary) -> None:
     say(", ".join(parts))
     # Warnings and notes of several frames, each once, weights and files.
     for note, names in summary.frame_notes.items():
-        first = ", ".join([*names[:_NAMED], *["…"] * (len(names) > _NAMED)])
+        first = ", ".join(tables.short_names(names[:_NAMED]))
+        first += ", …" if len(names) > _NAMED else ""
         kind = "warning" if note.startswith("warning") else "note"
         count = tables.count_of(len(names), "frame")
-        say(f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}")
+        line = f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}"
+        if line not in said:
+            say(line)
+        said.add(line)
     if summary.weights:
         say(f"mean weights in the result: {tables.mean_weights_text(summary.weights)}")
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 DEFAULT = "default"
 """A value that leaves the option out."""
 _NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
+_OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
+"""Options that have no effect without updates of z."""
 _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
@@ -94,8 +96,9 @@ def refine(as_json: bool, **values: Any) -> None:
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 
-    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and, with
-    ground truth, <name>_improvement.png (blue better, orange worse).
+    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and
+    <name>_improvement.png (blue better, orange worse): with ground truth at each pixel, else at
+    held-out or validation points.
     """
     from pnpdepth_cli.cli.printing import print_refinement
     from pnpdepth_cli.commands.refinement.refine_image import refine_image
@@ -145,7 +148,8 @@ def refine(as_json: bool, **values: Any) -> None:
     multiple=True,
     metavar="NAME=VALUE,…",
     help="Refine with each value of an option of the method, network or points, or without it:"
-    " default. Several --vary make all combinations, each in a folder of OUTPUT.",
+    " default. Several --vary make all combinations, each in a folder of OUTPUT; those that are"
+    " equal, as without updates of z, are one.",
 )
 @options.refinement(without=["camera"])
 @click.pass_context
@@ -163,7 +167,8 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
 
     The layout of a folder is recognised from its content. The simplest layout has files of the same
     stem in rgb/, sparse/, gt/ (optional) and calib/ (optional). A list has a header with image,
-    sparse, gt, calib, name, …; paths are relative to the list.
+    sparse, gt, calib, name, …; paths are relative to the list. The frames of a BAG are written to
+    OUTPUT_frames/, beside OUTPUT, and stay there for the next run.
 
     Each frame gets the files that `pnpdepth refine` writes. A frame that cannot be refined is
     reported and skipped (exit code 7). The same command run again refines only frames that are
@@ -174,10 +179,13 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
         _request_of(values | varied, folder, texts)
         for folder, (texts, varied) in _combinations(context, vary).items()
     ]
-    summaries = []
+    summaries: list[BatchSummary] = []
+    said = set[str]()
     with _finishing_on_interrupt() as pressed:
-        for request in requests:
-            summary, stopped = _run(request, pressed)
+        for number, request in enumerate(requests, start=1):
+            if len(requests) > 1:
+                say(f"run {number:,} of {len(requests):,}: {request.output.name}")
+            summary, stopped = _run(request, pressed, said)
             summaries.append(summary)
             if stopped or pressed():
                 break
@@ -208,16 +216,26 @@ def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> 
     return replace(request, output=request.output / folder, html=html)
 
 
-def _run(request: BatchRequest, pressed: Callable[[], bool]) -> tuple[BatchSummary, bool]:
-    """Returns the batch's summary, which it prints, and whether the batch was stopped."""
+def _run(
+    request: BatchRequest, pressed: Callable[[], bool], said: set[str]
+) -> tuple[BatchSummary, bool]:
+    """Returns the batch's summary, which it prints, and whether the batch was stopped.
+
+    Notes that an earlier run of the study printed, which are in `said`, are not printed again.
+    """
     from pnpdepth_cli.cli.printing import print_batch
     from pnpdepth_cli.commands.batch.run_batch import run_batch
     from pnpdepth_cli.commands.tables import count_of
 
+    def say_once(line: str) -> None:
+        if line not in said:
+            say_above_bar(line)
+        said.add(line)
+
     with progress_bar("batch", "frame") as show:
-        listener = Listener(say_above_bar, show, pressed)
+        listener = Listener(say_once, show, pressed)
         summary = run_batch(request, listener)
-    print_batch(summary)
+    print_batch(summary, said)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
     stopped = listener.done < listener.to_do
@@ -257,18 +275,25 @@ def _combinations(
     axes = [text.partition("=")[2].split(",") for text in varied]
     if any("" in axis for axis in axes):
         raise UsageError("--vary must be NAME=VALUE,VALUE with no value empty")
-    combinations, chosen = {}, list(itertools.product(*axes))
-    for words in chosen:
+    if any(len({*axis}) < len(axis) for axis in axes) or len({*varying}) < len(varying):
+        raise UsageError("--vary: an option or a value comes twice; leave one out")
+    combinations = dict[str, tuple[dict[str, str], dict[str, object]]]()
+    for words in itertools.product(*axes):
         texts, values = dict[str, str](), dict[str, object]()
-        for option, word in zip(varying, words, strict=True):
-            texts[option.opts[-1].removeprefix("--")] = word
+        names = [option.opts[-1].removeprefix("--") for option in varying]
+        without_updates = dict(zip(names, words, strict=True)).get("iterations") == "0"
+        for name, option, word in zip(names, varying, words, strict=True):
+            # Without updates of z, runs that differ in these are one.
+            if without_updates and name in _OF_UPDATES:
+                continue
+            texts[name] = word
             if word != DEFAULT:
                 taken = (word,) if option.multiple else word
                 values[str(option.name)] = option.type_cast_value(context, taken)
         folder = ",".join(f"{n}={_NOT_IN_NAMES.sub('-', text)}" for n, text in texts.items())
+        if combinations.get(folder, (texts, values)) != (texts, values):
+            raise UsageError(f"--vary: two values have the folder {folder}; leave one out")
         combinations[folder] = texts, values
-    if len(combinations) < len(chosen) or len({*varying}) < len(varying):
-        raise UsageError("--vary: an option or a value comes twice; leave one out")
     return combinations
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.choices import EXPORTS
+from pnpdepth_cli.choices import EXPORTS, UNKNOWN
 from pnpdepth_cli.cli import options
 from pnpdepth_cli.cli.terminal import print_json, progress_bar
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
@@ -54,10 +54,10 @@ def evaluate(
     pnpdepth eval out/ gt/ --json > runs/a.json
     pnpdepth eval out/ gt/ --protocol eigen --max-depth 50
 
-    Files in folders are matched by name; x_depth.png belongs to x.png, and beside such files all
-    others are left out. GT can also be a data set in a known layout. Frames of GT without a
-    prediction are counted, and the exit code is 7. Options override single settings of the
-    protocol.
+    Files in folders are matched by name; x_depth.png belongs to x.png. A folder PRED with such
+    files has no other predictions. GT can also be a data set in a known layout. Frames of GT
+    without a prediction are counted, and the exit code is 7. Options override single settings of
+    the protocol.
 
     \b
     paper         all known ground truth; mean over images
@@ -97,7 +97,8 @@ def evaluate(
     "--latex",
     type=options.FILE,
     metavar="FILE|-",
-    help="Write a tabular of runs × measures: the best in bold, * where p < 0.05.",
+    help="Write a tabular of runs × measures: the best in bold, * where p < 0.05; it needs the"
+    " package booktabs.",
 )
 @options.overwrite
 @options.as_json
@@ -132,7 +133,7 @@ def compare(
 
     A RUN is the output of `pnpdepth eval --json`, or the folder or summary.json of a batch.
     FILE:before takes the depth before refinement. Gains are in per cent of the first run, and
-    positive if the other run is better.
+    positive if the other run is better. Runs of a study are listed in the order of its values.
 
     p is the p-value of a paired permutation test over groups of frames: manifest column group,
     sequence or folder. In a single sequence the groups are blocks as long as its errors are
@@ -150,7 +151,8 @@ def compare(
     print_notes(comparison.notes)
     table = command.comparison_table(comparison)
     methods = command.methods_table(comparison)
-    to_stdout = write_tables({csv: table.csv(), latex: methods.latex()})
+    values = command.comparison_values(comparison)
+    to_stdout = write_tables({csv: values.csv(), latex: methods.latex()})
     if as_json:
         print_json(comparison.to_json())
     elif not to_stdout:
@@ -184,18 +186,26 @@ def cloud(**values: Any) -> None:
     click.echo(f"wrote {what}: {values['output']}")
 
 
-@click.command(short_help="Write depth for COLMAP, Nerfstudio or 3DGS.")
+@click.command(short_help="Write depth for COLMAP, Nerfstudio, 3DGS, ROS.")
 @click.argument("results", type=options.FILE)
 @click.option("--to", type=click.Choice(list(EXPORTS)), required=True, help="The program.")
 @click.option("-o", "--output", type=options.FILE, required=True, help="Output folder.")
+@click.option(
+    "--unknown",
+    type=click.Choice(UNKNOWN),
+    default="keep",
+    show_default=True,
+    help="Of 3DGS, which reads no masks: pixels that are not valid keep a depth, or have zero.",
+)
 @options.overwrite
-def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
-    """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program.
+def export(results: Path, output: Path, **values: Any) -> None:
+    """Write RESULTS, a folder of `batch` or `refine`, for a reconstruction program or a viewer.
 
     \b
     pnpdepth export out/ --to nerfstudio -o scene/
     pnpdepth export out/ --to colmap -o dense/               # the undistorted project
     pnpdepth export out/ --to gaussian-splatting -o dense/
+    pnpdepth export out/ --to mcap -o bag/
 
     \b
     colmap              stereo/depth_maps, stereo/normal_maps, for `colmap stereo_fusion`
@@ -203,6 +213,8 @@ def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
                         start.ply
     gaussian-splatting  inverse_depths/ (its option -d), sparse/0/depth_params.json,
                         and images/ and a model in sparse/0/ unless they are there
+    mcap                a bag of ROS 2, also for Foxglove and Rerun: image, camera_info, depth
+                        (32FC1), sigma, points used, cloud, poses as /tf; needs the extra ros
 
     Camera and pose come from the records, so RESULTS are best those of a COLMAP project
     (`pnpdepth batch --layout colmap`). OUTPUT may be the project itself.
@@ -211,6 +223,6 @@ def export(results: Path, to: str, output: Path, overwrite: bool) -> None:
     from pnpdepth_cli.commands.exports import export_results
 
     with progress_bar("export", "frame") as show:
-        what, notes = export_results(results, output, to=to, overwrite=overwrite, show=show)
+        what, notes = export_results(results, output, show=show, **values)
     print_notes(notes)
     click.echo(f"wrote {what}: {output}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +47,12 @@ from pnpdepth_cli.sensors.projection import describe_dropped
 
 RECORD = "frames.json"
 _NOT_IN_RECORD = ("output", "overwrite")
-_FOLDERS = ("rgb", "sparse")
+_FOLDERS = {
+    "rgb": re.compile(r"-?\d+_\d{6}\.(png|jpg)"),
+    "sparse": re.compile(r"-?\d+_\d{6}\.(exr|ply)"),
+}
+"""Names of the files that are written to each folder; any other file there is the user's."""
+_CALIBRATION = "calib.txt"
 _COMPARED_FRAMES = 5
 _LONGEST_GAP_S = 0.5  # longest time between two poses that one is interpolated from
 _DELAYS = 20  # messages of each topic, from the first, whose delay is measured
@@ -98,7 +104,7 @@ def write_frames(request: FramesRequest, say: Say) -> int:
                 f" {request.tolerance:g} s; give --clock-offset, or a larger --tolerance"
             )
         # Calibration and poses.
-        camera = _write_calibration(request, bag, sensors, say)
+        camera, is_calibrated = _write_calibration(request, bag, sensors, say)
         poses = _write_poses(request, bag, camera, times, say)
     # The record, which is complete now.
     record = _identity(request) | {
@@ -107,6 +113,7 @@ def write_frames(request: FramesRequest, say: Say) -> int:
         "seconds_added_to_points": offset,
         "complete": True,
         "frames": len(times),
+        "calibrated": is_calibrated,
         "poses": poses,
         "images_without_scan": lost,
     }
@@ -131,17 +138,29 @@ def _check_output(request: FramesRequest) -> None:
         raise OutputError(f"{folder} holds the frames of a bag; --overwrite replaces them")
     if folder.is_file() or (not ours and folder.is_dir() and any(folder.iterdir())):
         raise OutputError(f"{folder} exists, and holds no frames of a bag; name another with -o")
+    for name in _FOLDERS:
+        inside = (folder / name).iterdir() if (folder / name).is_dir() else ()
+        if (other := next((path for path in inside if path.is_dir()), None)) is not None:
+            raise OutputError(f"{other} is a folder of yours; move it, or name another with -o")
 
 
 def _clear(request: FramesRequest) -> None:
     """Removes the frames that were written before, and records that these are incomplete."""
+    folder = request.output
     for name in _FOLDERS:
-        make_folder(request.output / name, below=request.output)
-        for path in (request.output / name).iterdir():
+        make_folder(folder / name, below=folder)
+        for path in _written(folder, name):
             path.unlink()
-    for name in ("calib.txt", POSES_FILE):
-        (request.output / name).unlink(missing_ok=True)
-    write_json(request.output / RECORD, _identity(request) | {"complete": False})
+    before = read_json(folder / RECORD) if (folder / RECORD).is_file() else {}
+    for name, written in ((_CALIBRATION, "calibrated"), (POSES_FILE, "poses")):
+        if before.get(written):
+            (folder / name).unlink(missing_ok=True)
+    write_json(folder / RECORD, _identity(request) | {"complete": False})
+
+
+def _written(folder: Path, name: str) -> list[Path]:
+    """The files of frames in rgb/ or sparse/, in the order of their times' names."""
+    return sorted(p for p in (folder / name).iterdir() if _FOLDERS[name].fullmatch(p.name))
 
 
 def _write_pairs(
@@ -182,14 +201,16 @@ def _write_pairs(
     return times, lost, dropped
 
 
-def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: Say) -> str:
-    """Writes calib.txt as far as there is a calibration; returns the frame_id of the camera."""
+def _write_calibration(
+    request: FramesRequest, bag: Bag, sensors: Sensors, say: Say
+) -> tuple[str, bool]:
+    """Writes calib.txt if there is a calibration; returns the camera's frame_id, and whether."""
     # The camera, from camera_info.
     topics = sensors.images, sensors.points
     camera, points = (messages.frame_of(next(bag.messages([each]))[2]) for each in topics)
     if (of_bag := messages.camera_of_bag(bag, sensors.images)) is None:
         say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
-        return camera
+        return camera, False
     calibration, camera = of_bag[0], of_bag[1] or camera
     source = calibration.camera.source
     # The pose of the scanner, from static transforms.
@@ -208,16 +229,16 @@ def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: 
         pairs = () if sensors.is_map else _some_frames(request.output)
         calibration, note = choose_camera(calibration, pairs, sensors.images)
         say(note)
-    with atomic_path(request.output / "calib.txt") as temporary:
+    with atomic_path(request.output / _CALIBRATION) as temporary:
         temporary.write_text(_calibration_text(calibration))
-    return camera
+    return camera, True
 
 
 def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Yields the image and the points of a few frames."""
-    scans = sorted((folder / "sparse").iterdir())
-    for scan in scans[:: math.ceil(len(scans) / _COMPARED_FRAMES)]:
-        (image,) = (folder / "rgb").glob(f"{scan.stem}.*")
+    scans, images = _written(folder, "sparse"), _written(folder, "rgb")
+    step = math.ceil(len(scans) / _COMPARED_FRAMES)
+    for image, scan in zip(images[::step], scans[::step], strict=True):
         yield read_rgb(image).values, read_scan(scan)[0]
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import camera_of_exif, camera_of_file, image_of_size
@@ -65,6 +66,8 @@ def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -
         notes.append(f"poses: {request.poses}, {how}")
         return list(rows)
     poses = [frame.camera_and_pose[1] for frame in frames]
+    if len(frames) > 1 and all(pose is None for pose in poses):
+        poses = _estimated_poses(frames, notes)
     without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
     if without and len(without) < len(frames):
         raise InputError(
@@ -77,6 +80,46 @@ def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -
             " --poses"
         )
     return poses
+
+
+def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
+    """The poses that follow from the motions `batch --accumulate` estimated, which adds a note.
+
+    The first frame's camera is the world. None for all frames unless motions tie all together.
+    """
+    # Motions from other frames to each, by the file of their points.
+    place = {_points_file(frame): index for index, frame in enumerate(frames)}
+    ties: list[list[tuple[int, Extrinsics]]] = [[] for _ in frames]
+    for here, frame in enumerate(frames):
+        for neighbour in frame.record.neighbours:
+            there = place.get(neighbour.path)
+            if there is None or neighbour.motion is None:
+                continue
+            matrix = np.array(neighbour.motion, np.float64)
+            if matrix.shape != (3, 4):
+                raise InputError(f"{frame.depth}: the record beside it is damaged; refine it again")
+            motion = Extrinsics(matrix[:, :3], matrix[:, 3])
+            ties[here].append((there, motion))
+            ties[there].append((here, motion.inverse()))
+    # The frames that are tied to the first, those with the fewest motions between first.
+    poses = {0: SAME_PLACE}
+    waiting = deque([0])
+    while waiting:
+        here = waiting.popleft()
+        for there, motion in ties[here]:
+            if there not in poses:
+                poses[there] = poses[here] @ motion
+                waiting.append(there)
+    if len(poses) < len(frames):
+        return [None] * len(frames)
+    notes.append("poses: the motions that `batch --accumulate` estimated, one after the other")
+    return [poses[index].square()[:3] for index in range(len(frames))]
+
+
+def _points_file(frame: ResultFrame) -> str:
+    """The file that the frame's points are from, as records of its neighbours name it."""
+    source = frame.record.inputs.get("sparse")
+    return frame.name if source is None else source.path
 
 
 def _parts(

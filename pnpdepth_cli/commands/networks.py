@@ -91,6 +91,11 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         known = raw[raw.isfinite()]
+        if not len(known):
+            notes.append(
+                "warning: the prediction is inf or NaN at every pixel; are the network's weights,"
+                " its input range (`normalise`) and precision right?"
+            )
         layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
     return {
         "name": definition.name,

@@ -38,6 +38,8 @@ _LATEX = str.maketrans(
     }
 )  # fmt: skip
 _NAMED = 5  # of a long list
+_SEPARATOR = re.compile(r"([_/\-])")  # of the parts of a frame's name
+_LEAST_SAVED = 8  # characters for which a name is shortened
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
@@ -62,10 +64,10 @@ class Table:
         return [list(map(_cell, row)) for row in self.rows]
 
     def csv(self) -> str:
-        """Returns the cells as they are, None as nothing, below the keys of the measures."""
+        """Returns the cells as they are, None and NaN empty, below the keys of the measures."""
         buffer = io.StringIO()
         keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
-        rows = [[each[0] if isinstance(each, tuple) else each for each in row] for row in self.rows]
+        rows = [list(map(_plain_cell, row)) for row in self.rows]
         csv.writer(buffer, lineterminator="\n").writerows([keys, *rows])
         return buffer.getvalue()
 
@@ -77,6 +79,7 @@ class Table:
         )
         lines = (
             f"% {' '.join(self.title.split())}",
+            r"% needs \usepackage{booktabs}",
             rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
             *(r"\toprule", header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", ""),
         )
@@ -89,6 +92,12 @@ def _cell(value: object) -> Cell:
     if isinstance(value, str):
         return value, ""
     return "" if value is None else f"{value:,}", ""
+
+
+def _plain_cell(value: object) -> object:
+    """A cell without its style; None for what is no number."""
+    plain = value[0] if isinstance(value, tuple) else value
+    return None if isinstance(plain, float) and math.isnan(plain) else plain
 
 
 def _in_latex(text: str, style: Style) -> str:
@@ -107,6 +116,27 @@ def some_names(names: Iterable[str]) -> str:
     text = ", ".join(one_line(name) for name in listed[:_NAMED])
     more = len(listed) - _NAMED
     return f"{text} and {more:,} more" if more > 0 else text
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Returns the first name in full, and others with … for what they share with it.
+
+    What is shared ends at a separator, so that numbers stay whole.
+    """
+    parts = [_SEPARATOR.split(name) for name in names]
+    start = _shared_parts(parts)
+    end = _shared_parts([own[:start:-1] for own in parts])
+    inner = ["".join(own[start : len(own) - end]) for own in parts]
+    short = [f"{'…' * (start > 0)}{text}{'…' * (end > 0)}" for text in inner]
+    if len(names) < 2 or len(short[0]) + _LEAST_SAVED > len(names[0]):
+        return [*names]
+    return [names[0], *short[1:]]
+
+
+def _shared_parts(names: Sequence[Sequence[str]]) -> int:
+    """How many parts, from the first on, are the same in all names."""
+    same = [len({*parts}) == 1 for parts in zip(*names, strict=False)]
+    return same.index(False) if False in same else len(same)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -153,13 +183,13 @@ def _table(
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
     last = stages.AFTER
-    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {}).get("mae")
+    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
-    count = f"{scores.get('points'):,} points" if "points" in scores else ""
+    count = count_of(scores["points"] or 0, "point") if "points" in scores else ""
     if "frames" in scores:
-        count = f"{scores['frames']:,} frames"
+        count = count_of(scores["frames"] or 0, "frame")
     elif "coverage" in scores:
         count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
     remark = ", where a change proves nothing" * (basis == stages.USED)
@@ -169,8 +199,14 @@ def _table(
         own = by_stage[stage]
         style: Style = "bold" if stage == last else ""
         texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
-        against = "" if stage == stages.LINEAR else change(linear, own.get("mae"))
-        rows.append([*((text, style) for text in (titles[stage], *texts)), against])
+        title = titles[stage]
+        if own.get("frames") != scores.get("frames"):
+            title += f" (over {own['frames']:,} frames)"
+        against: Cell = ("", "")
+        if stage != stages.LINEAR:
+            of_same = own.get("frames") == linear.get("frames")
+            against = change(linear.get("mae") if of_same else None, own.get("mae"))
+        rows.append([*((text, style) for text in (title, *texts)), against])
     return Table(
         title=f"{about}: errors {stages.BASES[basis]}{remark}, {count}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],

@@ -205,7 +205,10 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
     x, d = x.detach().cpu().double(), points.depth.detach().cpu().double()
     good = x.isfinite()
     if not bool(good.any()):
-        raise ModelError("the network's output is not finite at any sparse point; nothing to align")
+        raise ModelError(
+            f"the network's prediction is not finite at any of {len(x):,} sparse points; are its"
+            " weights, its input range (`normalise`) and precision right?"
+        )
     x, d = x[good], d[good]
     fits = [fit for candidate in tried if (fit := _fit(x, d, candidate)) is not None]
     if fits:

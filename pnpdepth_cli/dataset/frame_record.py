@@ -192,9 +192,22 @@ class FrameRecord:
     """Versions of the program, Python and the numerical libraries."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for errors that are not of the result."""
+        """Raises ValueError for errors that are not of the result, and for half a result."""
         if lacking := [basis for basis, stages in self.errors.items() if AFTER not in stages]:
             raise ValueError(f"the errors {lacking[0]} are not of the result")
+        if self.batch is None or self.status == "failed":
+            return
+        # A summary and a report read these of a result of a batch.
+        if self.method is None or self.model is None:
+            raise ValueError("it does not say how the frame was refined")
+        if not self.method.networks:
+            raise ValueError("it names no network")
+        for name in ("align", "iterations", "propagate"):
+            if name not in self.settings:
+                raise ValueError(f"its settings lack {name!r}")
+        for basis, stages in self.errors.items():
+            if stages[AFTER].get("pixels" if basis == GT else "points") is None:
+                raise ValueError(f"the errors {basis} lack how many pixels or points they are of")
 
     @property
     def warnings(self) -> list[str]:
@@ -236,7 +249,8 @@ class FrameRecord:
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)
-        except (msgspec.ValidationError, OverflowError, UsageError) as error:
+        # A text that is not Unicode ends msgspec's own message in a UnicodeError.
+        except (msgspec.ValidationError, OverflowError, UnicodeError, UsageError) as error:
             raise InputError(
                 f"{source} is no record of a frame as this version writes it"
                 f" ({one_line(str(error))}); remove it, and run again"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import numpy as np
 from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.dataset.arrays import read_image, record_of
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ImageSource, file_of
-from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.points import SparsePoints
@@ -58,10 +59,17 @@ def read_neighbours(
         )
     own = Points(xy=used.xy.numpy(), depth=used.depth.numpy(), size=used.size)
     scans, records, notes = dict[int, list[accumulation.Scan]](), list[FileRecord](), list[str]()
+    basis, estimated = "", list[str]()
     for each in files.neighbours:
         # The neighbour's points, and the motion that the images show where it is of use.
-        points, source = points_of(each.files), each.files.sparse or each.files.gt
+        source = each.files.sparse or each.files.gt
         assert source is not None
+        try:
+            points = points_of(each.files)
+        except NoPointsError as error:
+            notes.append(f"warning: a neighbour adds no points: {error}")
+            records.append(record_of(source))
+            continue
         here, there, shown, basis = files.image, each.files.image, None, ""
         is_nearest = each.apart == 1 and 1 not in scans
         if here is not None and there is not None and (each.motion is None or is_nearest):
@@ -69,15 +77,19 @@ def read_neighbours(
             shown, basis = accumulation.motion_of_images(*seen, points, camera)
         # Its motion is that, or of poses, which must not contradict the images.
         motion, poses, off_px = shown, f"{each.poses}: {basis}", 0.0
+        if each.motion is None and motion is not None:
+            estimated.append(f"{_name_of(each.files)} ({basis})")
         if each.motion is not None:
             motion, poses = np.array(each.motion), each.poses
             off_px = 0.0 if shown is None else _distance_px(motion, shown, points, camera)
         off = not off_px <= _CONTRADICTION * points.size[1]
         if off:
+            moved = f"puts points {off_px:.0f} px elsewhere"
+            if not math.isfinite(off_px):
+                moved = "puts points in view that the poses put behind the camera"
             notes.append(
                 f"warning: the poses contradict the images: the motion from {_name_of(each.files)}"
-                f" on, by {basis}, puts points {off_px:.0f} px elsewhere; give poses of these"
-                " frames, or none"
+                f" on, by {basis}, {moved}; give poses of these frames, or none"
             )
         # A neighbour of known motion joins.
         if motion is None:
@@ -94,20 +106,30 @@ def read_neighbours(
             contradicts_images=off,
         )
         records.append(record)
-    # At least one must join.
-    if not scans:
+    # At least one of those with points must join.
+    if not scans and basis:
         raise InputError(
             f"{_name_of(files)}: no motion to a neighbour can be estimated ({basis}); give"
             " --poses, or leave out --accumulate"
+        )
+    if estimated:
+        notes.append(
+            "note: the motion of accumulated points is estimated from the images, from"
+            f" {' and '.join(estimated)}; --poses gives a known one"
         )
     return accumulation.accumulate(own, scans, camera).tensors(), records, notes
 
 
 def _distance_px(one: Floats, other: Floats, points: Points, camera: Camera) -> float:
-    """The median distance in the image between where two motions put points."""
+    """The median distance in the image between where two motions put points.
+
+    It is infinite where no point is in front of the camera by both motions.
+    """
     xyz = unproject(camera, points.xy, points.depth)
     moved = [xyz @ motion[:, :3].T + motion[:, 3] for motion in (one, other)]
     seen = (moved[0][:, 2] > 0) & (moved[1][:, 2] > 0)
+    if not seen.any():
+        return math.inf
     pixels = [pixels_of(camera, each[seen]) for each in moved]
     return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)))
 

@@ -72,13 +72,19 @@ class SparseDepth:
         pixel = pixel_index(self.points.resized(*size).xy, (size[0], size[1]))
         own = levels.ravel()[pixel.clip(0, levels.size - 1)]
         kept = own > 0 if least is None else own >= least
+        numbers = own[~np.isnan(own)]
+        given = f"{numbers.min():g} to {numbers.max():g}" if len(numbers) else "no number"
+        if 0 < len(numbers) < len(own):
+            given += f", and no number to {len(own) - len(numbers):,} of them"
         fact = (
             f"{np.count_nonzero(kept):,} of {len(own):,} points have a confidence"
             f" {'above 0' if least is None else f'of {least:g} or more'} in {path},"
-            f" which gives them {own.min():g} to {own.max():g}"
+            f" which gives them {given}"
         )
         if not kept.any():
-            way_out = "use another mask" if least is None else "lower --min-confidence"
+            way_out = "lower --min-confidence"
+            if least is None or not len(numbers):
+                way_out = "use another mask"
             raise NoPointsError(f"{fact}; {way_out}")
         dropped = self.record.dropped | {"of low confidence": int((~kept).sum())}
         record = replace(self.record, mask=str(path), least=least, dropped=dropped)

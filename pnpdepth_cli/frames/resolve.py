@@ -87,7 +87,10 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """
     wanted = layer if layer is not None else definition.default_layer
     if wanted is None:
-        raise errors.UsageError(f"network {definition.name!r} has no default layer; name a layer")
+        raise errors.UsageError(
+            f"network {definition.name!r} has no default layer; name one of those that"
+            " `pnpdepth layers` lists"
+        )
     try:
         fraction = float(wanted)
     except ValueError:

@@ -57,7 +57,7 @@ _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull o
 _SAMPLED = 4000  # pixels, for the typical distance
 
 _OF_MATCHES = (
-    "warning: of points that were matched in images, ±2σ holds about 80 % of the true depths: they"
+    "note: of points that were matched in images, ±2σ holds about 80 % of the true depths: they"
     " lie on texture, where depth is easy"
 )
 _OF_MAP = (
@@ -88,10 +88,10 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches, *[_OF_MAP] * is_map]
     # What it does not cover.
     if not bool(valid.all()):
-        part = 100 * float((~valid).double().mean())
-        notes.append(
-            f"note: {part:.0f} % of the depth is beyond what the points support, and not valid"
-        )
+        beyond = int((~valid).sum())
+        percent = round(100 * beyond / valid.numel())
+        what = f"{percent} % of the image" if percent else f"{beyond:,} of {valid.numel():,} pixels"
+        notes.append(f"note: the depth of {what} is beyond what the points support, and not valid")
     of_depth, is_valid = (each.numpy() for each in (sigma_m, valid))
     return replace(frame, sigma=of_depth, valid=is_valid, notes=tuple(notes))
 

@@ -145,6 +145,15 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     return _single(fields, camera, source)
 
 
+def read_inertial_pose(path: Path) -> Extrinsics:
+    """Returns the pose of KITTI's inertial system in the scanner's coordinates.
+
+    Raises:
+        InputError: The file is no calib_imu_to_velo.txt.
+    """
+    return _named_values(path, read_text(path)).pose("T")
+
+
 def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibration:
     """Returns a camera of the content of a YAML file of OpenCV, ROS or Kalibr.
 

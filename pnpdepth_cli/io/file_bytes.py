@@ -51,8 +51,6 @@ def read_bytes(path: Path) -> bytes:
         data = path.read_bytes()
     except OSError as error:
         raise cannot_read(path, error) from error
-    if not data:
-        raise InputError(f"{path} is empty (0 bytes); copy or create it again")
     return data
 
 
@@ -77,13 +75,15 @@ def size_of_regular_file(path: Path) -> int:
     """Returns the size of a file in bytes.
 
     Raises:
-        InputError: There is no such file, or it is a folder, a device or a pipe.
+        InputError: There is no such file; it is a folder, a device or a pipe; or it is empty.
     """
     status = _status(path)
     if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path} is a folder; give one file")
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is a device or a pipe; save its content to a file first")
+    if not status.st_size:  # also of what /proc shows as files, some of which never end
+        raise InputError(f"{path} is empty (0 bytes); copy or create it again")
     return status.st_size
 
 
@@ -180,13 +180,15 @@ def sha256_of(path: Path) -> str:
     Of a folder, that of its files' names and digests, in the order of the names.
 
     Raises:
-        InputError: The file cannot be read, or is a device or a pipe.
+        InputError: The file cannot be read, is empty, or is a device or a pipe.
     """
     digest = hashlib.sha256()
     if path.is_dir():
         for inside in sorted(path.iterdir()):
             if inside.is_file():
-                digest.update(f"{inside.name} {sha256_of(inside)}\n".encode())
+                is_empty = not inside.stat().st_size
+                own = hashlib.sha256().hexdigest() if is_empty else sha256_of(inside)
+                digest.update(f"{inside.name} {own}\n".encode())
         return digest.hexdigest()
     size_of_regular_file(path)
     try:

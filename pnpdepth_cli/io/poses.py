@@ -24,6 +24,8 @@ _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST_M = 1e6
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_OXTS_COLUMNS = 30
+_EARTH_RADIUS_M = 6378137.0  # of WGS 84 at the equator
 
 LONGEST_GAP_S = 0.02
 """Longest gap between a frame and its pose, as in the tools of the TUM RGB-D benchmark."""
@@ -96,6 +98,29 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise InputError(f"{path}: a translation of {translation} m is of no sensor")
     return Extrinsics(rotation, translation)
+
+
+def read_oxts(paths: Sequence[Path]) -> Floats:
+    """Returns the poses (N, 3, 4) of KITTI's inertial system, from its packets in oxts/data/.
+
+    Metres, x east, y north, z up, in the Mercator projection of the data set's authors, whose scale
+    is 1 at the first packet (Geiger et al., "Vision meets Robotics: The KITTI Dataset", 2013).
+
+    Raises:
+        InputError: A file is no packet of 30 numbers.
+    """
+    from scipy.spatial.transform import Rotation
+
+    packets = [numbers_in(file_bytes.read_text(path)) or [] for path in paths]
+    for path, packet in zip(paths, packets, strict=True):
+        if len(packet) != _OXTS_COLUMNS or not np.isfinite(packet[:6]).all():
+            raise InputError(f"{path} is no packet of {_OXTS_COLUMNS} numbers of KITTI's oxts")
+    latitude, longitude, altitude, roll, pitch, yaw = np.array(packets)[:, :6].T
+    scale_m = _EARTH_RADIUS_M * np.cos(np.radians(latitude[0]))
+    east = scale_m * np.radians(longitude)
+    north = scale_m * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
+    turns = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).as_matrix()
+    return np.concatenate([turns, np.stack([east, north, altitude], axis=1)[:, :, None]], axis=2)
 
 
 def is_rotation(matrix: Floats) -> bool:

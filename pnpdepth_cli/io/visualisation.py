@@ -41,6 +41,8 @@ _LABELS = 9  # of the bar
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
+_GAINS = "Change of error"
+"""Title of the panel of gains, by which a report finds it."""
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 
 
@@ -128,15 +130,21 @@ def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
 
 def _points_panel(grey: Array, xy: Array, depth: Array, scale: DepthScale, factor: float) -> Panel:
     """The points in the colours of their depth on the dark grey image, nearest on top."""
+    nearest_last = np.argsort(-depth, kind="stable")
+    canvas = _dots(grey, xy[nearest_last], scale.paint(depth[nearest_last]), factor)
+    return "Sparse depth", f"{len(depth):,} point{'' if len(depth) == 1 else 's'}", canvas
+
+
+def _dots(grey: Array, xy: Array, colours: Pixels, factor: float) -> Pixels:
+    """The dark grey image with points in these colours, the last on top."""
     canvas = np.ascontiguousarray(_resize(_dim(grey), factor, smooth=True))
     spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
     # OpenCV takes coordinates in sixteenths of a pixel.
     radius = round(16 * min(max(0.24 * spacing, 1.4), 6.0))
     centres = np.rint(16 * ((xy.astype(np.float64) + 0.5) * factor - 0.5)).astype(int).tolist()
-    colours = scale.paint(depth).tolist()
-    for index in np.argsort(-depth, kind="stable"):
-        cv2.circle(canvas, centres[index], radius, colours[index], -1, cv2.LINE_AA, 4)
-    return "Sparse depth", f"{len(depth):,} point{'' if len(depth) == 1 else 's'}", canvas
+    for centre, colour in zip(centres, colours.tolist(), strict=True):
+        cv2.circle(canvas, centre, radius, colour, -1, cv2.LINE_AA, 4)
+    return canvas
 
 
 def _save_depth_figure(
@@ -297,12 +305,74 @@ def improvement(
     if not known.all():
         unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
     remark = footer + (f"; dark: {unknown}" if unknown else "")
+    figure = _save_gains(path, [(_GAINS, remark, pixels)], strongest, unit)
+    return replace(figure, unknown=unknown, footer=footer)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointErrors:
+    """N points at which depths are compared with a measured one, which none of them has seen."""
+
+    xy: Array  # (N, 2) pixel coordinates
+    truth: Array  # (N,) as measured
+    before: Array  # (N,) the network's depth, aligned with other points
+    after: Array  # (N,) the result
+    linear: Array  # (N,) linear interpolation of other points
+    what: str
+    """What they are, such as "validation points"."""
+
+
+def improvement_at_points(
+    rgb: Array | None, points: PointErrors, size: tuple[int, int], path: Path, unit: str = "m"
+) -> FigureRecord:
+    """Writes a PNG of the points at which |depth - truth| fell, blue, and rose, orange.
+
+    Beside the result, linear interpolation is compared with the same depth before. A point where
+    the depth that is shown is unknown is left out.
+
+    Args:
+        rgb: (H, W, 3) in 0..1, the ground of the figure; None for a network without image.
+        points: The points.
+        size: (H, W) of the image.
+        path: The PNG.
+        unit: Name of the unit of depth.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    columns = 1 if size[1] > _WIDE * size[0] else 2
+    grey, factor = _grey_of(rgb, size), _magnification(size, columns=columns)
+    shown = {_GAINS: points.after, "Linear interpolation": points.linear}
+    gains = {name: gain(points.before, depth, points.truth) for name, depth in shown.items()}
+    # One scale for both panels.
+    every = np.concatenate([values[np.isfinite(values)] for values in gains.values()])
+    changed = np.abs(every[every != 0])
+    strongest = float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
+    panels, texts = [], []
+    for name, values in gains.items():
+        known = np.isfinite(values)
+        own = values[known]
+        order = np.argsort(np.abs(own), kind="stable")
+        colours = _paint_signed(own[order] / strongest, np.full(len(own), 0.8), "gain")
+        improved, worse = (
+            100 * float(part.mean()) if len(own) else 0.0 for part in (own > 0, own < 0)
+        )
+        texts.append(f"{improved:.1f} % better, {worse:.1f} % worse")
+        panels.append((name, texts[-1], _dots(grey, points.xy[known][order], colours, factor)))
+    footer = f"at {np.isfinite(gains[_GAINS]).sum():,} {points.what}: {texts[0]}"
+    panels[0] = (_GAINS, footer, panels[0][2])
+    return replace(_save_gains(path, panels, strongest, unit, columns), footer=footer)
+
+
+def _save_gains(
+    path: Path, panels: list[Panel], strongest: float, unit: str, columns: int = 1
+) -> FigureRecord:
+    """Writes a PNG of panels beside a bar of gains, whose ends have the value of full colour."""
     labels = [f"{share * strongest:+.3g}" for share in (-1, -0.5, 0, 0.5, 1)]
-    panel = "Change of error", remark, pixels
-    figure = _save_figure(path, [panel], signed_bar("gain", 256), labels, f"gain, {unit}")
+    bar = signed_bar("gain", 256)
+    figure = _save_figure(path, panels, bar, labels, f"gain, {unit}", columns)
     amount = f"by {strongest:.3g} {unit} or more"
-    ends = f"worse {amount}", f"better {amount}"
-    return replace(figure, ends=ends, unknown=unknown, footer=footer)
+    return replace(figure, ends=(f"worse {amount}", f"better {amount}"))
 
 
 def gain(before: Array, after: Array, truth: Array) -> NDArray[np.float64]:

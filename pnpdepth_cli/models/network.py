@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli.budget import check_claim, max_pixels
+from pnpdepth_cli.budget import check_claim, max_network_pixels
 from pnpdepth_cli.choices import FITS
 from pnpdepth_cli.completion.alignment import Alignment, align, candidates
 from pnpdepth_cli.core.split import Split
@@ -23,7 +23,12 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.models.cut_layers import suggest_layers
-from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
+from pnpdepth_cli.models.definition import (
+    ModelDefinition,
+    Multiple,
+    Normalisation,
+    file_and_part,
+)
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights import load_checkpoint
@@ -172,13 +177,15 @@ class Network:
         if len(tensors) != 1:
             paths = ", ".join(".".join(path) for path, _ in tensors)
             fact = f"gives a {type(output).__name__} with {len(tensors)} tensors in it ({paths})"
-            raise ModelError(f"{name} {fact}; `output` of its definition must pick the depth")
+            way_out = "pick the depth as FILE:[0], or by `output` of its definition"
+            raise ModelError(f"{name} {fact}; {way_out}")
         # One map, with or without axes of batch and channel.
         tensor = tensors[0][1].float()
         shape = tuple(tensor.shape)
         if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
             fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
-            raise ModelError(f"{name} {fact}; pick it by the definition's output")
+            way_out = "pick a channel as FILE:[0], z of points as FILE:[z]"
+            raise ModelError(f"{name} {fact}; {way_out}, or by `output` of its definition")
         tensor = tensor.reshape(1, 1, *shape[-2:])
         # Where it is not finite, it is NaN, and no gradient comes from there.
         known = tensor.isfinite()
@@ -350,10 +357,11 @@ def load_network(
     if not isinstance(module, nn.Module):
         wanted = "a class or a function that makes one is expected, as in lambda: net"
         raise ModelError(f"build of {name} gives no torch module; {wanted}")
-    if isinstance(size := definition.size, Fixed):
-        claim = f"{name} takes images of {size.width}×{size.height} pixels"
-        pixels, most = size.height * size.width, max_pixels()
-        check_claim(claim, pixels, most, error=ModelError, way_out="allow more pixels")
+    if not isinstance(size := definition.size, Multiple):
+        height, width = size.height or size.width or 1, size.width or size.height or 1
+        claim = f"{name} takes images of {width}×{height} pixels"
+        way_out = "allow more with --max-pixels"
+        check_claim(claim, height * width, max_network_pixels(), error=ModelError, way_out=way_out)
     path = checkpoint or definition.checkpoint
     notes = [f"model: {definition.assumed}"] if definition.assumed else []
     if definition.complete and checkpoint is not None:

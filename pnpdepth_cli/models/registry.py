@@ -19,14 +19,20 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING, Any, cast
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.budget import check_network_file
 from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
+from pnpdepth_cli.models.output_parts import part_of, split_parts
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def all_definitions() -> dict[str, ModelDefinition]:
@@ -64,7 +70,8 @@ def find_definition(spec: str) -> ModelDefinition:
     Args:
         spec: A name such as `fcrn-tiny`, a Python file `FILE.py` or `FILE.py:ATTRIBUTE` (which is
             run), an ONNX file `FILE.onnx` or `FILE.onnx:OUTPUT`, a torch.export archive `FILE.pt2`,
-            or a Hugging Face folder.
+            or a Hugging Face folder. Behind a file or folder, `:[1]` or `OUTPUT[z]` names a part of
+            its output: `output_parts.part_of`.
 
     Raises:
         ModelError: There is no such name or file, or it does not define a network.
@@ -73,9 +80,10 @@ def find_definition(spec: str) -> ModelDefinition:
     for family in sorted(by_prefix, key=len, reverse=True):
         if spec in (definitions := _definitions_of(family)):
             return definitions[spec]
-    from_file = _from_file(spec)
+    named = split_parts(spec)
+    from_file = _from_file(named.spec)
     if from_file is not None:
-        return from_file
+        return _with_parts(from_file, named.parts)
     known = all_definitions()
     if spec in known:
         return known[spec]
@@ -84,6 +92,21 @@ def find_definition(spec: str) -> ModelDefinition:
     raise ModelError(
         f"model {spec!r} is neither a known name nor a file or folder of a network; {way_out}"
     )
+
+
+def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDefinition:
+    """The definition whose output is a part of what its own would be."""
+    if not parts:
+        return definition
+    before = definition.output
+
+    def output(given: Any) -> Tensor:
+        found = given if before is None else before(given)
+        for part in parts:
+            found = part_of(found, part)
+        return cast("Tensor", found)
+
+    return replace(definition, output=output)
 
 
 def _from_file(spec: str) -> ModelDefinition | None:

@@ -98,8 +98,7 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
 
 def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
     """(M,) true where a moved point agrees with the measured points around it."""
-    _, near = cKDTree(measured.xy).query(xy, k=min(_CONTRADICTING, len(measured)))
-    near = near.reshape(len(xy), -1)
+    near = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
     apart = np.abs(np.log(depth[:, None] / measured.depth[near]))
     alike = apart[:, :_COMPARED] <= _TOLERANCE
     offset = np.abs(measured.xy[near] - xy[:, None]) / _spacing_px(measured)
@@ -108,13 +107,22 @@ def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
     return agrees
 
 
+def _nearest(tree: cKDTree, xy: NDArray[np.floating], count: int) -> NDArray[np.intp]:
+    """(M, K) numbers of the measured points nearest to pixels: `count`, or all if there are fewer.
+
+    There may be no pixels, as of a neighbour that sees nothing of the frame's view.
+    """
+    ranks = np.arange(1, min(count, tree.n) + 1)  # a list of ranks gives a row for each pixel
+    _, near = tree.query(xy, k=ranks)
+    return np.asarray(near, np.intp)
+
+
 def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
     """Unit normals (N, 3) of the planes through the neighbours of each point, and which are flat.
 
     The points are `xyz` (N, 3) in the camera's coordinates; the tree is of their pixels.
     """
-    _, near = tree.query(points.xy, k=min(_NEIGHBOURS, len(points)))
-    near = near.reshape(len(points), -1)
+    near = _nearest(tree, points.xy, _NEIGHBOURS)
     around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -77,6 +78,22 @@ def test_the_exit_code_is_that_of_the_kind_of_error(
     # a network is loaded in the folder of its results, which stays
     outputs = ("sparse.png", "x", *(["out"] if code < 4 else []))
     assert not any(Path(name).exists() for name in outputs)
+
+
+@pytest.mark.parametrize("value", [1e-45, 1e38, 3e38])
+def test_numpy_says_nothing_of_numbers_that_it_cannot_divide(
+    value: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    depth = read_depth(GT).values
+    depth[::3] = value
+    np.save(tmp_path / "d.npy", depth)
+    (tmp_path / "k.txt").write_text("K: 260 0 160 0 260 120 0 0 1\n")
+    arguments = [str(tmp_path / "d.npy"), "--calib", str(tmp_path / "k.txt")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(["cloud", *arguments, "-o", str(tmp_path / "c.ply")])
+        run(["eval", str(tmp_path / "d.npy"), str(GT)])
+    assert "Warning" not in "".join(capfd.readouterr())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")

@@ -47,6 +47,31 @@ def test_onnx_is_refined_and_checked(
     assert any("rgb range 'unit' is assumed" in note for note in checked["notes"])
 
 
+@pytest.mark.parametrize("value", ["inf", "nan"])
+@pytest.mark.parametrize("method", ["fused", "alone", "paper"])
+def test_a_network_that_gives_no_number_is_named_a_fault_of_the_network(
+    method: str, value: str, frame: FrameOnDisk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = frame.model.read_text().replace("definition = ", "definition = whole = ")
+    text += f"""
+import dataclasses, torch
+class Blind(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.middle = torch.nn.Conv2d(3, 1, 1)
+    def forward(self, rgb, *others):
+        return self.middle(rgb) + float("{value}")
+definition = dataclasses.replace(whole, build=Blind, complete=True, layers=("middle",))
+"""
+    (frame.folder / "blind.py").write_text(text)
+    network = ["--model", str(frame.folder / "blind.py"), "--method", method]
+    files = [str(frame.image), "--sparse", str(frame.sparse), "-o", str(frame.folder / "o.exr")]
+    assert run(["refine", *files, *network]) == 4
+    assert "not finite at any" in capsys.readouterr().err.splitlines()[-1]
+    assert run(["models", "check", network[1]]) == 0
+    assert "warning: the prediction is inf or NaN" in capsys.readouterr().out
+
+
 def test_doctor_reports_versions_what_is_missing_and_a_refined_plane(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -58,6 +58,33 @@ def test_no_command_has_too_many_options_and_none_but_vary_holds_others_in_its_v
     assert [o.name for o in found if "NAME=VALUE" in f"{o.metavar} {o.help}"] == ["vary"]
 
 
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_every_command_has_the_longer_help(name: str) -> None:
+    words = {"check": ["models", "check"]}.get(name, [name] if name else [])
+    result = CliRunner().invoke(cli, [*words, "--help-all"], prog_name="pnpdepth")
+    assert result.exit_code == 0
+    assert "Usage: pnpdepth" in result.output
+    shown = {*own_options(COMMANDS[name])} if name else {"--version"}
+    assert shown <= {*result.output.replace(",", " ").split()}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["refine", "i.png", "--sparse", "s.png", "-o", ""],
+        ["refine", "", "--sparse", "s.png"],
+        ["refine", "i.png", "--sparse", "s.png", "--checkpoint", ""],
+        ["batch", "folder", "-o", ""],
+        ["cloud", "d.png", "-o", ""],
+        ["frames", "a.bag", "-o", ""],
+    ],
+)
+def test_an_empty_text_is_no_file_and_not_the_current_folder(line: list[str]) -> None:
+    result = CliRunner().invoke(cli, line)
+    assert result.exit_code == 2
+    assert "empty" in result.output
+
+
 def test_every_field_of_a_request_has_one_name_and_its_option_is_one_of_batch() -> None:
     request = RefineRequest()
     groups = [request, *(getattr(request, name) for name in GROUPS)]

@@ -72,8 +72,9 @@ def test_columns_choose_measures_in_latex(frames: Path, capsys: pytest.CaptureFi
     Path("a.json").write_text(capsys.readouterr().out)
     assert code_of("compare a.json a.json --columns delta1,rmse --latex -") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[3] == r" & $\delta$1 $\uparrow$ & RMSE [mm] $\downarrow$ \\"
-    name, delta, rmse = lines[5].removesuffix(r" \\").split(" & ")
+    assert "booktabs" in lines[1]
+    assert lines[4] == r" & $\delta$1 $\uparrow$ & RMSE [mm] $\downarrow$ \\"
+    name, delta, rmse = lines[6].removesuffix(r" \\").split(" & ")
     assert (name, delta) == ("a.json", r"\textbf{100.00\%}")
     assert float(rmse.removeprefix(r"\textbf{").removesuffix("}")) > 1000
 

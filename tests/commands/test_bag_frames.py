@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("rosbags")
 
+from rosbags.highlevel import AnyReader
+
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.bag_frames import RECORD, write_frames
 from pnpdepth_cli.commands.requests import FramesRequest
@@ -17,7 +19,7 @@ from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
-from pnpdepth_cli.io.bags.messages import nearest_pairs
+from pnpdepth_cli.io.bags.messages import cloud_points, nearest_pairs
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import read_json
@@ -185,6 +187,22 @@ def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path)
     assert list(own.parent.iterdir()) == [own]
 
 
+def test_the_users_own_files_beside_frames_stay_and_a_folder_is_named(tmp_path: Path) -> None:
+    folder, bag = tmp_path / "frames", write_bag(tmp_path / "drive.mcap", without="/tf_static")
+    written(bag, folder)
+    name = next((folder / "rgb").iterdir()).stem
+    own = [f"rgb/{name}.txt", "rgb/mine.png", f"sparse/{name}_mask.png", "poses.txt", "notes.md"]
+    touch(*(folder / each for each in own))
+    written(bag, folder, between=(1, 1), overwrite=True)
+    assert all((folder / each).exists() for each in own)
+    assert not (folder / f"rgb/{name}.png").exists()
+    (folder / "rgb/more").mkdir()
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    with pytest.raises(OutputError, match="more"):
+        written(bag, folder, overwrite=True)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("part", [0.0, 0.5])
 def test_a_bag_that_is_cut_short_is_one_line(kind: str, part: float, tmp_path: Path) -> None:
@@ -203,3 +221,72 @@ def test_each_image_gets_the_nearest_scan_within_the_tolerance() -> None:
     pairs = [(image, scan) for _, image, scan in nearest_pairs(messages, 0.095)]
     assert pairs == [(0.04, 0.0), (0.06, 0.1), (0.2, 0.29)]
     assert [scan for *_, scan in nearest_pairs(messages, 0.01)] == [None] * 3
+
+
+@pytest.mark.parametrize("depth", ["", "16UC1"])
+def test_a_bag_goes_in_and_a_bag_comes_out(depth: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "drive.mcap", poses="/odom", depth=depth)
+    out, again = tmp_path / "out", tmp_path / "again"
+    options = ["--method", "alone", "--model", "fcrn-tiny", "--format", "exr"]
+    assert run(["batch", str(bag), "-o", str(out), *options, "--uncertainty"]) == 0
+    assert run(["export", str(out), "--to", "mcap", "-o", str(again)]) == 0
+    names = sorted(path.name.removesuffix("_depth.exr") for path in out.glob("*_depth.exr"))
+    assert len(names) == 3
+    by_topic = dict[str, list[Any]]()
+    with AnyReader([again]) as reader:
+        for connection, time_ns, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            by_topic.setdefault(connection.topic, []).append((time_ns, message))
+    for place, name in enumerate(names):
+        record = FrameRecord.read(out / f"{name}.json")
+        assert record.camera is not None
+        assert record.points is not None
+        camera, pose = record.camera.read()
+        time_ns = int(name.replace("_", "")) * 1000
+        of_frame = {topic: messages[place][1] for topic, messages in by_topic.items()}
+        assert {messages[place][0] for messages in by_topic.values()} == {time_ns}
+        # Depth and its standard deviation, bit for bit.
+        written_depth, valid = (
+            read_depth(out / f"{name}_depth.exr").values,
+            out / f"{name}_valid.png",
+        )
+        valid_depth = np.where(read_rgb(valid).values[..., 0] > 0, written_depth, 0)
+        found = floats_of(of_frame["/camera/depth/image"])
+        np.testing.assert_array_equal(np.isnan(found), valid_depth == 0)
+        known = valid_depth > 0
+        assert found[known].tobytes() == valid_depth[known].tobytes()
+        sigma = read_depth(out / f"{name}_sigma.exr").values
+        assert floats_of(of_frame["/camera/depth/sigma"]).tobytes() == sigma.tobytes()
+        # The image and the camera.
+        image = of_frame["/camera/image"]
+        pixels = image.data.reshape(HEIGHT, WIDTH, 3) / np.float32(255)
+        np.testing.assert_allclose(
+            pixels,
+            read_rgb(next((tmp_path / "out_frames/rgb").glob(f"{name}.*"))).values,
+            atol=1e-6,
+        )
+        for topic in ("/camera/camera_info", "/camera/depth/camera_info"):
+            np.testing.assert_array_equal(of_frame[topic].k.reshape(3, 3), camera.intrinsics)
+        stamp = image.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == time_ns
+        # The points that were used, where the camera sees them, and the cloud of the depth.
+        points = cloud_points(of_frame["/camera/points_used"], "")
+        assert len(points) == record.points.used
+        nearest, farthest = record.points.nearest, record.points.farthest
+        assert (points[:, 2].min(), points[:, 2].max()) == pytest.approx((nearest, farthest))
+        cloud = cloud_points(of_frame["/camera/cloud"], "")
+        x, y, z = cloud.T.astype(np.float64)
+        pixel = camera.intrinsics @ [x / z, y / z, np.ones(len(z))]
+        column, row = np.rint(pixel[:2]).astype(int)
+        np.testing.assert_allclose(z, valid_depth[row, column], rtol=1e-6)
+        # The pose is from world to camera's origin.
+        (transform,) = of_frame["/tf"].transforms
+        shift = transform.transform.translation
+        np.testing.assert_allclose([shift.x, shift.y, shift.z], pose[:, 3], atol=1e-9)
+        assert (transform.header.frame_id, transform.child_frame_id) == ("world", "camera")
+
+
+def floats_of(message: Any) -> np.ndarray:
+    """The numbers (H, W) of an Image of encoding 32FC1."""
+    assert message.encoding == "32FC1"
+    return message.data.view("<f4").reshape(message.height, message.width)

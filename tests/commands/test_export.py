@@ -111,17 +111,17 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_at_every_pixel(root: Path) -> 
 @pytest.mark.parametrize("unit_scale", [None, 0.25])
 def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: float | None) -> None:
     scene, far = root / "scene", DEPTH.copy()
-    far[:2] = np.array([[65.534], [65.535]]) / (unit_scale or 1)  # of which 16 bits hold one
+    far[:2] = np.array([[65.532], [65.534]]) / (unit_scale or 1)  # 16 bits of millimetres hold it
     what, notes = export_results(results(root, far, unit_scale), scene, to="nerfstudio")
     assert what == f"3 frames in {'m' if unit_scale else 'model units'}"
-    assert f" {3 * WIDTH} pixels beyond 65.53 " in notes[0]
+    assert notes == []
     content = json.loads((scene / "transforms.json").read_text())
     assert (content["camera_model"], len(content["frames"])) == ("OPENCV", 3)
     entry = content["frames"][1]
     assert (entry["w"], entry["h"]) == (WIDTH, HEIGHT)
     assert (scene / entry["file_path"]).read_bytes() == (root / "images/b.png").read_bytes()
     depth = cv2.imread(str(scene / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED) * 1e-3
-    assert depth[:2, 0] == pytest.approx([65.534, 0])
+    assert depth[:2, 0] == pytest.approx([65.532, 65.534])
     assert content["enable_depth_loading"]  # Instant-NGP's names
     assert (content["integer_depth_scale"], entry["depth_path"]) == (1e-3, entry["depth_file_path"])
     u, v = 10, 20
@@ -134,6 +134,29 @@ def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: floa
     assert world[:3] == pytest.approx(expected, rel=1e-3)
     start = read_scan(scene / content["ply_file_path"])[0]
     assert np.median(start[:, 2]) == pytest.approx(np.median(DEPTH) * world[2] / z, rel=0.01)
+
+
+@pytest.mark.parametrize(("farthest", "factor"), [(65.535, 0.002), (300.0, 0.005), (9000.0, 0.2)])
+def test_codes_of_nerfstudio_are_larger_where_the_scene_is(
+    root: Path, farthest: float, factor: float
+) -> None:
+    scene, far = root / "scene", DEPTH.copy()
+    far[0] = farthest
+    _, notes = export_results(results(root, far), scene, to="nerfstudio")
+    assert f"--depth-unit-scale-factor {factor:g}`" in notes[0]
+    content = json.loads((scene / "transforms.json").read_text())
+    assert content["integer_depth_scale"] == content["depth_unit_scale_factor"] == factor
+    png = cv2.imread(str(scene / content["frames"][0]["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(png * factor, far, atol=0.51 * factor)
+
+
+def test_3dgs_leaves_out_what_is_unknown_where_asked(root: Path) -> None:
+    depth = DEPTH.copy()
+    depth[:2] = 0
+    export_results(results(root, depth), root, to="gaussian-splatting", unknown="zero")
+    png = cv2.imread(str(root / "inverse_depths/a.png"), cv2.IMREAD_UNCHANGED)
+    assert not png[:2].any()
+    assert png[2:].all()
 
 
 def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root: Path) -> None:
@@ -210,3 +233,44 @@ def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -
     ):
         with pytest.raises(error, match=named):
             export_results(source, output, to="colmap")
+
+
+def test_a_bag_of_frames_without_times_has_steps_and_names_what_it_lacks(root: Path) -> None:
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    _, notes = export_results(results(root), root / "bag", to="mcap")
+    assert "0.1 s" in notes[0]
+    with rosbags.AnyReader([root / "bag"]) as reader:
+        topics = {topic: info.msgcount for topic, info in reader.topics.items()}
+        times = sorted({time_ns for _, time_ns, _ in reader.messages()})
+    assert np.diff(times).tolist() == [10**8] * 2
+    assert topics["/camera/depth/image"] == topics["/tf"] == 3
+    assert "/camera/depth/sigma" not in topics
+    assert sorted(path.name for path in (root / "bag").iterdir()) == [
+        "metadata.yaml",
+        "results.mcap",
+    ]
+    with pytest.raises(OutputError, match="--overwrite"):
+        export_results(root / "out", root / "bag", to="mcap")
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "count"),
+    [("PINHOLE", "plumb_bob", 5), ("OPENCV_FISHEYE", "equidistant", 4)],
+)
+def test_a_bag_has_the_lens_as_ros_names_it(
+    root: Path, tmp_path: Path, camera: str, model: str, count: int
+) -> None:
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    other = tmp_path / "other"
+    other.mkdir()
+    project(other, camera)
+    export_results(results(other), other / "bag", to="mcap")
+    with rosbags.AnyReader([other / "bag"]) as reader:
+        wanted = [each for each in reader.connections if each.topic == "/camera/camera_info"]
+        _, _, data = next(reader.messages(connections=wanted))
+        info = reader.deserialize(data, wanted[0].msgtype)
+    assert (info.distortion_model, len(info.d)) == (model, count)
+    of_record = FrameRecord.read(other / "out/a.json").camera
+    assert of_record is not None
+    expected = [*of_record.distortion, *[0.0] * count][:count]
+    assert info.d.tolist() == expected

@@ -286,3 +286,22 @@ def test_extrinsics_with_kittis_calibration_are_rectified_too(tmp_path: Path, sc
     np.save(tmp_path / "a.npy", scan[:, :3])
     given = {"calib": tmp_path / "calib.txt", "extrinsics": tmp_path / "pose.txt"}
     same_points(tmp_path / "a.npy", scan[:, :3], scan=ScanOptions(keep_occluded=True, **given))
+
+
+@pytest.mark.parametrize(("part", "least"), [(0.5, None), (0.5, 1.0), (1.0, None), (1.0, 1.0)])
+def test_a_confidence_that_is_no_number_counts_as_none_and_is_said(
+    tmp_path: Path, part: float, least: float | None
+) -> None:
+    confidence = np.full((240, 320), 2, np.float32)  # of half the size
+    confidence[: round(240 * part)] = np.nan
+    np.save(tmp_path / "confidence.npy", confidence)
+    if part == 1:
+        with pytest.raises(NoPointsError, match="no number; use another mask"):
+            indoor(INDOOR / "sparse.png", tmp_path / "confidence.npy", least)
+        return
+    frame = indoor(INDOOR / "sparse.png", tmp_path / "confidence.npy", least)
+    codes = codes_of(INDOOR / "sparse.png")
+    assert len(frame.points) == np.count_nonzero(codes[240:])
+    (note,) = (note for note in frame.notes if "confidence" in note)
+    assert f"no number to {np.count_nonzero(codes[:240]):,} of them" in note
+    assert "nan" not in note.lower().replace("confidence.npy", "")

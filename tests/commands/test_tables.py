@@ -106,6 +106,21 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
     assert tables.means_tables({}, "m", {}) == []
 
 
+def test_a_mean_over_fewer_frames_says_so_and_is_not_compared() -> None:
+    stages: dict[str, Scores] = {
+        "before": {"mae": 2.0, "frames": 2},
+        "after": {"mae": 1.0, "frames": 3},
+        "linear": {"mae": 4.0, "frames": 3},
+    }
+    titles = tables.stage_titles(record_of("net", weights={"net": 1.0}))
+    (table,) = tables.means_tables({"ground_truth": stages}, "m", titles, ("mae",))
+    assert texts(table) == [
+        ["net, aligned with the points (over 2 frames)", "2.0000 m", "–"],
+        ["fused (net 100%)", "1.0000 m", "-75.0%"],
+        ["linear interpolation of all points", "4.0000 m", ""],
+    ]
+
+
 def test_a_csv_has_keys_lines_that_end_in_a_newline_and_nothing_for_none() -> None:
     table = Table(columns=["name", MEASURES[0]], rows=[["a,b", -1.5], ["c", None]])
     assert table.csv() == 'name,rmse\n"a,b",-1.5\nc,\n'
@@ -119,3 +134,19 @@ def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
     ):
         record = record_of("net", "compact", weights={"net": net, "compact": compact})
         assert tables.names_of_depths(record) == ("net, aligned with the points", after)
+
+
+def test_names_are_shortened_by_what_they_share_and_numbers_stay_whole() -> None:
+    drive = "2011_09_26_drive_0023_sync_{:010}_image_02"
+    names = [drive.format(number) for number in (0, 1, 12)]
+    assert tables.short_names(names) == [names[0], "…0000000001…", "…0000000012…"]
+    for others in (["a_1"], ["a_1", "a_2"], ["kitchen", "office"], ["a", "a"], []):
+        assert tables.short_names(others) == others
+
+
+def test_updates_that_change_nothing_have_no_row() -> None:
+    at = at_points(12, before=4.0, updated=4.0, propagated=1.0, after=1.0, linear=2.0)
+    record = record_of("net", weights={"net": 1.0}, errors={"validation": at})
+    assert not any("z updated" in row[0] for row in texts(refinement_tables(record)[0]))
+    record = replace(record, errors={"validation": at | at_points(12, updated=3.0)})
+    assert any("z updated" in row[0] for row in texts(refinement_tables(record)[0]))

@@ -102,9 +102,25 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
         {"status": "unknown"},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
         {"inputs": {"sparse": {"path": "s.png", "sampled": {"kind": "none", "count": 1}}}},
+        {"size": "\ud800"},
+        {"errors": {"\udfff": "\ud800"}},
     ],
 )
 def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
+    with pytest.raises(InputError, match=r"a\.json"):
+        FrameRecord.from_json(entry, Path("a.json"))
+
+
+@pytest.mark.parametrize(
+    "lost", ["method", "model", "settings propagate", "errors used after points"]
+)
+def test_half_a_record_of_a_batch_is_refused(lost: str) -> None:
+    entry = RECORD.to_json()
+    assert FrameRecord.from_json(entry, Path("a.json")) == RECORD
+    part, (*outer, name) = entry, lost.split()
+    for key in outer:
+        part = part[key]
+    del part[name]
     with pytest.raises(InputError, match=r"a\.json"):
         FrameRecord.from_json(entry, Path("a.json"))
 

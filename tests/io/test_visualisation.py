@@ -9,7 +9,14 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.io.visualisation import UNKNOWN, depth_scale, improvement, preview
+from pnpdepth_cli.io.visualisation import (
+    UNKNOWN,
+    PointErrors,
+    depth_scale,
+    improvement,
+    improvement_at_points,
+    preview,
+)
 
 
 def panels_of(path: Path, content: FigureRecord) -> dict[str, np.ndarray]:
@@ -63,3 +70,32 @@ def test_better_worse_equal_and_unknown_have_their_own_colours(tmp_path: Path) -
     assert content.ends == ("worse by 1 inches or more", "better by 1 inches or more")
     assert content.footer == "33.3 % of 3 pixels improved, 33.3 % worse"
     assert content.unknown == "no ground truth"
+
+
+def test_points_that_got_better_are_blue_and_linear_interpolation_is_beside(tmp_path: Path) -> None:
+    points = PointErrors(
+        xy=np.float32([[2, 2], [12, 2], [2, 12], [12, 12]]),
+        truth=np.float32([5, 5, 5, 5]),
+        before=np.float32([6, 6, 6, 6]),
+        after=np.float32([5, 7, 4, 0]),  # better, worse, equal, and unknown
+        linear=np.float32([7, 5, 5, 5]),
+        what="validation points",
+    )
+    content = improvement_at_points(None, points, (15, 15), tmp_path / "i.png", "inches")
+    panels = panels_of(tmp_path / "i.png", content)
+    assert list(panels) == ["Change of error", "Linear interpolation"]
+    blue, orange = [25, 90, 190], [220, 105, 0]
+
+    def colours(name: str) -> list[list[int]]:
+        factor = panels[name].shape[0] / 15
+        places = ((points.xy[:, ::-1] + 0.5) * factor).astype(int)
+        return panels[name][tuple(places.T)].tolist()
+
+    after, linear = map(colours, panels)
+    assert (after[0], after[1]) == (blue, orange)
+    assert (linear[0], linear[1], linear[2], linear[3]) == (orange, blue, blue, blue)
+    assert min(after[2]) > 150  # grey for an equal error
+    assert len(set(after[3])) == 1  # no point, but the dark image
+    assert after[3][0] < 100
+    assert content.footer == "at 3 validation points: 33.3 % better, 33.3 % worse"
+    assert content.ends == ("worse by 1 inches or more", "better by 1 inches or more")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
@@ -84,6 +85,18 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     more = with_both.xy[len(with_near) :]
     distance = np.linalg.norm(more[:, None] - with_near.xy[None], axis=2).min(axis=1)
     assert distance.min() >= 2
+
+
+@pytest.mark.parametrize("seen", [0, 1])
+@pytest.mark.parametrize("count", [1, 5, 3000])
+def test_a_scan_that_sees_little_of_the_view_adds_what_agrees(seen: int, count: int) -> None:
+    own = room(seed=0).select(slice(count))
+    turned_away = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
+    behind, ahead = own.select(slice(0)), own.select(slice(seen))
+    scans = [(room(seed=1), turned_away), (behind, from_ahead(0)), (ahead, from_ahead(0))]
+    both = accumulate(own, {1: scans}, CAMERA)
+    assert both.xy.tobytes() == own.xy.tobytes()  # the one that agrees lies on a measured pixel
+    assert both.depth.tobytes() == own.depth.tobytes()
 
 
 def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:

@@ -226,7 +226,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
     """Raises InputError for a frame whose results have no files of their own."""
-    endings = [path.name for path in refine.outputs_in(Path(), "", with_gt=True).values()]
+    endings = [path.name for path in refine.outputs_in(Path(), "").values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
     for frame in frames:
         # Names that differ in Unicode normalisation only are one file on macOS.

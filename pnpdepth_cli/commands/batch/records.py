@@ -65,7 +65,7 @@ class Records:
     def outputs_of(self, frame: FrameFiles) -> Outputs:
         """Returns the files of a frame's result."""
         output, refine = self.request.output, self.request.refine
-        return refine.outputs_in(output, frame.name, with_gt=frame.gt is not None)
+        return refine.outputs_in(output, frame.name)
 
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
@@ -234,10 +234,10 @@ def write_summary(
         "chosen": len(chosen),
         "chosen_not_done": sum(r.status != "done" for r in records if r.name in chosen),
     }
-    # Weights of the networks.
-    weights = {}
-    for name in dict.fromkeys(name for record in results for name in record.weights):
-        own = [record.weights[name] for record in results if name in record.weights]
+    # Weights of the networks; one that a frame lacks has none there.
+    weights, fused = {}, [record.weights for record in results if record.weights]
+    for name in dict.fromkeys(name for of_frame in fused for name in of_frame):
+        own = [of_frame.get(name, 0.0) for of_frame in fused]
         weights[name] = {"mean": sum(own) / len(own), "least": min(own), "largest": max(own)}
     means = {name: weight["mean"] for name, weight in weights.items()}
     longest = max(results, key=lambda record: len(record.loss), default=None)  # none diverged early

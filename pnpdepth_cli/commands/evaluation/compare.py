@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,9 @@ class Gain:
     """The same by the number of tests, of all measures and runs."""
 
 
+_OF_GAIN = [each.name for each in fields(Gain)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ComparedRun:
     """A run on the frames that all runs scored."""
@@ -87,7 +91,7 @@ class ComparedRun:
     varied: dict[str, str]
     coverage: float | None
     gains: dict[str, Gain]
-    """Gains by measure; empty for the first run."""
+    """Gains by measure; empty for the reference, which is the first that was given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +102,14 @@ class Comparison:
     measures: tuple[Measure, ...]
     scoring: dict[str, object]
     runs: tuple[ComparedRun, ...]
+    """The runs of a study in the order of its values, others as they were given."""
     clusters: Clusters
     notes: list[str]
+
+    @property
+    def reference(self) -> ComparedRun:
+        """The run that the others are compared with."""
+        return next(run for run in self.runs if not run.gains)
 
     def to_json(self) -> dict[str, object]:
         """Returns what `--json` prints."""
@@ -137,28 +147,44 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     clusters = find_clusters(groups, np.concatenate(list(values[1:] - values[0]), axis=1))
     means = [_means(of_run.tolist(), keys) for of_run in values]
     gains = [{}, *_gains(values, means, measures, clusters)]
+    before = np.array([run.rows(names, keys, BEFORE) for run in runs], np.float64)
     is_unique = len({run.name for run in runs}) == len(runs)
     compared = [
         ComparedRun(
             name=run.name if is_unique else run.path,
             path=run.path,
             mean=mean,
-            before=_means(run.rows(names, keys, BEFORE), keys),
+            before=_means(np.where(known, of_run, math.nan).tolist(), keys),
             varied=run.varied,
             coverage=_means(run.rows(names, [COVERAGE.key]), [COVERAGE.key])[COVERAGE.key],
             gains=of_first,
         )
-        for run, mean, of_first in zip(runs, means, gains, strict=True)
+        for run, mean, of_run, of_first in zip(runs, means, before, gains, strict=True)
     ]
     found = Comparison(
         frames=names,
         measures=measures,
         scoring=runs[0].scoring,
-        runs=tuple(compared),
+        runs=tuple(_in_order(compared)),
         clusters=clusters,
         notes=[],
     )
     return replace(found, notes=[*_notes(runs, found, known)])
+
+
+def _in_order(runs: Sequence[ComparedRun]) -> list[ComparedRun]:
+    """The runs of `batch --vary` in the order of its values; others as they are."""
+    if not all(run.varied for run in runs):
+        return [*runs]
+    places = [_places(name, runs) for name in dict.fromkeys(n for run in runs for n in run.varied)]
+    return sorted(runs, key=lambda run: [place(run) for place in places])
+
+
+def _places(name: str, runs: Sequence[ComparedRun]) -> Callable[[ComparedRun], float]:
+    """A function of a run that says where its value of an option lies; without one, before all."""
+    values = [*dict.fromkeys(run.varied[name] for run in runs if name in run.varied)]
+    places = _numbers(values) or {value: float(place) for place, value in enumerate(values)}
+    return lambda run: places[run.varied[name]] if name in run.varied else -math.inf
 
 
 def _means(rows: Rows, keys: Sequence[str]) -> Means:
@@ -249,7 +275,7 @@ def _read_run(text: str) -> Run:
         scores = [frame.errors[GT][stage] for frame in scored]
         if not scores:
             raise InputError(f"{path}: no frame has scores; refine or evaluate with ground truth")
-        measures = [Measure(**entry) for entry in content.get("measures", ())] or MEASURES
+        measures = [_read_measure(entry) for entry in content.get("measures", ())] or MEASURES
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
@@ -265,6 +291,14 @@ def _read_run(text: str) -> Run:
         why = f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))})"
         hint = "give what eval --json printed, or the summary of a batch with ground truth"
         raise InputError(f"{why}; {hint}") from error
+
+
+def _read_measure(entry: Mapping[str, Any]) -> Measure:
+    """The measure of an entry that `Measure.to_json` gave; an error of Python's if it is none."""
+    measure = Measure(**entry)
+    if not (isinstance(measure.key, str) and measure.heading and measure.text(1.0)):
+        raise ValueError(f"{measure.key!r} is no measure")
+    return measure
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -285,13 +319,25 @@ def comparison_table(comparison: Comparison) -> Table:
             p = "–" if math.isnan(found.p_adjusted) else f"{found.p_adjusted:.4f}"
             rows.append([*row, (texts[0], style), *texts[1:], p])
     frames = count_of(len(comparison.frames), "shared frame")
-    gains = f"gains in per cent of the error of {comparison.runs[0].name}, positive is better"
+    gains = f"gains in per cent of the error of {comparison.reference.name}, positive is better"
     tests = f"intervals (95 %) and p-values {_describe_tests(comparison)}"
     return Table(
         title=f"{frames}; {gains}; {tests}",
         columns=["measure", "run", "mean", "gain [%]", "low", "high", "p"],
         rows=rows,
     )
+
+
+def comparison_values(comparison: Comparison) -> Table:
+    """Returns `comparison_table` for programs: keys, numbers in full, nothing for what is none."""
+    options = [*dict.fromkeys(name for run in comparison.runs for name in run.varied)]
+    rows: list[list[object]] = []
+    for measure in comparison.measures:
+        for run in comparison.runs:
+            row = [measure.key, run.name, *map(run.varied.get, options), run.mean[measure.key]]
+            of_run = run.gains.get(measure.key)
+            rows.append([*row, *(vars(of_run).values() if of_run else [None] * len(_OF_GAIN))])
+    return Table(columns=["measure", "run", *options, "mean", *_OF_GAIN], rows=rows)
 
 
 def methods_table(comparison: Comparison) -> Table:
@@ -311,7 +357,7 @@ def methods_table(comparison: Comparison) -> Table:
             stars = "*" * sum(p < limit for limit in _STARS)
             row.append((text + stars, "bold" if is_known and text == best else ""))
     best = f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold"
-    marks = f"*, **, ***: differs from {runs[0].name} with p < 0.05, 0.01, 0.001"
+    marks = f"*, **, ***: differs from {comparison.reference.name} with p < 0.05, 0.01, 0.001"
     return Table(
         title=f"{best}; {marks} {_describe_tests(comparison)}",
         columns=["", *comparison.measures],
@@ -349,9 +395,14 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
     # where each value lies, and the runs of each line in this order
     across, positions = _axis(comparison.runs)
     lines = defaultdict[str, dict[float, list[ComparedRun]]](dict)
+    names = [*dict.fromkeys(_labels(run, across) for run in comparison.runs)]
+    full = max(map(len, names))
     for run in sorted(comparison.runs, key=lambda run: positions[run.varied[across]]):
-        others = [f"{k}={value}" for k, value in run.varied.items() if k not in (across, _SEED)]
-        lines[", ".join(others)].setdefault(positions[run.varied[across]], []).append(run)
+        # A run without an option, as it has no effect there, is a point of each of its lines.
+        own = {*_labels(run, across)}
+        for labels in names:
+            if len(labels) == full and own <= {*labels}:
+                lines[", ".join(labels)].setdefault(positions[run.varied[across]], []).append(run)
     # a column of two panels for each measure
     measures = comparison.measures
     size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
@@ -384,14 +435,21 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
 
 def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:
     """The option that lies along the axis, and where its values do: names from 0 on."""
-    options = {tuple(run.varied) for run in runs}
-    if len(options) > 1 or () in options:
+    options = max((tuple(run.varied) for run in runs), key=len)
+    if not all({*run.varied} <= {*options} and run.varied for run in runs):
         raise UsageError("--plot needs results of `batch --vary`, all of the same options")
-    names = [name for name in options.pop() if name != _SEED] or [_SEED]
+    shared = [name for name in options if all(name in run.varied for run in runs)]
+    names = [name for name in shared if name != _SEED] or [_SEED]
     values = {name: [*dict.fromkeys(run.varied[name] for run in runs)] for name in names}
     across = max(values, key=lambda name: (_numbers(values[name]) is not None, len(values[name])))
     places = {value: float(place) for place, value in enumerate(values[across])}
     return across, _numbers(values[across]) or places
+
+
+def _labels(run: ComparedRun, across: str) -> tuple[str, ...]:
+    """The values that tell the run's line from others."""
+    others = ((k, value) for k, value in run.varied.items() if k not in (across, _SEED))
+    return tuple(f"{k}={value}" for k, value in others)
 
 
 def _numbers(texts: Sequence[str]) -> dict[str, float] | None:

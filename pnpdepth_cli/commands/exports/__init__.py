@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -50,6 +50,8 @@ class ExportFrame:
     """Pose in the unit of the result. None: unknown."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
+    unknown: str = "keep"
+    """What a program without masks gets of pixels that are not valid: one of `choices.UNKNOWN`."""
 
     @property
     def stem(self) -> str:
@@ -114,6 +116,7 @@ def export_results(
     *,
     to: str,
     overwrite: bool = False,
+    unknown: str = "keep",
     show: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[str, list[str]]:
     """Writes the files; returns what they hold in words, and notes, lines for a person.
@@ -123,6 +126,7 @@ def export_results(
         output: The folder to write to; it may hold the images and the model already.
         to: One of `choices.EXPORTS`.
         overwrite: Whether existing files are replaced.
+        unknown: One of `choices.UNKNOWN`, for programs that read no masks.
         show: Receives the numbers of frames that are written, and of all.
 
     Raises:
@@ -132,7 +136,8 @@ def export_results(
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     # The results, all in one unit.
-    frames = [_frame(result, export, output) for result in result_frames(results)]
+    found = [_frame(result, export, output) for result in result_frames(results)]
+    frames = [replace(frame, unknown=unknown) for frame in found]
     units = sorted({f"{f.result.record.unit} (unit-scale {f.unit_scale:g})" for f in frames})
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")

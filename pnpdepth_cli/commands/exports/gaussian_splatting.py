@@ -6,8 +6,9 @@ offset of each image are in sparse/0/depth_params.json. The code ignores images 
 0.2 or above 5 times the median, so all images have one scale here.
 
 The code takes 0 for infinitely far and reads no masks, so every pixel has a depth. A pixel that is
-not valid keeps its own. An unknown one has that of the nearest known pixel. Unless a model is
-there, sparse/0/ gets one of the refined images with points of their depth.
+not valid keeps its own. An unknown one has that of the nearest known pixel. With `unknown` "zero"
+both are 0, as is right of a sky, and as trainers that leave out pixels without depth read it.
+Unless a model is there, sparse/0/ gets one of the refined images with points of their depth.
 """
 
 from __future__ import annotations
@@ -72,6 +73,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         masked += int((~valid).sum())
         clipped += int((inverse > largest).sum())
         fitting = np.clip(inverse, scale / _CODES, largest).astype(np.float32)
+        if frame.unknown == "zero":
+            fitting = np.where(valid, fitting, np.float32(0))
         write_depth(_depth_image(folder, frame), fitting, scale=_CODES / scale)
         done()
     # What the program reads the codes with.
@@ -80,6 +83,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
         depth = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
+        if frames[0].unknown == "zero":
+            depth = "0, which 3DGS reads as infinitely far"
         notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
     if not model_files(_model(folder)):
         hint = "refine undistorted images with poses"

@@ -2,9 +2,10 @@
 
 The data conventions are Nerfstudio's. Camera axes are x right, y up, z backwards. Principal points
 count from the image's corner, so pixel centres are at .5. A depth is PNG code × 0.001 in the unit
-of the poses, that of the results. Instant-NGP reads the same file; it takes that factor from
-`integer_depth_scale`. Splatting begins with the points of start.ply, in the coordinates of the
-poses.
+of the poses, that of the results; scenes that are farther than 16 bits of it have a larger factor.
+Nerfstudio takes another factor from its option `--depth-unit-scale-factor`. Instant-NGP reads the
+same file; it takes the factor from `integer_depth_scale`. Splatting begins with the points of
+start.ply, in the coordinates of the poses.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.scans import write_cloud
 
-_CODES_PER_UNIT = 1000.0
+_FACTORS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Units of a code, of which the first is taken that all depths of the frames fit in."""
 _START = "start.ply"
 _LENSES = {
     "radial-tangential": ("OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4")),
@@ -46,30 +48,37 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     if len(lenses) > 1:
         fact = f"the cameras have lenses of several kinds ({', '.join(lenses)})"
         raise InputError(f"{fact}, but Nerfstudio takes one; undistort the images first")
+    # Units of a code: Nerfstudio's default, or as many as the farthest depth needs.
+    farthest = max(float(frame.valid_depth().max()) for frame in frames)
+    fitting = [factor for factor in _FACTORS if np.rint(farthest / factor) <= LARGEST_CODE]
+    if not fitting:
+        raise InputError(f"a depth of {farthest:.4g} is none of a scene; refine the frames again")
+    factor = fitting[0]
     # Depth, points and image of each frame.
-    clipped, entries, start = 0, [], []
+    entries, start = [], []
     for frame in frames:
         entries.append(_entry(folder, frame))
         start.append(frame.start_points(len(frames)))
-        depth = frame.valid_depth()
-        fits = np.rint(depth * _CODES_PER_UNIT) <= LARGEST_CODE
-        clipped += int((~fits).sum())
-        write_depth(folder / _depth_image(frame), np.where(fits, depth, 0), scale=_CODES_PER_UNIT)
+        write_depth(folder / _depth_image(frame), frame.valid_depth(), scale=1 / factor)
         done()
     write_cloud(folder / _START, start)
     # Cameras and poses.
     content = {
         "camera_model": _LENSES[lenses[0]][0],
         "enable_depth_loading": True,
-        "integer_depth_scale": 1 / _CODES_PER_UNIT,
+        "integer_depth_scale": factor,
+        "depth_unit_scale_factor": factor,
         "ply_file_path": _START,
         "frames": entries,
     }
     write_json(folder / "transforms.json", content)
-    if not clipped:
+    if factor == _FACTORS[0]:
         return []
-    limit = f"{LARGEST_CODE / _CODES_PER_UNIT:.4g} {frames[0].result.record.unit}"
-    return [f"depth: {clipped:,} pixels beyond {limit}, the largest of 16 bits, are unknown"]
+    unit = frames[0].result.record.unit
+    return [
+        f"depth: up to {farthest:.4g} {unit}, so a code is {factor:g} {unit}; give ns-train"
+        f" `nerfstudio-data --depth-unit-scale-factor {factor:g}`"
+    ]
 
 
 def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:

@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest, endings_of
 from pnpdepth_cli.commands.requests import check_outputs
-from pnpdepth_cli.completion.interpolation import in_hull
+from pnpdepth_cli.completion.interpolation import in_hull, linear
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
@@ -21,10 +22,18 @@ from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import KITTI_SCALE, LARGEST_CODE, format_of_suffix
-from pnpdepth_cli.io.visualisation import depth_scale, improvement, preview, write_mask
+from pnpdepth_cli.io.visualisation import (
+    PointErrors,
+    depth_scale,
+    improvement,
+    improvement_at_points,
+    preview,
+    write_mask,
+)
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
+from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
@@ -58,7 +67,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     elif output.is_file() or (suffix[1:].isalpha() and not output.is_dir()):
         raise OutputError(f"{output} is no folder; name one, or a depth file ({formats})")
     else:
-        outputs = request.outputs_in(output, inputs[0].stem, with_gt=files.gt is not None)
+        outputs = request.outputs_in(output, inputs[0].stem)
     # No input is replaced, and no result unless it may be.
     check_outputs(outputs.values(), inputs, overwrite=request.overwrite)
     return outputs
@@ -73,7 +82,8 @@ def remove_outdated(outputs: Outputs) -> None:
     if record is None:
         return
     endings = {end for suffix in DEPTH_SUFFIXES for end in endings_of(suffix).values()}
-    outdated = {record.with_name(record.stem + end) for end in endings} - {*outputs.values()}
+    written = {path for kind, path in outputs.items() if kind != "improvement"}  # not of each frame
+    outdated = {record.with_name(record.stem + end) for end in endings} - written
     for path in (record, *sorted(outdated)):
         try:
             path.unlink(missing_ok=True)
@@ -143,6 +153,8 @@ def write_outputs(
 ) -> dict[str, FigureRecord]:
     """Writes the depth and its images; returns the figures by kind.
 
+    An improvement map needs ground truth, or points that the result has not seen.
+
     Args:
         outputs: The files by kind.
         inputs: The frame as it was read.
@@ -164,13 +176,43 @@ def write_outputs(
         figures["preview"] = preview(
             image, xy, depth, frame.before, frame.depth, outputs["preview"], inputs.unit, made_by
         )
-    if "improvement" in outputs and inputs.gt is not None:
+    path, unit = outputs.get("improvement"), inputs.unit
+    if path is not None and inputs.gt is not None:
         figures["improvement"] = improvement(
-            image, frame.before, frame.depth, inputs.gt, outputs["improvement"], inputs.unit
+            image, frame.before, frame.depth, inputs.gt, path, unit
         )
+    elif path is not None and (points := _unseen_points(inputs, frame)) is not None:
+        figures["improvement"] = improvement_at_points(image, points, inputs.size, path, unit)
     if "view" in outputs:
         _write_view(outputs["view"], inputs, frame)
     return figures
+
+
+def _unseen_points(inputs: Frame, frame: Refined) -> PointErrors | None:
+    """The held-out points, else the validation points, with the depths there; None without any."""
+    held_out, validation = inputs.held_out, frame.validation
+    if held_out is not None and len(held_out):
+        maps = (
+            torch.from_numpy(frame.before),
+            torch.from_numpy(frame.depth),
+            linear(inputs.points),
+        )
+        before, after, between = (held_out.sample(depth).numpy() for depth in maps)
+        points, what = held_out, "held-out points"
+    elif validation is not None and len(validation.points):
+        stages = (BEFORE, AFTER, LINEAR)
+        before, after, between = (validation.predicted[stage].numpy() for stage in stages)
+        points, what = validation.points, "validation points"
+    else:
+        return None
+    return PointErrors(
+        xy=points.xy.numpy(),
+        truth=points.depth.numpy(),
+        before=before,
+        after=after,
+        linear=between,
+        what=what,
+    )
 
 
 def _write_sigma(path: Path, sigma: DepthMap) -> None:

@@ -137,6 +137,7 @@ def write_refined(
             outputs={
                 kind: path.relative_to(folder).as_posix() if folder else str(path)
                 for kind, path in outputs.items()
+                if kind != "improvement" or kind in figures
             },
             seconds=seconds,
             peak_memory_mb=peak_memory_mb(method.own.network.device),

@@ -34,7 +34,8 @@ class RefineRequest:
     model: str = option(
         "compact",
         "A name of `pnpdepth models`, FILE.onnx[:OUTPUT], FILE.pt2, a Hugging Face folder, or"
-        " FILE.py[:ATTR], which is Python code and is run.",
+        " FILE.py[:ATTR], which is Python code and is run. FILE:[1] or FILE:[z] is a part of its"
+        " output.",
         metavar="NETWORK",
     )
     more_models: tuple[str, ...] = ()
@@ -94,9 +95,9 @@ class RefineRequest:
             changes[group] = replace(own, **{name: values.pop(name) for name in names})
         return replace(self, **changes, **values)
 
-    def outputs_in(self, folder: Path, name: str, *, with_gt: bool) -> Outputs:
+    def outputs_in(self, folder: Path, name: str) -> Outputs:
         """Returns the files of a result in a folder; slashes in the name are subfolders."""
-        asked = {"view": self.view_3d, "improvement": with_gt}
+        asked = {"view": self.view_3d}
         asked |= dict.fromkeys(("sigma", "valid"), self.uncertainty)
         endings = endings_of(f".{self.format}")
         return {k: folder / f"{name}{end}" for k, end in endings.items() if asked.get(k, True)}

@@ -9,22 +9,26 @@ same drive's folder, in <date>/, raw/<date>/ or kitti_raw/<date>/. As downloaded
 truth lie apart in data_depth_velodyne/{train,val}/ and data_depth_annotated/{train,val}/.
 
 `kitti-raw`: a drive, a date, or what the dates are in. Ground truth is the annotated depth, where
-the drive or a folder data_depth_annotated/{train,val}/ beside the dates has it.
+the drive or a folder data_depth_annotated/{train,val}/ beside the dates has it. Poses are those of
+the inertial system, where the drive has oxts/ and the date calib_imu_to_velo.txt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose
+from pnpdepth_cli.camera import Extrinsics
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose, file_of
 from pnpdepth_cli.dataset.layouts.layout import Layout, Part, join_parts, row
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.poses import read_poses
+from pnpdepth_cli.io.calibration import read_calibration, read_inertial_pose
+from pnpdepth_cli.io.poses import read_oxts, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 
 _CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
+_PACKETS, _INERTIAL = "oxts/data", "calib_imu_to_velo.txt"
 _RAW = ("", "raw/", "kitti_raw/")  # folders of the raw data's dates
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
@@ -143,7 +147,31 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "gt": (_truth_of(drive, camera.name), "*.png?"),
         }
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
-        yield from _frames_of_camera(drive, camera.name, parts, shared)
+        found = list(_frames_of_camera(drive, camera.name, parts, shared))
+        poses = _poses_of_drive(drive, [each for each in found if isinstance(each, FrameFiles)])
+        yield from (
+            poses.get(each, each) if isinstance(each, FrameFiles) else each for each in found
+        )
+
+
+def _poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:
+    """The frames with poses of the inertial system; none where a file of them is missing.
+
+    The world is the first frame's camera, rectified.
+    """
+    packets = [drive / _PACKETS / f"{file_of(f.image).stem}.txt" for f in frames if f.image]
+    inertial = drive.parent / _INERTIAL
+    if not packets or not all(path.is_file() for path in (*packets, inertial)):
+        return {}
+    scanner = read_calibration(drive.parent, frames[0].camera).scanner
+    if scanner is None:
+        return {}
+    # From the camera to the inertial system, to the world, and to the first camera.
+    of_camera = (scanner @ read_inertial_pose(inertial)).inverse()
+    places = [Extrinsics(pose[:, :3], pose[:, 3]) @ of_camera for pose in read_oxts(packets)]
+    origin = places[0].inverse()
+    poses = [as_pose((origin @ place).square()[:3]) for place in places]
+    return {f: replace(f, pose=pose) for f, pose in zip(frames, poses, strict=True)}
 
 
 def _frames_of_camera(

@@ -127,7 +127,10 @@ def _load_external(model: ModelProto, folder: Path) -> None:
         for tensor in external._get_all_tensors(model)
         if external.uses_external_data(tensor)
     ]
-    sizes = {claim.location: (folder / claim.location).stat().st_size for claim in claims}
+    sizes = dict[str, int]()
+    for location in dict.fromkeys(claim.location for claim in claims):
+        check_network_file(folder / location, "its file")
+        sizes[location] = (folder / location).stat().st_size
     claimed = sum(claim.length or sizes[claim.location] for claim in claims)
     most = min(_SHARED * sum(sizes.values()), max_decoded_bytes())
     check_claim(f"its tensors have {claimed:,} bytes in other files", claimed, most)

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -136,6 +137,49 @@ def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: P
     ways_out = ["--poses"] * 2 + ["camera"] * 2
     messages = [record.message or "" for record in listener.records]
     assert all(way in message for message, way in zip(messages, ways_out, strict=True))
+
+
+def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path) -> None:
+    root, listener = drive_on_disk(tmp_path, frames=3), Recorder()
+    away = np.column_stack([Rotation.from_rotvec([0, np.radians(150), 0]).as_matrix(), [0, 0, 0]])
+    ahead = np.column_stack([np.eye(3), [0, 0, 300.0]])
+    np.savetxt(root / "away.txt", np.reshape([away, np.eye(3, 4), ahead], (3, 12)))
+    sparse = root / "sparse/drive_002.png"
+    assert "drive_001" in accumulating(root, poses=root / "away.txt", listener=listener)
+    assert record_of(root, "drive_001")["points"]["moved"] == 0
+    # Nor does one without any point.
+    cv2.imwrite(str(sparse), np.zeros_like(cv2.imread(str(sparse), cv2.IMREAD_UNCHANGED)))
+    assert "drive_001" in accumulating(root, limit=2, listener=listener)
+    assert record_of(root, "drive_001")["points"]["moved"] > 0
+    assert any(sparse.name in note for note in record_of(root, "drive_001")["notes"])
+
+
+def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> None:
+    for part in ("rgb", "sparse", "calib"):
+        shutil.copytree(DRIVE / part, tmp_path / part)
+    (tmp_path / "net").mkdir()
+    frame_on_disk(tmp_path / "net")
+    accumulating(tmp_path, poses=None, refine={"iterations": 0})
+    notes = record_of(tmp_path, "drive_001")["notes"]
+    (said,) = (note for note in notes if "estimated from the images" in note)
+    assert "drive_000" in said
+    assert "drive_002" in said
+    # Each frame's farthest point moves by the known 0.6 m a frame.
+    output = tmp_path / "all.ply"
+    _, of_cloud = write_depth_cloud(CloudRequest(depth=tmp_path / "out", output=output))
+    assert any("estimated" in note for note in of_cloud)
+    ends = []
+    for number in range(3):
+        single = tmp_path / f"{number}.ply"
+        depth = tmp_path / f"out/drive_{number:03}_depth.png"
+        write_depth_cloud(CloudRequest(depth=depth, output=single))
+        xyz = read_scan(single)[0]
+        ends.append((len(xyz), xyz))
+    whole, start = read_scan(output)[0], 0
+    for number, (count, xyz) in enumerate(ends):
+        shift = np.median(whole[start : start + count] - xyz, axis=0)
+        np.testing.assert_allclose(shift, [0, 0, 0.6 * number], atol=0.06)
+        start += count
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:

@@ -296,6 +296,35 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
     assert ["4 frames count as 2 groups of frames" in note for note in told.notes] == [True]
 
 
+def test_mean_weights_add_up_where_a_frame_lacks_a_network(root: Path) -> None:
+    weights: list[dict[str, float]] = [
+        {"net": 0.5, "compact": 0.5},
+        {"compact": 0.9, "linear": 0.1},
+        {"net": 0.2, "compact": 0.8},
+        {},  # of a method without weights
+    ]
+    settings = {"align": "none", "iterations": 0, "propagate": "none"}
+    records = [
+        FrameRecord(
+            name=f"{number}",
+            weights=own,
+            settings=settings,
+            errors={"ground_truth": {"before": {"mae": 1.0}, "after": {"mae": 2.0}}},
+            model=ModelRecord(name="net", spec="net"),
+            method=method_record("net", "compact"),
+        )
+        for number, own in enumerate(weights)
+    ]
+    (root / "out").mkdir()
+    request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
+    told = write_summary(request, find_frames(request), {}, records)
+    means = {name: own["mean"] for name, own in told.weights.items()}
+    assert means == pytest.approx({"net": 0.7 / 3, "compact": 2.2 / 3, "linear": 0.1 / 3})
+    assert sum(means.values()) == pytest.approx(1)
+    assert told.weights["net"]["least"] == 0
+    assert told.titles["after"] == "fused (net 23%, compact 73%, linear 3%)"
+
+
 def test_results_are_not_written_through_a_planted_link(root: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     add_frame(root, "room/e")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import sys
 from collections.abc import Iterable
@@ -17,6 +19,7 @@ from pnpdepth_cli.commands.evaluation.compare import (
     Comparison,
     compare,
     comparison_table,
+    comparison_values,
     methods_table,
     plot_comparison,
 )
@@ -156,6 +159,16 @@ def test_a_batch_is_compared_with_what_it_started_from_by_groups(tmp_path: Path)
     assert comparison.notes[-1].startswith("warning: 3 groups of frames are too few")
 
 
+def test_errors_before_are_averaged_over_the_frames_of_those_after(tmp_path: Path) -> None:
+    frames: list[dict[str, Scores]] = [
+        {"before": {"mae": before}, "after": {"mae": after}}
+        for before, after in ((2.0, 1.0), (4.0, 3.0), (90.0, None))
+    ]
+    one, two = (saved(tmp_path / name, *frames) for name in ("one", "two"))
+    (first, _) = compare([one, two], columns=["mae"]).runs
+    assert (first.before["mae"], first.mean["mae"]) == (3, 2)
+
+
 BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '{"measures": []}']
 
 
@@ -167,6 +180,24 @@ def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
         with pytest.raises(InputError, match=r"broken\.json|one") as error:
             compare([one, other])
         assert "ValueError" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"better": None}, {"better": []}, {"decimals": "x"}, {"shown_factor": ""}, {"key": 5}]
+)
+def test_a_file_whose_measures_cannot_be_shown_is_refused(
+    tmp_path: Path, wrong: dict[str, object]
+) -> None:
+    frame(tmp_path, [[11, 11]], [[10, 10]])
+    good = scored(tmp_path).to_json()
+    measures = good["measures"]
+    assert isinstance(measures, list)
+    for name, first in (("good", measures[0]), ("bad", measures[0] | wrong)):
+        write_json(tmp_path / f"{name}.json", good | {"measures": [first, *measures[1:]]})
+    paths = [str(tmp_path / f"{name}.json") for name in ("good", "bad")]
+    compare([paths[0], paths[0]])
+    with pytest.raises(InputError, match=r"bad\.json"):
+        compare(paths)
 
 
 def refined(folder: Path, mae: float, **varied: str) -> str:
@@ -199,6 +230,40 @@ def test_a_plot_has_an_axis_lines_and_means_over_seeds(tmp_path: Path) -> None:
     (legend,) = figure.legends
     named = [text.get_text() for text in legend.get_texts()]
     assert named == ["loss=x", "loss=y", "before refinement"]
+
+
+@pytest.mark.parametrize("first", ["0", "20"])
+def test_runs_of_a_study_are_in_the_order_of_its_values(tmp_path: Path, first: str) -> None:
+    counts = sorted(["0", "5", "20", "100"], key=lambda count: (count != first, count))
+    runs = [refined(tmp_path, 1 / (1 + int(count)), iterations=count) for count in counts]
+    comparison = compare(runs, columns=["mae"])
+    assert [run.varied["iterations"] for run in comparison.runs] == ["0", "5", "20", "100"]
+    assert comparison.reference.varied["iterations"] == first
+    expected = 100 * (1 - (1 + int(first)) / 101)
+    assert comparison.runs[3].gains["mae"].percent == pytest.approx(expected)
+    for table in (comparison_table(comparison), methods_table(comparison)):
+        assert f"of {comparison.reference.name}," in table.title or "differs from" in table.title
+
+
+def test_a_csv_for_programs_has_keys_numbers_in_full_and_empty_cells(tmp_path: Path) -> None:
+    runs = [refined(tmp_path, mae, iterations=n) for n, mae in (("0", 1.0), ("5", 2 / 3))]
+    first, second = csv.DictReader(io.StringIO(comparison_values(compare(runs)).csv()))
+    assert first["measure"] == "mae"
+    assert (first["iterations"], second["iterations"]) == ("0", "5")
+    assert float(second["mean"]) == 2 / 3
+    assert float(second["percent"]) == pytest.approx(100 / 3, abs=1e-12)
+    assert (first["percent"], second["low_percent"]) == ("", "")  # one frame has no interval
+
+
+def test_a_run_without_updates_is_a_point_of_each_line(tmp_path: Path) -> None:
+    pairs = [("5", "1%", 0.5), ("5", "3%", 0.25), ("20", "1%", 0.3), ("20", "3%", 0.2)]
+    runs = [refined(tmp_path, 1.0, iterations="0")]
+    runs += [refined(tmp_path, mae, iterations=n, lr=lr) for n, lr, mae in pairs]
+    above, below = plotted(compare(runs), tmp_path / "p.png").axes
+    assert below.get_xlabel() == "iterations"
+    lines = {line.get_label(): line.get_xydata().tolist() for line in above.get_lines()}
+    assert lines["lr=1%"] == [[0, 1.0], [5, 0.5], [20, 0.3]]
+    assert lines["lr=3%"] == [[0, 1.0], [5, 0.25], [20, 0.2]]
 
 
 def test_names_alone_lie_side_by_side_in_their_order(tmp_path: Path) -> None:

@@ -76,3 +76,29 @@ def test_a_3d_view_has_the_depth_and_directions_of_the_cloud(frame: FrameOnDisk)
     intrinsics = np.array([[50, 0, 30], [0, 50, 20], [0, 0, 1.0]])
     camera = Camera(intrinsics=intrinsics, distortion=(-0.2, 0.03, 0.001, 0.0))
     assert np.abs(rays - rays_of(camera, np.column_stack([x, y]))).max() * 50 < 0.05
+
+
+@pytest.mark.parametrize(
+    ("options", "heading"),
+    [
+        ({"method": "alone"}, "validation points"),
+        ({"method": "alone", "holdout": 0.3}, "held-out points"),
+        ({"propagate": "none"}, None),
+    ],
+)
+def test_without_ground_truth_improvement_is_at_points_that_nothing_used(
+    frame: FrameOnDisk, options: dict[str, object], heading: str | None
+) -> None:
+    path = frame.folder / "out/img_improvement.png"
+    run(frame, gt=frame.gt)  # of an earlier run
+    assert path.is_file()
+    record = run(frame, overwrite=True, **options)
+    assert path.is_file() == (heading is not None) == ("improvement" in record.outputs)
+    if heading is None:
+        return
+    basis = heading.partition(" ")[0].replace("-", "_")
+    footer = record.figures["improvement"].footer
+    assert footer is not None
+    assert footer.startswith(f"at {record.errors[basis]['after']['points']:,} {heading}: ")
+    if basis == "held_out" and record.improved_fraction is not None:
+        assert f"{100 * record.improved_fraction:.1f} % better" in footer

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.dataset.arrays import apply_masks, move_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions
@@ -14,6 +16,7 @@ from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.io.poses import read_oxts
 from pnpdepth_cli.protocols import ODOMETRY_PART
 from tests.colmap_models import write_text_model
 from tests.data_sets import (
@@ -348,3 +351,74 @@ def test_each_frame_of_a_video_belongs_to_the_depth_of_its_number(tmp_path: Path
     frame = inputs_of(read_frames(tmp_path, "pairs")[1])
     np.testing.assert_allclose(frame.points.depth, 2)
     assert frame.sources["sparse"].assumed
+
+
+SPEED = 8  # column of an oxts packet: forward velocity, m/s
+
+
+def raw_drive(root: Path, packets: Sequence[str]) -> Path:
+    """A drive of KITTI's raw data with these oxts packets, and the calibration of a real one."""
+    date = root / "2011_09_26"
+    folder = date / DRIVE
+    turn = "0 -1 0 0 0 -1 1 0 0"  # the camera looks along the scanner's x
+    write(date / "calib_cam_to_cam.txt", f"R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_02: {PROJECTION}\n")
+    write(date / "calib_velo_to_cam.txt", f"R: {turn}\nT: 0 -0.08 -0.27\n")
+    write(date / "calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n")
+    for number, packet in enumerate(packets):
+        touch(
+            folder / f"image_02/data/{number:010}.png",
+            folder / f"velodyne_points/data/{number:010}.bin",
+        )
+        write(folder / f"oxts/data/{number:010}.txt", packet)
+    return date
+
+
+PROJECTION = "700 0 300 0 0 700 100 0 0 0 1 0"
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, -150.0])
+def test_poses_of_a_raw_drive_are_those_of_the_inertial_system(
+    heading_deg: float, tmp_path: Path
+) -> None:
+    # 10 m ahead, then a turn by 3 degrees to the left on the spot, at a latitude of 49 degrees.
+    heading, metre_deg = np.radians(heading_deg), 1 / 111_319.49
+    north, east = 10 * np.sin(heading) * metre_deg, 10 * np.cos(heading) * metre_deg
+    places = [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 1.0, 3.0)]
+    scale = np.cos(np.radians(49))
+    packets = [
+        " ".join(map(str, [49 + n * north, 8.4 + e * east / scale, 110, 0, 0,
+                           heading + np.radians(turn), *[0] * 24]))
+        for n, e, turn in places
+    ]  # fmt: skip
+    date = raw_drive(tmp_path, packets)
+    poses = np.array([frame.pose for frame in list_frames(tmp_path, None)[1]])
+    np.testing.assert_allclose(poses[0], np.eye(3, 4), atol=1e-9)
+    np.testing.assert_allclose(poses[1, :, 3], [0, 0, 10], atol=0.02)
+    turned = Rotation.from_matrix(poses[2, :, :3]).as_rotvec(degrees=True)
+    np.testing.assert_allclose(turned, [0, -3, 0], atol=1e-6)
+    # Without a packet of every frame, or the pose of the system, none is known.
+    (date / DRIVE / "oxts/data/0000000001.txt").write_text("49 8 110")
+    with pytest.raises(InputError, match="0000000001"):
+        list_frames(tmp_path, None)
+    (date / DRIVE / "oxts/data/0000000001.txt").unlink()
+    assert all(frame.pose is None for frame in list_frames(tmp_path, None)[1])
+
+
+def test_the_poses_of_a_real_drive_have_its_speed(shared_data: Path) -> None:
+    drive = next((shared_data / "kitti_raw/2011_09_26").glob("*_sync"))
+    packets = sorted((drive / "oxts/data").glob("*.txt"))
+    poses = read_oxts(packets)
+    lines = (drive / "oxts/timestamps.txt").read_text().splitlines()[: len(packets)]
+    seconds = [float(line.rpartition(":")[2]) for line in lines]
+    stated = np.mean([float(path.read_text().split()[SPEED]) for path in packets])
+    assert stated == pytest.approx(8.8, abs=0.1)
+    way_m = np.linalg.norm(poses[-1, :, 3] - poses[0, :, 3])
+    # satellite positions move by decimetres against velocities
+    assert way_m / (seconds[-1] - seconds[0]) == pytest.approx(stated, rel=0.05)
+    ahead = poses[0, :, :3].T @ (poses[-1, :, 3] - poses[0, :, 3])
+    assert ahead[0] / way_m > 0.99

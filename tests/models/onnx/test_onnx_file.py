@@ -100,6 +100,7 @@ QUANTISED = helper.make_node("DynamicQuantizeLinear", ["depth"], ["q", "scale", 
         ({"shape": (1, 4, 32, 48)}, "1×4×32×48"),
         ({"shape": (2, 3, 32, 48)}, "2×3×32×48"),
         ({"shape": (1, 3, 10**6, 10**6)}, "pixels"),
+        ({"shape": (1, 3, 7000, 9000)}, "--max-pixels"),
     ],
 )
 def test_other_networks_are_refused(stated: dict[str, Any], message: str, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
-from tests.models.weights.files import npy_of, pickled, refused
+from tests.models.weights.files import little, npy_of, pickled, refused
 from tests.models.weights.test_tensor_bundle import bundle, entry
 
 
@@ -70,6 +70,17 @@ def test_every_format_gives_its_weights_and_is_refused_if_cut(suffix: str, tmp_p
     for length in range(0, len(whole) - 1, max(1, len(whole) // 60)):
         path.write_bytes(whole[:length])
         refused(path)
+
+
+@pytest.mark.parametrize("suffix", [*SAVES, ".index", ".ckpt"])
+def test_no_pipe_or_endless_file_is_read(suffix: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"endless{suffix}").symlink_to("/proc/self/pagemap")
+    for name in ("pipe", "endless"):
+        with little():
+            refused(tmp_path / f"{name}{suffix}")
+    with little():
+        refused(tmp_path)  # a folder of both
 
 
 @pytest.mark.parametrize("prefix", ["module.", "module.module.", "_orig_mod.", "model._orig_mod."])
