@@ -23,8 +23,18 @@ from pnpdepth_cli.errors import ModelError
 _ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
 """One activation may have so many elements (1 GB), or so many times those of input and weights."""
 
+_broadcast: Callable[..., torch.Size] = torch.broadcast_shapes
+
 _NUMBERS = ("item", "_local_scalar_dense", "equal")
 """Operators of torch whose result is a Python number."""
+
+_BATCH_NORMS = ("native_batch_norm", "_native_batch_norm_legit_no_training")
+
+_TRUTH_VALUES = (
+    *("eq", "ne", "lt", "le", "gt", "ge", "isnan", "isinf", "isfinite", "isposinf", "isneginf"),
+    *("signbit", "logical_and", "logical_or", "logical_xor", "logical_not", "isclose", "isreal"),
+)
+"""Functions of single elements whose result is true or false."""
 
 
 class Operation(nn.Module):
@@ -171,6 +181,11 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         work: Elements read and products summed by all operations together, or no limit.
     """
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # As in `Watch`: without this mark, torch would import its whole compiler.
+        return False
+
     def __init__(self, largest: int, in_all: float = math.inf, work: float = math.inf) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._largest, self._left, self._work = largest, in_all, work
@@ -203,13 +218,34 @@ def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str,
     without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
     try:
-        return func(*args, **kwargs | without)
+        return result_without_values(func, args, kwargs | without)
     except NotImplementedError:
         if func._opname not in _NUMBERS:
             raise ModelError("a result of a size that only its values tell") from None
         return None
     except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
         return None
+
+
+def result_without_values(
+    func: OpOverload, args: Sequence[object], kwargs: Mapping[str, object]
+) -> object:
+    """Returns the result of an operation on tensors of the meta device.
+
+    Where torch would write it out in smaller operations, it imports its compiler, which takes 1 s.
+    Batch normalisation and functions of single elements need none.
+    """
+    tensors = [each for each in (*args, *kwargs.values()) if isinstance(each, Tensor)]
+    first = tensors[0] if tensors else None
+    if first is None or not all(each.is_meta for each in tensors):
+        return func(*args, **kwargs)
+    if func._opname in _BATCH_NORMS:
+        return torch.empty_like(first), first.new_empty(0), first.new_empty(0)
+    plain = torch.Tag.pointwise in func.tags and not func._schema.is_mutable
+    plain = plain and func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
+    if plain and all(each.dtype == first.dtype == torch.float32 for each in tensors):
+        return first.new_empty(_broadcast(*(each.shape for each in tensors)))
+    return func(*args, **kwargs)
 
 
 def _tensors_in(value: object) -> list[Tensor]:

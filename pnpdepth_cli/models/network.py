@@ -160,6 +160,20 @@ class Network:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
                 does not choose from.
         """
+        tensor = self.map_of(output)
+        # Where it is not finite, it is NaN, and no gradient comes from there.
+        known = tensor.isfinite()
+        if bool(known.all()):
+            return tensor
+        _read_nan_gradients_as_zero(tensor)
+        return torch.where(known, tensor, torch.nan)
+
+    def map_of(self, output: object) -> Tensor:
+        """Returns the prediction as `raw_of` does, but not finite where it is not.
+
+        Raises:
+            ModelError: As of `raw_of`.
+        """
         # The definition's `output` picks the depth, or it is the only tensor.
         name = f"network {self.definition.name!r}"
         if self.definition.output is not None:
@@ -176,13 +190,7 @@ class Network:
         if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
             fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
             raise ModelError(f"{name} {fact}; pick it by the definition's output")
-        tensor = tensor.reshape(1, 1, *shape[-2:])
-        # Where it is not finite, it is NaN, and no gradient comes from there.
-        known = tensor.isfinite()
-        if bool(known.all()):
-            return tensor
-        _read_nan_gradients_as_zero(tensor)
-        return torch.where(known, tensor, torch.nan)
+        return tensor.reshape(1, 1, *shape[-2:])
 
     def known_of(self, output: object) -> Tensor:
         """Returns `raw_of` the output, 0 where it is not finite."""
@@ -368,7 +376,7 @@ def _with_suggested_layers(network: Network) -> Network:
     frame = FrameMap.fit(network.definition.size, _SUGGESTION_SIDE, _SUGGESTION_SIDE)
     with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
-        layers = suggest_layers(network.module, arguments, network.raw_of)
+        layers = suggest_layers(network.module, arguments, network.map_of)
     if not layers:
         return network
     note = (
