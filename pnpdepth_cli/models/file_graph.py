@@ -6,6 +6,7 @@ gigabytes; `SizeLimit` knows the size of every result before it is allocated.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +23,6 @@ from pnpdepth_cli.errors import ModelError
 
 _ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
 """One activation may have so many elements (1 GB), or so many times those of input and weights."""
-
-_broadcast: Callable[..., torch.Size] = torch.broadcast_shapes
 
 _NUMBERS = ("item", "_local_scalar_dense", "equal")
 """Operators of torch whose result is a Python number."""
@@ -233,9 +232,9 @@ def result_without_values(
     """Returns the result of an operation on tensors of the meta device.
 
     Where torch would write it out in smaller operations, it imports its compiler, which takes 1 s.
-    Batch normalisation and functions of single elements need none.
+    The commonest operations need none.
     """
-    tensors = [each for each in (*args, *kwargs.values()) if isinstance(each, Tensor)]
+    tensors = _tensors_in((args, kwargs))
     first = tensors[0] if tensors else None
     if first is None or not all(each.is_meta for each in tensors):
         return func(*args, **kwargs)
@@ -243,9 +242,22 @@ def result_without_values(
         return torch.empty_like(first), first.new_empty(0), first.new_empty(0)
     plain = torch.Tag.pointwise in func.tags and not func._schema.is_mutable
     plain = plain and func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
-    if plain and all(each.dtype == first.dtype == torch.float32 for each in tensors):
-        return first.new_empty(_broadcast(*(each.shape for each in tensors)))
+    same = all(each.dtype == first.dtype for each in tensors)
+    if plain and same and first.dtype == torch.float32:
+        return first.new_empty(_broadcast([each.shape for each in tensors]))
+    if func._opname == "cat" and same and len({each.ndim for each in tensors}) == 1 and first.ndim:
+        axis = int(args[1]) if len(args) > 1 else 0  # type: ignore[call-overload]
+        shape = list(first.shape)
+        shape[axis] = sum(each.shape[axis] for each in tensors)
+        return first.new_empty(shape)
     return func(*args, **kwargs)
+
+
+def _broadcast(shapes: Sequence[Sequence[int]]) -> list[int]:
+    """The shape of a function of single elements of tensors that have these shapes."""
+    # torch.broadcast_shapes imports a package for symbols.
+    sides = itertools.zip_longest(*map(reversed, shapes), fillvalue=1)
+    return [next((size for size in sizes if size != 1), 1) for sizes in sides][::-1]
 
 
 def _tensors_in(value: object) -> list[Tensor]:
