@@ -56,16 +56,25 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
         return definition.default_layer
     enough = min(wanted_field(frame.network, point_count), *frame.network)
 
-    with out_of_memory_is_a_device_error(network.device):
-        arguments = network.synthetic_arguments(frame)
-        fields = fields_of(network, arguments, definition.layers)
-        ordered = _by_preference(definition.layers, fields, enough)
+    def decide() -> list[str]:
+        with out_of_memory_is_a_device_error(network.device):
+            arguments = network.synthetic_arguments(frame)
+            fields = fields_of(network, arguments, definition.layers)
+            ordered = _by_preference(definition.layers, fields, enough)
+            first = partial(_first_usable, ordered)
+            return [by_shapes(network.module, arguments, first) or definition.layers[0]]
 
-        def first_usable(module: nn.Module, arguments: _Arguments) -> str:
-            usable = (name for name in ordered if _can_be_cut(module, name, arguments))
-            return next(usable, definition.layers[0])
+    question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
+    return network.recalled_layers(question, decide)[0]
 
-        return by_shapes(network.module, arguments, first_usable)
+
+def _first_usable(layers: Sequence[str], module: nn.Module, arguments: _Arguments) -> str | None:
+    """The first of the layers that the network can be cut at."""
+    for layer in layers:
+        with suppress(ModelError), Split(module, layer) as split, torch.no_grad():
+            split.rear(split.front(*arguments))
+            return layer
+    return None
 
 
 def fields_of(
@@ -94,13 +103,6 @@ def _by_preference(layers: Sequence[str], fields: Mapping[str, Field], enough: f
     wide = [name for name, (width, _) in widths.items() if width >= enough]
     others = [name for name in widths if name not in wide]
     return [*wide, *sorted(others, key=widths.__getitem__, reverse=True)]
-
-
-def _can_be_cut(module: nn.Module, layer: str, arguments: _Arguments) -> bool:
-    with suppress(ModelError), Split(module, layer) as split, torch.no_grad():
-        split.rear(split.front(*arguments))
-        return True
-    return False
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.models.cut_layers import suggest_layers
+from pnpdepth_cli.models.decisions import recalled
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, file_and_part
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
@@ -130,6 +132,17 @@ class Network:
             self.image_of(frame, synthetic if rgb is None else rgb),
             frame.points_to_network(points),
             intrinsics=frame.intrinsics_to_network(camera),
+        )
+
+    def recalled_layers(self, question: str, decide: Callable[[], list[str]]) -> list[str]:
+        """Returns layers that were decided before, else what is decided now; see `recalled`."""
+        names = {name for name, _ in self.module.named_modules()}
+        return recalled(
+            self.module,
+            self.definition.checkpoint if self.definition.complete else None,
+            question,
+            decide,
+            lambda layers: bool(layers) and names.issuperset(layers),
         )
 
     def verify(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
@@ -374,9 +387,14 @@ def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | N
 def _with_suggested_layers(network: Network) -> Network:
     """The network with layers to cut at, for a definition that lists none."""
     frame = FrameMap.fit(network.definition.size, _SUGGESTION_SIDE, _SUGGESTION_SIDE)
-    with out_of_memory_is_a_device_error(network.device):
-        arguments = network.synthetic_arguments(frame)
-        layers = suggest_layers(network.module, arguments, network.map_of)
+
+    def suggest() -> list[str]:
+        with out_of_memory_is_a_device_error(network.device):
+            arguments = network.synthetic_arguments(frame)
+            return [*suggest_layers(network.module, arguments, network.map_of)]
+
+    question = f"layers, of {frame.network}"
+    layers = tuple(network.recalled_layers(question, suggest))
     if not layers:
         return network
     note = (

@@ -26,11 +26,16 @@ def by_shapes(
     A network of a file or of transformers is run without values, which takes no time. The code of
     any other may keep tensors outside itself, which would have no values later: it is run as it is.
     """
-    if isinstance(module, FileGraph) or type(module).__module__.startswith("transformers."):
+    if isinstance(module, FileGraph) or is_of_transformers(module):
         # Where a network reads values, or torch knows no shapes, this fails.
         with suppress(Exception), _WithoutValues():  # type: ignore[no-untyped-call]
             return run(_without_values(module), tuple(each.to("meta") for each in arguments))
     return run(module, arguments)
+
+
+def is_of_transformers(module: nn.Module) -> bool:
+    """Whether the network is a class of that package."""
+    return type(module).__module__.startswith("transformers.")
 
 
 def _without_values(module: nn.Module) -> nn.Module:
