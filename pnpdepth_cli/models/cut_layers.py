@@ -25,6 +25,7 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.shapes import by_shapes
+from pnpdepth_cli.spent import spent_on
 
 if TYPE_CHECKING:
     from pnpdepth_cli.models.network import Network
@@ -65,7 +66,8 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
             return [by_shapes(network.module, arguments, first) or definition.layers[0]]
 
     question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
-    return network.recalled_layers(question, decide)[0]
+    with spent_on("layer"):
+        return network.recalled_layers(question, decide)[0]
 
 
 def _first_usable(layers: Sequence[str], module: nn.Module, arguments: _Arguments) -> str | None:

@@ -24,6 +24,7 @@ from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.errors import InputError, ModelError
 from pnpdepth_cli.models import definition
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
+from pnpdepth_cli.spent import spent_on
 
 _MOST_JSON_BYTES = 1 << 24
 _MAX_SIDE = 1 << 16  # pixels
@@ -182,7 +183,10 @@ def _build(folder: Path, kind: str) -> nn.Module:
     # Read when huggingface_hub is imported; a folder may name a backbone that is looked for online.
     os.environ["HF_HUB_OFFLINE"] = "1"
     try:
-        from transformers import utils
+        with spent_on("import"):
+            from transformers import utils
+
+            network_class = _network_class(kind)
     except ImportError as error:
         way_out = "pip install 'pnpdepth[hf]'"
         raise ModelError(f"reading {folder} needs {error.name}: {way_out}") from None
@@ -191,7 +195,6 @@ def _build(folder: Path, kind: str) -> nn.Module:
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     # The network is described without values, and must not be larger than its weights then.
-    network_class = _network_class(kind)
     with _fewer_parameters_than_bytes(folder):
         module, info = network_class.from_pretrained(
             str(folder),

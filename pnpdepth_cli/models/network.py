@@ -30,6 +30,7 @@ from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.spent import spent_on
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
@@ -331,6 +332,16 @@ def load_network(
         DeviceError: The device is missing or too small.
         UsageError: A checkpoint is named for a network that brings its own weights.
     """
+    with spent_on("weights"):
+        network = _load(spec, checkpoint, device)
+    if network.definition.layers or network.definition.defaults.layer:
+        return network
+    with spent_on("layer"):
+        return _with_suggested_layers(network)
+
+
+def _load(spec: str | ModelDefinition, checkpoint: Path | None, device: str) -> Network:
+    """The network without layers that its definition does not name."""
     torch_device = find_device(device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
     name = f"network {definition.name!r}"
@@ -355,16 +366,13 @@ def load_network(
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(torch_device):
         module.to(torch_device)
-    network = Network(
+    return Network(
         definition=definition,
         module=module,
         device=torch_device,
         checkpoint=None if path is None else file_and_part(path)[0],
         notes=tuple(notes),
     )
-    if definition.layers or definition.defaults.layer:
-        return network
-    return _with_suggested_layers(network)
 
 
 def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | None) -> list[str]:

@@ -33,6 +33,7 @@ from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit
 from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
 from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
+from pnpdepth_cli.spent import spent_on
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
@@ -92,9 +93,10 @@ def _read(file: Path) -> tuple[ModelProto, bool]:
     # The file, and the packages that read it.
     check_network_file(file, "ONNX file", _MAX_BYTES)
     try:
-        import onnx
-        import onnxruntime  # noqa: F401
-        from google.protobuf.message import DecodeError
+        with spent_on("import"):
+            import onnx
+            import onnxruntime  # noqa: F401
+            from google.protobuf.message import DecodeError
     except ImportError as error:
         way_out = "pip install 'pnpdepth[onnx]'"
         raise ModelError(f"reading {file} needs {error.name}: {way_out}") from None
@@ -206,7 +208,8 @@ def _verify(
     """
 
     def compare() -> list[str]:
-        _compare(source, file, module, arguments)
+        with spent_on("check"):
+            _compare(source, file, module, arguments)
         return [_AGREES]
 
     sizes = [(tuple(each.shape), each.device.type) for each in arguments]
