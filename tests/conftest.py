@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,12 @@ def pytest_configure(config: pytest.Config) -> None:
         from tests.rounding import enter_in_every_thread
 
         enter_in_every_thread()
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test decides about networks is kept for it alone, not in the user's folder."""
+    monkeypatch.setenv("PNPDEPTH_CACHE", str(tmp_path_factory.getbasetemp() / secrets.token_hex(6)))
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = (
     *("errors", "stages", "measures", "camera", "points", "protocols", "choices", "file_record"),
-    *("settings", "budget", "scan_pattern"),
+    *("settings", "budget", "scan_pattern", "spent"),
 )
 """Each imports only those before it."""
 MAY_IMPORT = {

@@ -88,7 +88,7 @@ def print_refinement(record: FrameRecord) -> None:
         where = "scored pixels" if GT in record.errors else "held-out points"
         say(f"improved: {record.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
-    parts = [", ".join(f"{stage} {spent:.2f} s" for stage, spent in record.seconds.items())]
+    parts = [_times(record.seconds)]
     parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
     updates = len(record.loss) - 1
     if updates > 0:
@@ -97,6 +97,18 @@ def print_refinement(record: FrameRecord) -> None:
         parts.insert(0, f"{tables.count_of(updates, 'update')} of z ({how})")
     say(" · ".join(parts))
     say(f"wrote {'  '.join(record.outputs.values())}")
+
+
+def _times(seconds: Mapping[str, float]) -> str:
+    """Such as `read 0.04 s, load network 4.10 s (import 2.02, weights 0.61, layer 0.90)`."""
+    texts = []
+    for stage, spent in seconds.items():
+        if ": " in stage:  # a part of another
+            continue
+        own = {name: each for name, each in seconds.items() if name.startswith(f"{stage}: ")}
+        shown = [f"{name.partition(': ')[2]} {each:.2f}" for name, each in own.items()]
+        texts.append(f"{stage} {spent:.2f} s" + (f" ({', '.join(shown)})" if shown else ""))
+    return ", ".join(texts)
 
 
 def print_batch(summary: BatchSummary, said: set[str]) -> None:

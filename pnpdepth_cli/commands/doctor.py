@@ -13,12 +13,23 @@ import psutil
 import torch
 
 import pnpdepth_cli
+from pnpdepth_cli.commands.tables import count_of
+from pnpdepth_cli.models import decisions
 
 _DEVELOPERS = ("test", "docs", "train")  # extras that no command needs
 
 
-def examine() -> dict[str, list[str]]:
-    """Returns the lines of the report by topic."""
+def examine(*, clear_cache: bool = False) -> dict[str, list[str]]:
+    """Returns the lines of the report by topic.
+
+    Args:
+        clear_cache: Whether what was decided about networks in earlier runs is forgotten first.
+
+    Raises:
+        OutputError: That is not allowed.
+    """
+    if clear_cache:
+        decisions.forget()
     memory = psutil.virtual_memory()
     return {
         "pnpdepth": [pnpdepth_cli.__version__],
@@ -26,6 +37,7 @@ def examine() -> dict[str, list[str]]:
         "packages": list(_packages()),
         "devices": _devices(),
         "memory": [f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB available"],
+        "cache": [_cache()],
         "self-test": [_self_test()],
     }
 
@@ -49,6 +61,13 @@ def _devices() -> list[str]:
     cpu = f"cpu: {torch.get_num_threads()} threads, {capability}"
     numbers = range(torch.cuda.device_count())
     return [cpu, *(f"cuda:{n}: {torch.cuda.get_device_name(n)}" for n in numbers)]
+
+
+def _cache() -> str:
+    """What was decided about networks, and is kept for the next run."""
+    files = decisions.kept()
+    size = sum(path.stat().st_size for path in files)
+    return f"decisions about {count_of(len(files), 'network')}, {size / 1000:.1f} kB"
 
 
 def _self_test() -> str:

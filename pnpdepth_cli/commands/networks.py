@@ -11,9 +11,10 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from pnpdepth_cli import errors
-from pnpdepth_cli.core.influence import influential_field
+from pnpdepth_cli.core.influence import Field
 from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.models.cut_layers import fields_of
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
@@ -133,7 +134,7 @@ class MeasuredLayer:
 
     stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
     fraction of the network's floating-point operations behind the cut, which every update repeats.
-    Fields: rows and columns that one point influences, see `influential_field`.
+    Fields: rows and columns that one point influences, see `influential_fields`.
     """
 
     name: str
@@ -178,14 +179,21 @@ def list_layers(
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
+        fields = fields_of(network, arguments, names)
         for done, name in enumerate(names, start=1):
-            measured.append(_measure(network, name, arguments, frame, whole.get_total_flops()))
+            flops = whole.get_total_flops()
+            measured.append(_measure(network, name, arguments, frame, flops, fields.get(name)))
             on_layer(done, len(names))
     return measured
 
 
 def _measure(
-    network: Network, name: str, arguments: tuple[Tensor, ...], frame: FrameMap, whole_flops: int
+    network: Network,
+    name: str,
+    arguments: tuple[Tensor, ...],
+    frame: FrameMap,
+    whole_flops: int,
+    field: Field | None,
 ) -> MeasuredLayer:
     try:
         with Split(network.module, name) as split, torch.no_grad():
@@ -193,7 +201,6 @@ def _measure(
             split.rear(z)  # the first pass learns the cut
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
-            in_z, in_output = influential_field(split, z, network.known_of)
     except errors.ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(
@@ -201,6 +208,6 @@ def _measure(
         shape=tuple(z.shape),
         stride=frame.network[0] / z.shape[-2] if z.ndim == 4 else None,
         cost_behind=behind.get_total_flops() / whole_flops if whole_flops else None,
-        field_in_z=in_z,
-        field_in_output=in_output,
+        field_in_z=None if field is None else field.in_z,
+        field_in_output=None if field is None else field.in_output,
     )

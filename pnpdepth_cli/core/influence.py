@@ -1,79 +1,209 @@
-"""The influential field: how far one sparse point reaches through a cut network, measured.
+"""The influential field: how far one sparse point reaches through a cut network, by its shapes.
 
-Both senses of the paper's term are measured: the patch of z that the gradient of one point reaches
-(5×5 for two 3×3 convolutions), and the patch of the output that changes when that patch of z does
-(9×9 there).
+Both senses of the paper's term: the patch of z that the gradient of one point reaches (5×5 for two
+3×3 convolutions), and the patch of the output that changes when that patch of z does (9×9 there).
+All layers are measured in one pass, which may run on tensors without values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch._ops import OpOverload
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.errors import wrap_user_errors
+from pnpdepth_cli.core.split.cut_point import CutPoint
+from pnpdepth_cli.core.split.tensors import tensors_in
+from pnpdepth_cli.core.spread import Spread, spread_of
+from pnpdepth_cli.errors import ModelError, wrap_user_errors
 
 _POSITIONS = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
-"""Where points are placed, as fractions of height and width; inactive units may hide a part at
-one position."""
-
+"""Where points are placed, as fractions of height and width; a field may differ by a stride."""
 
 Patch = tuple[int, int]
 """Height and width of a patch."""
 
 
-def influential_field(
-    split: Split, z: Tensor, depth_of: Callable[[object], Tensor], enough: float | None = None
-) -> tuple[Patch | None, Patch]:
-    """Returns the largest patch of z in elements, and of the output in pixels.
+class Field(NamedTuple):
+    """What one point influences: a patch of z in elements, and of the output in pixels.
 
-    They are those of a few points near the centre of the image. The sizes are lower bounds:
-    connections through units that are zero for this image do not count. The patch of z is None if
-    z has no two spatial axes.
+    The sizes are upper bounds: units that are zero for an image let nothing through. in_z: None if
+    z has no two spatial axes. stride: pixels of the output for each element of z.
+    """
+
+    in_z: Patch | None
+    in_output: Patch
+    stride: float
+
+
+def influential_fields(
+    module: nn.Module,
+    arguments: tuple[object, ...],
+    layers: Iterable[str],
+    prediction_of: Callable[[object], Tensor],
+) -> dict[str, Field]:
+    """Returns the largest fields of a few points near the centre of the image, by layer.
+
+    A layer is left out that is not in the network, never runs, runs several times without a choice,
+    or gives no single tensor.
 
     Args:
-        z: z_0, as returned by `split.front`.
-        depth_of: Turns the network's output into depth (1, 1, h, w).
-        enough: Rows and columns that the patch of the output is compared with. No further point is
-            tried once it has as many, or, since points differ little, fewer than half. None
-            tries every point.
+        module: The network, in eval mode.
+        arguments: Its arguments for a frame.
+        layers: Layers as `Split` takes them.
+        prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
     """
-    z = z.detach().requires_grad_(True)
-    with torch.enable_grad():
-        depth = depth_of(split.rear(z))
-    in_z, in_output = [], []
-    for down, right in _POSITIONS:
-        # ∂depth/∂z of one point; the graph of the depth is kept for the next one.
-        with torch.enable_grad():
-            point = depth[..., int(depth.shape[-2] * down), int(depth.shape[-1] * right)].sum()
-        z.grad = None
-        if point.requires_grad:
-            with wrap_user_errors("the gradient of the network"):
-                point.backward(retain_graph=True)  # type: ignore[no-untyped-call]
-        gradient = torch.zeros_like(z) if z.grad is None else z.grad
-        moved = z.detach() + z.detach().std(correction=0) * gradient.sign()
-        # With gradients both times: without, torch may take a kernel that rounds differently.
-        with torch.enable_grad():
-            changed = depth_of(split.rear(moved.requires_grad_(True))).detach() != depth.detach()
-        in_output.append(_extent(changed))
-        if z.ndim == 4:
-            in_z.append(_extent(gradient != 0))
-        width = min(_largest(in_output))
-        if enough is not None and (width >= enough or 0 < width < enough / 2):
-            break
-    return _largest(in_z) if in_z else None, _largest(in_output)
+    follower, cuts = _Follower(), dict[str, CutPoint]()
+    for layer in layers:
+        with suppress(ModelError):
+            cuts[layer] = CutPoint.find(module, layer)
+    with ExitStack() as hooks, torch.no_grad(), wrap_user_errors("the network's forward"):
+        for cut in cuts.values():
+            if not isinstance(cut.module, torch.jit.ScriptModule):
+                hooks.enter_context(cut.module.register_forward_hook(partial(follower.begin, cut)))
+        with follower:
+            prediction = prediction_of(module(*arguments))
+    return {
+        layer: _field(follower.followed(layer, prediction), shape, prediction)
+        for layer, shape in follower.shapes.items()
+        if cuts[layer].call is not None or follower.calls[layer] == 1
+    }
 
 
-def _extent(mask: Tensor) -> Patch:
-    """Height and width of the bounding box of the true elements of (…, h, w)."""
-    flat = mask.reshape(-1, *mask.shape[-2:]).any(dim=0)
-    rows, columns = flat.any(dim=1).nonzero(), flat.any(dim=0).nonzero()
-    if not len(rows):
-        return 0, 0
-    return int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
+def _field(spreads: list[Spread], shape: torch.Size, prediction: Tensor) -> Field:
+    """The field of a layer whose output has this shape."""
+    patches = [_patches(spreads, prediction, position) for position in _POSITIONS]
+    in_z, in_output = (_largest(patch) for patch in zip(*patches, strict=True))
+    has_map = len(shape) == 4
+    stride = prediction.shape[-2] / max(1, shape[-2]) if has_map else 0.0
+    return Field(in_z if has_map else None, in_output, stride)
 
 
-def _largest(patches: list[Patch]) -> Patch:
-    return max(height for height, _ in patches), max(width for _, width in patches)
+def _patches(
+    spreads: list[Spread], prediction: Tensor, position: tuple[float, float]
+) -> tuple[Patch, Patch]:
+    """The patch of z that one point of the prediction depends on, and that of the output."""
+    in_z, in_output = [0, 0], [0, 0]
+    for side, fraction in enumerate(position):
+        # The spreads are those of the rows of z and of its columns, or of z as a whole.
+        axis = prediction.ndim - 2 + side
+        for spread in spreads[side : side + 1] or spreads:
+            first, last = spread.first[:, axis], spread.last[:, axis]
+            point = int(prediction.shape[axis] * fraction)
+            reached = ((first <= point) & (point <= last)).nonzero()
+            if len(reached):
+                in_z[side] = int(reached[-1] - reached[0]) + 1
+                in_output[side] = int(last[reached].max() - first[reached].min()) + 1
+    if not all(in_z):
+        return (0, 0), (0, 0)
+    return (in_z[0], in_z[1]), (in_output[0], in_output[1])
+
+
+def _largest(patches: Iterable[Patch]) -> Patch:
+    heights, widths = zip(*patches, strict=True)
+    return max(heights), max(widths)
+
+
+_Geometry = tuple[int, torch.Size, tuple[int, ...]]
+"""Offset, shape and strides of a tensor in its storage."""
+
+_Source = tuple[str, int]
+"""A layer, and 0 for the rows of its output or 1 for the columns."""
+
+
+class _Follower(TorchDispatchMode):
+    """Follows what depends on the outputs of layers through every operation of a pass.
+
+    A tensor is known by its place in memory, so that views and changes in place are followed too.
+    """
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # as in `Watch`
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.shapes: dict[str, torch.Size] = {}
+        """Shapes of the outputs of the layers that ran."""
+        self.calls: Counter[str] = Counter()
+        """How often each layer ran."""
+        self._known: dict[int, dict[_Geometry, dict[_Source, Spread]]] = {}
+
+    def begin(self, cut: CutPoint, _module: nn.Module, _inputs: object, output: object) -> None:
+        """Follows a layer's output from here on, if this is the call that is cut at; a hook."""
+        self.calls[cut.layer] += 1
+        if self.calls[cut.layer] != (cut.call or 1):
+            return
+        with suppress(ModelError):
+            _, z = cut.choose(output)
+            spreads = [Spread.whole(z.shape or (1,), 1)]
+            if z.ndim == 4:
+                spreads = [Spread.of_axis(z.shape, 2), Spread.of_axis(z.shape, 3)]
+            self.shapes[cut.layer] = z.shape
+            known = self._spreads_of(z)
+            known.update({(cut.layer, side): each for side, each in enumerate(spreads)})
+
+    def followed(self, layer: str, tensor: Tensor) -> list[Spread]:
+        """Returns where a tensor depends on the rows and the columns of a layer's output."""
+        known = self._spreads_of(tensor)
+        return [known[layer, side] for side in range(2) if (layer, side) in known]
+
+    def __torch_dispatch__(
+        self,
+        func: OpOverload,
+        types: object,
+        args: Sequence[object] = (),
+        kwargs: Mapping[str, object] | None = None,
+    ) -> object:
+        kwargs = kwargs or {}
+        # Inputs by the number of the argument; those in lists and keywords have none.
+        inputs = [
+            (int(path[0]) if len(path) == 1 else None, tensor) for path, tensor in tensors_in(args)
+        ]
+        inputs += [(None, tensor) for _, tensor in tensors_in(kwargs)]
+        before = [(index, tensor, dict(self._spreads_of(tensor))) for index, tensor in inputs]
+        result = func(*args, **kwargs)
+        storages = {_storage(tensor) for _, tensor in inputs}
+        for position, (_, output) in enumerate(tensors_in(result)):
+            found = dict[_Source, Spread]()
+            for index, tensor, known in before:
+                for source, spread in known.items():
+                    moved = spread_of(func, args, index, tensor, spread, output, position)
+                    if moved is not None:
+                        found[source] = moved.joined(found.get(source))
+            if _storage(output) not in storages:
+                self._known[_storage(output)] = {}  # new memory, where nothing else is known
+            elif func._schema.is_mutable:
+                self._spoil(output, found)
+            self._known.setdefault(_storage(output), {})[_geometry(output)] = found
+        return result
+
+    def _spreads_of(self, tensor: Tensor) -> dict[_Source, Spread]:
+        places = self._known.setdefault(_storage(tensor), {})
+        return places.setdefault(_geometry(tensor), {})
+
+    def _spoil(self, written: Tensor, spreads: dict[_Source, Spread]) -> None:
+        """Notes a change in place: other views of the same memory may depend on all of it."""
+        for (_, shape, _), known in self._known.get(_storage(written), {}).items():
+            for source, spread in spreads.items():
+                known[source] = Spread.whole(shape or (1,), len(spread.first))
+
+
+def _storage(tensor: Tensor) -> int:
+    try:
+        return int(tensor.untyped_storage()._cdata)
+    except NotImplementedError:  # a sparse tensor has none
+        return 0
+
+
+def _geometry(tensor: Tensor) -> _Geometry:
+    strided = tensor.layout == torch.strided
+    if not strided:
+        return 0, tensor.shape, ()
+    return int(tensor.storage_offset()), tensor.shape, tensor.stride()

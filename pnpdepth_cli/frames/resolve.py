@@ -20,6 +20,7 @@ from pnpdepth_cli.models.definition import (
 from pnpdepth_cli.models.network import Network, align_output
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
+from pnpdepth_cli.spent import spent_on
 
 NORMALISATIONS = {
     "unit": Normalisation(),
@@ -63,7 +64,8 @@ def resolve_definition(
     definition, notes = network.definition, list(network.notes)
     with errors.out_of_memory_is_a_device_error(network.device):
         if definition.normalisation is None and frame.rgb is not None:
-            network, note = _with_best_input_range(network, [frame, *more_frames()])
+            with spent_on("input range"):
+                network, note = _with_best_input_range(network, [frame, *more_frames()])
             notes.append(note)
         if definition.verify is not None:
             notes += network.verify(prepare(network, frame).arguments)

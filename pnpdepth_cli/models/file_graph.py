@@ -6,6 +6,7 @@ gigabytes; `SizeLimit` knows the size of every result before it is allocated.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,14 @@ _ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
 
 _NUMBERS = ("item", "_local_scalar_dense", "equal")
 """Operators of torch whose result is a Python number."""
+
+_BATCH_NORMS = ("native_batch_norm", "_native_batch_norm_legit_no_training")
+
+_TRUTH_VALUES = (
+    *("eq", "ne", "lt", "le", "gt", "ge", "isnan", "isinf", "isfinite", "isposinf", "isneginf"),
+    *("signbit", "logical_and", "logical_or", "logical_xor", "logical_not", "isclose", "isreal"),
+)
+"""Functions of single elements whose result is true or false."""
 
 
 class Operation(nn.Module):
@@ -171,6 +180,11 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         work: Elements read and products summed by all operations together, or no limit.
     """
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # As in `Watch`: without this mark, torch would import its whole compiler.
+        return False
+
     def __init__(self, largest: int, in_all: float = math.inf, work: float = math.inf) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._largest, self._left, self._work = largest, in_all, work
@@ -203,13 +217,47 @@ def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str,
     without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
     try:
-        return func(*args, **kwargs | without)
+        return result_without_values(func, args, kwargs | without)
     except NotImplementedError:
         if func._opname not in _NUMBERS:
             raise ModelError("a result of a size that only its values tell") from None
         return None
     except (RuntimeError, ValueError, TypeError, IndexError):  # running it says what is wrong
         return None
+
+
+def result_without_values(
+    func: OpOverload, args: Sequence[object], kwargs: Mapping[str, object]
+) -> object:
+    """Returns the result of an operation on tensors of the meta device.
+
+    Where torch would write it out in smaller operations, it imports its compiler, which takes 1 s.
+    The commonest operations need none.
+    """
+    tensors = _tensors_in((args, kwargs))
+    first = tensors[0] if tensors else None
+    if first is None or not all(each.is_meta for each in tensors):
+        return func(*args, **kwargs)
+    if func._opname in _BATCH_NORMS:
+        return torch.empty_like(first), first.new_empty(0), first.new_empty(0)
+    plain = torch.Tag.pointwise in func.tags and not func._schema.is_mutable
+    plain = plain and func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
+    same = all(each.dtype == first.dtype for each in tensors)
+    if plain and same and first.dtype == torch.float32:
+        return first.new_empty(_broadcast([each.shape for each in tensors]))
+    if func._opname == "cat" and same and len({each.ndim for each in tensors}) == 1 and first.ndim:
+        axis = int(args[1]) if len(args) > 1 else 0  # type: ignore[call-overload]
+        shape = list(first.shape)
+        shape[axis] = sum(each.shape[axis] for each in tensors)
+        return first.new_empty(shape)
+    return func(*args, **kwargs)
+
+
+def _broadcast(shapes: Sequence[Sequence[int]]) -> list[int]:
+    """The shape of a function of single elements of tensors that have these shapes."""
+    # torch.broadcast_shapes imports a package for symbols.
+    sides = itertools.zip_longest(*map(reversed, shapes), fillvalue=1)
+    return [next((size for size in sizes if size != 1), 1) for sizes in sides][::-1]
 
 
 def _tensors_in(value: object) -> list[Tensor]:

@@ -7,15 +7,15 @@ says, by this program's own code.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
-import torch
 from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
@@ -24,6 +24,7 @@ from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.errors import InputError, ModelError
 from pnpdepth_cli.models import definition
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
+from pnpdepth_cli.spent import spent_on
 
 _MOST_JSON_BYTES = 1 << 24
 _MAX_SIDE = 1 << 16  # pixels
@@ -85,16 +86,26 @@ def _pixels(side: float | None) -> int:
     return round(1 / side) if isinstance(side, float) else side or 1
 
 
-_FAMILIES: dict[str, tuple[OutputKind, OutputScale, int]] = {
-    "depth_anything": ("inverse", "affine", 14),
+class _Family(NamedTuple):
+    """What the networks of a model type predict, and what sides of images are multiples of."""
+
+    network: str
+    """Name of the class in transformers."""
+    output_kind: OutputKind
+    output_scale: OutputScale
+    multiple: int
+
+
+_FAMILIES = {
+    "depth_anything": _Family("DepthAnythingForDepthEstimation", "inverse", "affine", 14),
     # Intel's DPT give inverse depth, Meta's on DINOv2 give depth; their configurations do not say.
-    "dpt": ("unknown", "affine", 16),
-    "zoedepth": ("depth", "metric", 32),
-    "glpn": ("depth", "metric", 32),
+    "dpt": _Family("DPTForDepthEstimation", "unknown", "affine", 16),
+    "zoedepth": _Family("ZoeDepthForDepthEstimation", "depth", "metric", 32),
+    "glpn": _Family("GLPNForDepthEstimation", "depth", "metric", 32),
     # Inverse depth for a canonical camera: a factor away from metres.
-    "depth_pro": ("inverse", "scale", 1),
+    "depth_pro": _Family("DepthProForDepthEstimation", "inverse", "scale", 1),
 }
-"""What the networks of a model type predict, and what sides of images are multiples of."""
+"""The families of networks, by the model type in config.json."""
 
 
 def hf_definition(folder: Path) -> definition.ModelDefinition:
@@ -116,7 +127,7 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
     with wrap_content_errors(str(folder / "config.json")):
         _check_settings(config)
     # What its numbers are, and how images are prepared.
-    output_kind, output_scale, of = _FAMILIES[kind]
+    _, output_kind, output_scale, of = _FAMILIES[kind]
     if config.get("depth_estimation_type") == "metric":
         output_kind, output_scale = "depth", "metric"
     file = folder / "preprocessor_config.json"
@@ -137,7 +148,7 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
         normalisation=processing.normalisation(),
         output_kind=output_kind,
         output_scale=output_scale,
-        build=lambda: _build(folder),
+        build=lambda: _build(folder, kind),
         complete=True,
         checkpoint=weights,
         output=lambda output: output.predicted_depth,
@@ -168,30 +179,30 @@ def _read(file: Path, kind: type[_Kind]) -> _Kind:
         return msgspec.convert(json.loads(file.read_bytes()), kind)
 
 
-def _build(folder: Path) -> nn.Module:
+def _build(folder: Path, kind: str) -> nn.Module:
     # Read when huggingface_hub is imported; a folder may name a backbone that is looked for online.
     os.environ["HF_HUB_OFFLINE"] = "1"
     try:
-        import transformers
+        with spent_on("import"):
+            from transformers import utils
+
+            network_class = _network_class(kind)
     except ImportError as error:
         way_out = "pip install 'pnpdepth[hf]'"
         raise ModelError(f"reading {folder} needs {error.name}: {way_out}") from None
     # transformers says nothing of its own.
-    logging: Any = transformers.utils.logging
+    logging: Any = utils.logging
     logging.set_verbosity_error()
     logging.disable_progress_bar()
-    # The network must not be larger than its weights, which are read last.
-    networks: Any = transformers.AutoModelForDepthEstimation
-    config = transformers.AutoConfig.from_pretrained(str(folder), local_files_only=True)
-    with _fewer_parameters_than_bytes(folder), torch.device("meta"):
-        networks.from_config(config)
-    module, info = networks.from_pretrained(
-        str(folder),
-        local_files_only=True,
-        use_safetensors=True,
-        trust_remote_code=False,
-        output_loading_info=True,
-    )
+    # The network is described without values, and must not be larger than its weights then.
+    with _fewer_parameters_than_bytes(folder):
+        module, info = network_class.from_pretrained(
+            str(folder),
+            local_files_only=True,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+        )
     # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:
@@ -201,14 +212,24 @@ def _build(folder: Path) -> nn.Module:
     return network
 
 
+def _network_class(kind: str) -> Any:
+    """The network for depth of a type, from the module of transformers that defines it."""
+    module = importlib.import_module(f"transformers.models.{kind}.modeling_{kind}")
+    return getattr(module, _FAMILIES[kind].network)
+
+
 @contextmanager
 def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
-    """Inside, a network of more parameters than its weights have bytes raises ModelError."""
+    """Inside, a network of more parameters than its weights have bytes raises ModelError.
+
+    transformers describes the network on the meta device, and gives it its weights afterwards.
+    """
     left = (folder / "model.safetensors").stat().st_size
 
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
         nonlocal left
-        left -= 0 if parameter is None else max(1, parameter.numel())
+        if parameter is not None and parameter.is_meta:
+            left -= max(1, parameter.numel())
         if left < 0:
             raise ModelError(f"{folder}: config.json describes a larger network than its weights")
 

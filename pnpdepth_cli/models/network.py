@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.models.cut_layers import suggest_layers
+from pnpdepth_cli.models.decisions import recalled
 from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
@@ -33,6 +35,7 @@ from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.registry import find_definition, importing_beside
 from pnpdepth_cli.models.weights import load_checkpoint
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.spent import spent_on
 
 FARTHEST_DEPTH = 1e4
 """Metres; inverse depth below 1/FARTHEST_DEPTH reads as this depth."""
@@ -140,6 +143,17 @@ class Network:
             intrinsics=frame.intrinsics_to_network(camera),
         )
 
+    def recalled_layers(self, question: str, decide: Callable[[], list[str]]) -> list[str]:
+        """Returns layers that were decided before, else what is decided now; see `recalled`."""
+        names = {name for name, _ in self.module.named_modules()}
+        return recalled(
+            self.module,
+            self.definition.checkpoint if self.definition.complete else None,
+            question,
+            decide,
+            lambda layers: bool(layers) and names.issuperset(layers),
+        )
+
     def verify(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
         """Returns the notes of the definition's `verify` on the network's arguments for a frame.
 
@@ -168,6 +182,20 @@ class Network:
             ModelError: It holds no prediction, or several tensors that `output` of the definition
                 does not choose from.
         """
+        tensor = self.map_of(output)
+        # Where it is not finite, it is NaN, and no gradient comes from there.
+        known = tensor.isfinite()
+        if bool(known.all()):
+            return tensor
+        _read_nan_gradients_as_zero(tensor)
+        return torch.where(known, tensor, torch.nan)
+
+    def map_of(self, output: object) -> Tensor:
+        """Returns the prediction as `raw_of` does, but not finite where it is not.
+
+        Raises:
+            ModelError: As of `raw_of`.
+        """
         # The definition's `output` picks the depth, or it is the only tensor.
         name = f"network {self.definition.name!r}"
         if self.definition.output is not None:
@@ -186,13 +214,7 @@ class Network:
             fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
             way_out = "pick a channel as FILE:[0], z of points as FILE:[z]"
             raise ModelError(f"{name} {fact}; {way_out}, or by `output` of its definition")
-        tensor = tensor.reshape(1, 1, *shape[-2:])
-        # Where it is not finite, it is NaN, and no gradient comes from there.
-        known = tensor.isfinite()
-        if bool(known.all()):
-            return tensor
-        _read_nan_gradients_as_zero(tensor)
-        return torch.where(known, tensor, torch.nan)
+        return tensor.reshape(1, 1, *shape[-2:])
 
     def known_of(self, output: object) -> Tensor:
         """Returns `raw_of` the output, 0 where it is not finite."""
@@ -346,6 +368,16 @@ def load_network(
         DeviceError: The device is missing or too small.
         UsageError: A checkpoint is named for a network that brings its own weights.
     """
+    with spent_on("weights"):
+        network = _load(spec, checkpoint, device)
+    if network.definition.layers or network.definition.defaults.layer:
+        return network
+    with spent_on("layer"):
+        return _with_suggested_layers(network)
+
+
+def _load(spec: str | ModelDefinition, checkpoint: Path | None, device: str) -> Network:
+    """The network without layers that its definition does not name."""
     torch_device = find_device(device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
     name = f"network {definition.name!r}"
@@ -371,16 +403,13 @@ def load_network(
     module.eval().requires_grad_(False)
     with out_of_memory_is_a_device_error(torch_device):
         module.to(torch_device)
-    network = Network(
+    return Network(
         definition=definition,
         module=module,
         device=torch_device,
         checkpoint=None if path is None else file_and_part(path)[0],
         notes=tuple(notes),
     )
-    if definition.layers or definition.defaults.layer:
-        return network
-    return _with_suggested_layers(network)
 
 
 def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | None) -> list[str]:
@@ -403,9 +432,14 @@ def _load_weights(module: nn.Module, definition: ModelDefinition, path: Path | N
 def _with_suggested_layers(network: Network) -> Network:
     """The network with layers to cut at, for a definition that lists none."""
     frame = FrameMap.fit(network.definition.size, _SUGGESTION_SIDE, _SUGGESTION_SIDE)
-    with out_of_memory_is_a_device_error(network.device):
-        arguments = network.synthetic_arguments(frame)
-        layers = suggest_layers(network.module, arguments, network.raw_of)
+
+    def suggest() -> list[str]:
+        with out_of_memory_is_a_device_error(network.device):
+            arguments = network.synthetic_arguments(frame)
+            return [*suggest_layers(network.module, arguments, network.map_of)]
+
+    question = f"layers, of {frame.network}"
+    layers = tuple(network.recalled_layers(question, suggest))
     if not layers:
         return network
     note = (

@@ -36,6 +36,7 @@ from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.visualisation import gain
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.spent import parts_of
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
 Stages = dict[str, frame_record.Scores]
@@ -54,7 +55,7 @@ def refine_image(request: RefineRequest) -> frame_record.FrameRecord:
     outputs = plan_outputs(request)
     with timed(seconds, "read"):
         inputs = read_requested(request)
-    with timed(seconds, "load network"):
+    with timed(seconds, "load network"), parts_of(seconds, "load network"):
         method = load_method(request, inputs)
     with timed(seconds, "refine"), method:
         frame = method.refine(inputs, with_stages=inputs.gt is not None)

@@ -1,4 +1,4 @@
-"""An ONNX file as a definition. On the first image, onnxruntime checks what torch computes.
+"""An ONNX file as a definition. Once for a size, onnxruntime checks what torch computes.
 
 The network's submodules are the graph's nodes, under their own names. What depends on no input is
 computed once, when the module is made, and arithmetic on shapes is no layer.
@@ -22,6 +22,7 @@ from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import check_claim, check_network_file, max_decoded_bytes
 from pnpdepth_cli.errors import InputError, ModelError, wrap_user_errors
+from pnpdepth_cli.models.decisions import recalled
 from pnpdepth_cli.models.definition import (
     ASSUMED_MULTIPLE,
     ModelDefinition,
@@ -32,6 +33,7 @@ from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit
 from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
 from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
+from pnpdepth_cli.spent import spent_on
 
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
@@ -52,6 +54,8 @@ _WORK = 1 << 32
 MISMATCH = 1e-3
 """The largest deviation from onnxruntime's output, relative to that output's range."""
 
+_AGREES = f"ONNX: agrees with onnxruntime to better than {MISMATCH:.1%} of its range"
+
 
 def onnx_definition(file: Path, output: str | None = None, **stated: object) -> ModelDefinition:
     """Returns the definition of an ONNX depth network.
@@ -65,7 +69,7 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
     Raises:
         ModelError: The file cannot be read, or the network cannot be run.
     """
-    model = _read(file)
+    model, is_whole = _read(file)
     constants = {tensor.name for tensor in model.graph.initializer}
     inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
     is_part = _prune(model, _choose_output(model, output, file))
@@ -77,27 +81,31 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
         build=lambda: onnx_graph(model, file),
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'no name'}",
         output=_as_map,
-        verify=functools.partial(_compare, source, file),
+        verify=functools.partial(_verify, source, file, is_whole=is_whole),
     )  # fmt: skip
 
 
-def _read(file: Path) -> ModelProto:
-    """The onnx.ModelProto with its weights, of an opset that is covered."""
+def _read(file: Path) -> tuple[ModelProto, bool]:
+    """The onnx.ModelProto with its weights, of an opset that is covered.
+
+    True if all of it lies in the file.
+    """
     # The file, and the packages that read it.
     check_network_file(file, "ONNX file", _MAX_BYTES)
     try:
-        import onnx
-        import onnxruntime  # noqa: F401
-        from google.protobuf.message import DecodeError
+        with spent_on("import"):
+            import onnx
+            import onnxruntime  # noqa: F401
+            from google.protobuf.message import DecodeError
     except ImportError as error:
         way_out = "pip install 'pnpdepth[onnx]'"
         raise ModelError(f"reading {file} needs {error.name}: {way_out}") from None
     more = (DecodeError, onnx.checker.ValidationError)
     with wrap_content_errors(f"ONNX file {file} cannot be read", *more):
         model = onnx.load(str(file), load_external_data=False)
-        _load_external(model, file.parent)
+        is_whole = not _load_external(model, file.parent)
         _check_covered(model)
-    return model
+    return model, is_whole
 
 
 def _check_covered(model: ModelProto) -> None:
@@ -115,8 +123,8 @@ def _check_covered(model: ModelProto) -> None:
         raise InputError(f"it is of opset {_opset(model)}; export it with one from {wanted}")
 
 
-def _load_external(model: ModelProto, folder: Path) -> None:
-    """Reads the tensors that lie in files beside the model into it.
+def _load_external(model: ModelProto, folder: Path) -> bool:
+    """Reads the tensors that lie in files beside the model into it. True if there are any.
 
     InputError if they claim more than these files have, or more than memory holds.
     """
@@ -134,7 +142,9 @@ def _load_external(model: ModelProto, folder: Path) -> None:
     claimed = sum(claim.length or sizes[claim.location] for claim in claims)
     most = min(_SHARED * sum(sizes.values()), max_decoded_bytes())
     check_claim(f"its tensors have {claimed:,} bytes in other files", claimed, most)
-    external.load_external_data_for_model(model, str(folder))
+    if claims:
+        external.load_external_data_for_model(model, str(folder))
+    return bool(claims)
 
 
 def _shape(value: ValueInfoProto) -> list[int | str]:
@@ -186,10 +196,34 @@ def _patch_size(model: ModelProto) -> int | None:
     return None
 
 
+def _verify(
+    source: str | bytes,
+    file: Path,
+    module: nn.Module,
+    arguments: Sequence[Tensor],
+    *,
+    is_whole: bool,
+) -> str:
+    """Says that the network agrees with onnxruntime. ModelError if it does not.
+
+    They are compared on the first image of a size, and not again as long as the file stays as it
+    is. Weights in other files may change unseen, so with them each first image is compared.
+    """
+
+    def compare() -> list[str]:
+        with spent_on("check"):
+            _compare(source, file, module, arguments)
+        return [_AGREES]
+
+    sizes = [(tuple(each.shape), each.device.type) for each in arguments]
+    recalled(module, file if is_whole else None, f"agrees for {sizes}", compare, [_AGREES].__eq__)
+    return _AGREES
+
+
 def _compare(
     source: str | bytes, file: Path, module: nn.Module, arguments: Sequence[Tensor]
-) -> str:
-    """How well the network agrees with onnxruntime on an image. ModelError if it does not.
+) -> None:
+    """Raises ModelError if the network does not agree with onnxruntime on an image.
 
     The source is the file that onnxruntime reads, or the content of one.
     """
@@ -209,7 +243,6 @@ def _compare(
     if not deviation <= MISMATCH:
         fact = f"differs from onnxruntime's by {deviation:.2g} of the output's range"
         raise ModelError(f"ONNX file {file}: its reading by torch {fact}")
-    return f"ONNX: agrees with onnxruntime on this image to {deviation:.1g} of its range"
 
 
 def _deviation(actual: Tensor, expected: Tensor) -> float:

@@ -1,0 +1,184 @@
+"""What is kept about networks between runs, and what happens to it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from pnpdepth_cli.models import cut_layers, decisions, network
+from pnpdepth_cli.models.cut_layers import default_layer
+from pnpdepth_cli.models.network import load_network
+
+SIZE = (64, 96)
+
+
+class Small(nn.Module):
+    """A map at a quarter of the image's size, and one at half of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.down = nn.Conv2d(3, 4, 4, stride=4)
+        self.up = nn.ConvTranspose2d(4, 4, 2, stride=2)
+        self.head = nn.ConvTranspose2d(4, 1, 2, stride=2)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.head(self.up(self.down(rgb)))
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(decisions.FOLDER, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def file(tmp_path: Path, cache: Path) -> str:
+    return str(write(tmp_path / "net.onnx", seed=0))
+
+
+def write(path: Path, seed: int) -> Path:
+    torch.manual_seed(seed)
+    torch.onnx.export(Small().eval(), (torch.rand(1, 3, *SIZE),), str(path), dynamo=False)
+    return path
+
+
+def decided(file: str) -> tuple[tuple[str, ...], str | None]:
+    loaded = load_network(file, None)
+    return loaded.definition.layers, default_layer(loaded, SIZE, 50)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Which decisions were made, and not recalled."""
+    made = list[str]()
+
+    def counting(owner: object, name: str) -> None:
+        original = getattr(owner, name)
+
+        def counted(*args: object) -> object:
+            made.append(name)
+            return original(*args)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    counting(network, "suggest_layers")
+    counting(cut_layers, "fields_of")
+    return made
+
+
+def test_what_was_decided_is_recalled(file: str, asked: list[str], cache: Path) -> None:
+    first = decided(file)
+    assert asked == ["suggest_layers", "fields_of"]
+    assert decided(file) == first
+    assert len(asked) == 2
+    (kept,) = decisions.kept()
+    assert kept.stat().st_size < 4096
+    decisions.forget()
+    assert decided(file) == first
+    assert len(asked) == 4
+
+
+def test_the_notes_are_the_same_when_decisions_are_recalled(file: str) -> None:
+    arguments = (torch.rand(1, 3, *SIZE),)
+    first, second = (load_network(file, None) for _ in range(2))
+    assert first.notes == second.notes
+    assert first.verify(arguments) == second.verify(arguments)
+
+
+def test_another_network_in_the_same_file_is_decided_anew(file: str, asked: list[str]) -> None:
+    decided(file)
+    write(Path(file), seed=1)
+    decided(file)
+    assert len(asked) == 4
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"{", b"[]", b"\xff\xfe", b'{"versions": {}, "answers": {}}', b"[" * 100_000,
+        b"0" * 2_000_000,
+    ],
+)  # fmt: skip
+def test_a_damaged_file_is_ignored_and_replaced(
+    content: bytes, file: str, asked: list[str]
+) -> None:
+    first = decided(file)
+    (kept,) = decisions.kept()
+    kept.write_bytes(content)
+    assert decided(file) == first
+    assert decided(file) == first
+    assert len(asked) == 4
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("pnpdepth", "0.1"), ("torch", "1.0")],
+)
+def test_decisions_of_another_version_are_not_taken(
+    key: str, value: str, file: str, asked: list[str]
+) -> None:
+    decided(file)
+    (kept,) = decisions.kept()
+    content = json.loads(kept.read_text())
+    content["versions"][key] = value
+    kept.write_text(json.dumps(content))
+    decided(file)
+    assert len(asked) == 4
+
+
+@pytest.mark.parametrize("answer", [["no layer"], [], "down", [1], None])
+def test_an_answer_that_cannot_be_right_is_not_believed(
+    answer: object, file: str, asked: list[str]
+) -> None:
+    first = decided(file)
+    (kept,) = decisions.kept()
+    content = json.loads(kept.read_text())
+    content["answers"] = dict.fromkeys(content["answers"], answer)
+    kept.write_text(json.dumps(content))
+    assert decided(file) == first
+    assert len(asked) == 4
+
+
+def test_a_folder_that_cannot_be_written_changes_nothing(
+    file: str, asked: list[str], cache: Path
+) -> None:
+    cache.parent.mkdir(exist_ok=True)
+    cache.write_text("a file where the folder would be")
+    assert decided(file) == decided(file)
+    assert len(asked) == 4
+    assert cache.read_text() == "a file where the folder would be"
+
+
+def test_two_that_write_at_once_leave_a_whole_file(file: str) -> None:
+    loaded = load_network(file, None)
+    assert isinstance(loaded.checkpoint, Path)
+
+    def ask(number: int) -> None:
+        for question in range(20):
+            text = f"{number}.{question}"
+            decide = partial(list, [text])
+            got = decisions.recalled(loaded.module, loaded.checkpoint, text, decide)
+            assert got == [text]
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (kept,) = decisions.kept()
+    assert json.loads(kept.read_text())["answers"]
+    assert [path for path in kept.parent.iterdir() if path != kept] == []
+
+
+def test_nothing_is_kept_of_code_that_is_not_known(tmp_path: Path, cache: Path) -> None:
+    code = "import torch\nfrom torch import nn\n\ndef net():\n    return nn.Conv2d(3, 1, 3)\n"
+    (tmp_path / "net.py").write_text(code)
+    module = nn.Conv2d(3, 1, 3)
+    assert decisions.recalled(module, tmp_path / "net.py", "layers", lambda: ["a"]) == ["a"]
+    assert not cache.exists()
