@@ -95,6 +95,8 @@ class FrameFiles:
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
     gt_scale: float | None = None  # codes per metre of integer ground truth
+    scales_stated: bool = False
+    """Whether the user states the scales of these very files, so that floats are divided, too."""
     part: FramePart = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for x in the camera's coordinates, in KITTI odometry camera 0's."""
@@ -177,7 +179,8 @@ class ReadOptions:
 
     depth_scale: float | None = option(
         None,
-        "Integer depth files hold metres × S.  [default: from the file, else 256]",
+        "Depth files hold metres × S; beside a file of integers, float files hold metres."
+        "  [default: from the file, else 256; of floats 1]",
         metavar="S",
     )
     unit_scale: float | None = option(

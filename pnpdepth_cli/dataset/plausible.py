@@ -47,25 +47,34 @@ _MIDDLE_M = (0.5, 80.0)  # medians of most frames
 _DEEP = 2.0  # times a tenth of the depths is another tenth farther; not so below an aircraft
 # Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
-_UNITS = (1000.0, 100.0, 10.0, 1.0)  # per metre, of numbers that are no codes
+# Numbers per metre that are no codes: mm, cm, inches, dm, feet, m; and steps of 0.25 and 5 mm.
+_UNITS = (1000.0, 100.0, 39.3701, 10.0, 3.28084, 1.0, 4000.0, 200.0)
 _OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
+
+OF_DATA_SET = "the data set"
+"""Whose integers a scale is of that a layout states; floats are not said to be none of it."""
 
 MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
 """The smallest and the largest median, metres, of depth maps and of ranges of scans."""
 
 
 def scan_returns(
-    path: Path | str, xyz: NDArray[np.floating], scale: float | None = None
+    path: Path | str,
+    xyz: NDArray[np.floating],
+    scale: float | None = None,
+    *,
+    of_integers: str = "",
 ) -> tuple[NDArray[np.float32], dict[str, int], list[str]]:
     """Returns the points (N, 3) of a scan that are returns, in metres; counts; lines for a person.
 
     Args:
         path: Path or topic of the scan.
         xyz: (N, 3) in the scanner's coordinates, as they are stored.
-        scale: Numbers per metre that the user states; used where metres are implausible.
+        scale: Numbers per metre that the user states.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
 
     Raises:
         InputError: Many coordinates are none of a scan, or are implausible in metres.
@@ -99,7 +108,13 @@ def scan_returns(
     dropped = {why: count for why, count in drops.dropped.items() if count}
     notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
     divisor, lines = divisor_to_metres(
-        range_m[row], Reading("scan"), f"{path}: range", "--depth-scale", scale, SCANS
+        range_m[row],
+        Reading("scan"),
+        f"{path}: range",
+        "--depth-scale",
+        scale,
+        SCANS,
+        of_integers=of_integers,
     )
     points = np.ascontiguousarray(xyz[row], np.float32) / np.float32(divisor)
     return points, dropped, [*notes, *lines]
@@ -154,7 +169,13 @@ def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list
 
 
 def plausible_map(
-    values: NDArray[np.float32], reading: Reading, what: str, option: str, scale: float | None
+    values: NDArray[np.float32],
+    reading: Reading,
+    what: str,
+    option: str,
+    scale: float | None,
+    *,
+    of_integers: str = "",
 ) -> tuple[NDArray[np.float32], list[str]]:
     """Returns a depth map (H, W) in metres without what is no depth, and lines for a person.
 
@@ -164,6 +185,7 @@ def plausible_map(
         what: Name of the depths in lines for a person.
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
 
     Raises:
         InputError: The depths are implausible in metres.
@@ -174,7 +196,9 @@ def plausible_map(
     values[known] = np.where(far, np.float32(0), values[known])
     # a scale of integers that is assumed is compared with the other file of the frame instead
     stated = scale or reading.scale
-    divisor, lines = divisor_to_metres(values[values > 0], reading, what, option, stated)
+    divisor, lines = divisor_to_metres(
+        values[values > 0], reading, what, option, stated, of_integers=of_integers
+    )
     notes = [*(f"{what}: {note}" for note in notes), *lines]
     return values / np.float32(divisor), notes
 
@@ -186,10 +210,14 @@ def divisor_to_metres(
     option: str,
     scale: float | None,
     medians: tuple[float, float] = MAPS,
+    *,
+    of_integers: str = "",
 ) -> tuple[float, list[str]]:
     """Returns what depths are divided by to be metres, mostly 1, and lines for a person.
 
-    A float file holds metres. A scale that the user states counts only where that cannot be.
+    A float file holds metres, unless the user states a scale of it. One scale may be stated of two
+    files. If one of these holds integers, it is theirs, and floats are divided by it only where
+    they cannot be metres.
 
     Args:
         depth: (N,) known depths, or ranges, as they were read.
@@ -198,6 +226,8 @@ def divisor_to_metres(
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
         medians: The smallest and the largest that is plausible.
+        of_integers: The other file of the frame whose integers the scale is of. Empty: it is of
+            these depths.
 
     Raises:
         InputError: They are implausible, and nothing that the user states explains it.
@@ -206,27 +236,43 @@ def divisor_to_metres(
         return 1.0, []
     low, high = medians
     median, floats = float(np.median(depth)), reading.scale is None
+    if floats and scale is not None and scale != 1 and not of_integers:
+        made = median / scale
+        lines = [f"{what}: ÷ {scale:g}, as is stated"]
+        if not low <= made <= high:
+            lines.append(f"warning: {what}: median {metres(made)} m is implausible with {option}")
+        return scale, lines
+    # What is implausible as it is read.
     many = floats and median >= _CODES and depth.size >= _FEW
     codes = many and bool((np.rint(depth) == depth).all())
     likely = low <= median <= high and not codes
     far = floats and median > _COMMON_M[1] and depth.size >= _FEW
     near_m, far_m = np.quantile(depth, (0.1, 0.9)) if likely and far else (1.0, 1.0)
     if likely and (far_m <= _DEEP * near_m or scale == 1):
-        return 1.0, []
+        if not floats or scale in (None, 1) or of_integers in ("", OF_DATA_SET):
+            return 1.0, []
+        return 1.0, [
+            f"{what}: floats, read as metres; {option} {scale:g} is of the integers of"
+            f" {of_integers}"
+        ]
     if floats and scale is not None and scale != 1 and low <= median / scale <= high:
         return scale, [f"{what}: ÷ {scale:g}, as {metres(median)} m are implausible"]
+    # All scales in use that would make it plausible, the most likely first.
     kind = " of whole numbers" if codes else ""
     doubt = "far for so deep a view" if likely else "implausible"
     fact = f"{what}: median{kind} {metres(median)} m is {doubt}, the scale is probably wrong"
     now = reading.scale or 1.0
     common = _COMMON_SCALES if codes or not floats else _UNITS
     scales = [(s, limits) for limits in (_MIDDLE_M, _COMMON_M) for s in common]
-    better = next((s for s, (least, most) in scales if least <= median * now / s <= most), None)
-    if better is None or better == now:
+    better = dict.fromkeys(s for s, (least, most) in scales if least <= median * now / s <= most)
+    better.pop(now, None)
+    if not better:
         advice = f"give numbers per metre with {option} (now {now:g})"
     else:
-        made = metres(median * now / better)
-        advice = f"{option} {better:g} (now {now:g}) would make it {made} m"
+        first, *others = (f"{s:g}" for s in better)
+        made = [f"{metres(median * now / s)} m" for s in better]
+        advice = f"{option} {first} (now {now:g}) would make it {made[0]}"
+        advice += "".join(f", {s} {m}" for s, m in zip(others, made[1:], strict=True))
     if likely or scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")

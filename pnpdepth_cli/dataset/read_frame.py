@@ -18,12 +18,12 @@ from pnpdepth_cli.dataset.frame_files import (
     ScanOptions,
 )
 from pnpdepth_cli.dataset.neighbours import read_neighbours
-from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
+from pnpdepth_cli.dataset.plausible import OF_DATA_SET, check_same_scale, plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
-from pnpdepth_cli.io.depth import describe_range, read_depth
+from pnpdepth_cli.io.depth import describe_range, holds_integers, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import METRES, Size, SparsePoints
@@ -140,9 +140,11 @@ def _read_ground_truth(
     files: FrameFiles, options: ReadOptions, source: Path, size: Size | None
 ) -> tuple[DepthFile, FileRecord, list[str]]:
     """The ground truth of an image (H, W): a projected scan, or a depth map."""
-    scale, of_scan = options.depth_scale or files.gt_scale, options.scan.over(files)
+    (scale, of_integers), of_scan = _scale_of(files, options, "gt"), options.scan.over(files)
     if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
+        scan = read_scan_points(
+            source, of_scan, size, files.image_file, scale=scale, of_integers=of_integers
+        )
         notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, notes
@@ -156,10 +158,32 @@ def _read_ground_truth(
     if files.gt_other_size and size is not None and values.shape != size:
         values = arrays.move_depth(source, values, size)
     option = "--depth-scale" if files.sparse is None else _gt_scale_option(files)
-    values, notes = plausible_map(values, reading, "gt", option, scale)
+    values, notes = plausible_map(values, reading, "gt", option, scale, of_integers=of_integers)
     described = describe_range(values, reading, noun="pixels", option=option)
     truth = DepthFile(values=values, reading=reading)
     return truth, arrays.record_of(source, reading), [f"gt: {described}", *notes]
+
+
+def _scale_of(files: FrameFiles, options: ReadOptions, part: str) -> tuple[float | None, str]:
+    """What is stated of a file's scale: numbers per metre, and whose integers these are.
+
+    `--depth-scale` is of both files of a frame, but of the integers alone if one of them holds
+    integers. What a layout states is of integers only.
+
+    Args:
+        files: The files of the frame.
+        options: What the user states.
+        part: Name of the file, "sparse" or "gt".
+    """
+    own, other = (files.sparse, files.gt) if part == "sparse" else (files.gt, files.sparse)
+    of_layout = files.sparse_scale if part == "sparse" else files.gt_scale
+    if options.depth_scale is None:
+        return of_layout, "" if files.scales_stated else OF_DATA_SET
+    if own is None or other is None or other.is_dir():
+        return options.depth_scale, ""
+    if other.suffix.lower() in SCAN_ONLY_SUFFIXES or not holds_integers(other):
+        return options.depth_scale, ""
+    return options.depth_scale, str(other)
 
 
 def _gt_scale_option(files: FrameFiles) -> str:
@@ -204,8 +228,10 @@ def _read_sparse(
     path, image, scan = files.sparse, files.image_file, options.scan.over(files)
     assert path is not None
     # What it is: a COLMAP model, a scan, or else a map or a list.
-    is_model, scale = path.is_dir(), options.depth_scale or files.sparse_scale
+    is_model, (scale, of_integers) = path.is_dir(), _scale_of(files, options, "sparse")
     is_scan = not is_model and scan.describes(path)
+    if options.depth_scale is not None and is_model and files.gt is None:
+        raise UsageError(f"{path} is a COLMAP model; --unit-scale is its scale, not --depth-scale")
     if options.unit_scale is not None and not is_model:
         raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
     if options.sparse_range and (is_model or is_scan):
@@ -218,9 +244,9 @@ def _read_sparse(
             raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
         sparse = sparse_depth.read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif is_scan:
-        sparse = read_scan_points(path, scan, size, image, scale=scale)
+        sparse = read_scan_points(path, scan, size, image, scale=scale, of_integers=of_integers)
     else:
-        sparse = sparse_depth.read_map_points(path, options, size, scale)
+        sparse = sparse_depth.read_map_points(path, options, size, scale, of_integers=of_integers)
         if options.sparse_range:
             sparse = sparse_depth.depth_of_distances(sparse, scan, image)
     # Those that are sure enough, in the part of the frame.

@@ -62,6 +62,7 @@ def read_scan_points(
     image: Path | None = None,
     *,
     scale: float | None = None,
+    of_integers: str = "",
 ) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
@@ -71,7 +72,8 @@ def read_scan_points(
         size: (H, W) of the image; None for the calibration's.
         image: File of the image; its edges tell whether it is rectified, where the calibration
             leaves that open.
-        scale: Numbers of the scan per metre; used where metres are implausible.
+        scale: Numbers of the scan per metre that the user states.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
 
     Raises:
         InputError: A file cannot be read, or calibration and image do not fit together.
@@ -85,7 +87,7 @@ def read_scan_points(
     warnings = check_size(named, calibration.camera, size, image)
     # The returns of the scan.
     stored, source = read_scan(path)
-    xyz, no_returns, mended = scan_returns(path, stored, scale)
+    xyz, no_returns, mended = scan_returns(path, stored, scale, of_integers=of_integers)
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, xyz)]
         calibration, note = choose_camera(calibration, frames)

@@ -95,7 +95,12 @@ class SparseDepth:
 
 
 def read_map_points(
-    path: Path, options: ReadOptions, size: Size | None, scale: float | None
+    path: Path,
+    options: ReadOptions,
+    size: Size | None,
+    scale: float | None,
+    *,
+    of_integers: str = "",
 ) -> SparseDepth:
     """Returns the points of a depth map or a list that the camera sees.
 
@@ -103,7 +108,8 @@ def read_map_points(
         path: The file.
         options: Which occluded points go.
         size: (H, W) of the image; None for the map's own.
-        scale: Integers per metre. None: the file's own.
+        scale: Numbers per metre that the user states. None: the file's own.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
 
     Raises:
         InputError: The file cannot be read, or its numbers are no depth of this image.
@@ -135,7 +141,9 @@ def read_map_points(
     # The others must be pixels of the image, and plausible in metres.
     points = points.resized(*size)
     inside, of_pixels = check_pixels(path, points.xy, size)
-    divisor, warnings = divisor_to_metres(depth, reading, "sparse", "--depth-scale", scale)
+    divisor, warnings = divisor_to_metres(
+        depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
+    )
     points = points.select(inside)
     return SparseDepth(
         points=replace(points, depth=points.depth / np.float32(divisor)),

@@ -87,6 +87,16 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     return stored
 
 
+def holds_integers(path: Path) -> bool:
+    """Returns whether a file holds depth as integers, which need a scale.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    stored, _ = _load_list(path)
+    return stored.values.dtype.kind in "iu"
+
+
 def depth_from_stored(
     path: Path, stored: DepthFile, scale: float | None, size: tuple[int, int] | None = None
 ) -> DepthFile:

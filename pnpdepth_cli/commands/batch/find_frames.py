@@ -54,10 +54,18 @@ def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None
     between = None if whole else (0, request.every * (request.limit or 1) - 1)
-    frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
+    # The points are metres in these files, so a scale that the user states is of the bag.
+    frames = FramesRequest(
+        bag=request.source,
+        output=folder,
+        between=between,
+        depth_scale=request.reading.depth_scale,
+        overwrite=True,
+    )
     if not has_frames(frames):
         say(f"bag: wrote {write_frames(frames, say):,} frames to {folder}")
-    return replace(request, source=folder)
+    refine = request.refine.with_fields(depth_scale=None)
+    return replace(request, source=folder, refine=refine)
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:

@@ -61,8 +61,8 @@ class EvalRequest:
     resize: bool = option(False, "Resize predictions to the size of the ground truth, bilinearly.")
     exclude_sparse: bool = option(False, "Leave out pixels with a sparse point.")
 
-    pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
-    gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
+    pred_scale: float | None = option(None, "Predictions hold metres × S.", metavar="S")
+    gt_scale: float | None = option(None, "Ground truth holds metres × S.", metavar="S")
     gt_range: bool = option(
         False, "Ground truth is the distance from the camera, not depth z; needs the camera."
     )

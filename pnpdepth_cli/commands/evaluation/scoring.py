@@ -20,7 +20,7 @@ from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, read_image
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.dataset.plausible import plausible_map
+from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
@@ -142,7 +142,15 @@ def _read_truth(
     assert frame.gt is not None
     file = raw_depth(frame.gt, frame.image) or _read(frame.gt, scale, request)
     values, reading = apply_masks(file.values, frame.masks), file.reading
-    values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
+    of_layout = request.gt_scale is None and not frame.scales_stated
+    values, notes = plausible_map(
+        values,
+        reading,
+        "gt",
+        "--gt-scale",
+        scale,
+        of_integers=OF_DATA_SET if of_layout else "",
+    )
     gt = np.ascontiguousarray(frame.part.apply(values))
     if request.gt_range:
         gt = _depth_of_distances(gt, frame, result, (values.shape[0], values.shape[1]))
@@ -180,6 +188,10 @@ def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Dept
     """The prediction at the ground truth's size, and how it was read."""
     file = _read(path, request.pred_scale, request)
     values = file.values
+    if file.reading.scale is None and request.pred_scale is not None:  # floats
+        values = values / np.float32(request.pred_scale)
+        source = f"{file.reading.source} ÷ {request.pred_scale:g}"
+        file = replace(file, reading=file.reading._replace(source=source))
     if values.shape != size and not request.resize:
         advice = "; --resize scales predictions if both show the same view"
         raise unequal_sizes(f"prediction {path}", values.shape, "the ground truth", size, advice)

@@ -97,6 +97,7 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
         camera=int(row["camera"]) if "camera" in row else None,
         sparse_scale=_number(row, "sparse_scale"),
         gt_scale=_number(row, "gt_scale"),
+        scales_stated=True,
         part=part or WHOLE,
         masks=(paths["mask"],) if "mask" in row else (),
         gt_other_size=_FLAGS[flag.lower()],
