@@ -95,8 +95,10 @@ class FrameFiles:
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
     gt_scale: float | None = None  # codes per metre of integer ground truth
-    scales_stated: bool = False
+    scales_stated: bool = field(default=False, compare=False)
     """Whether the user states the scales of these very files, so that floats are divided, too."""
+    kind_of_sparse: str | None = None  # what `sparse` holds, as `ReadOptions.sparse_kind`
+    kind_of_gt: str | None = None  # what `gt` holds
     part: FramePart = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for x in the camera's coordinates, in KITTI odometry camera 0's."""
@@ -189,6 +191,12 @@ class ReadOptions:
     sparse_range: bool = option(
         False, "Sparse depth is the distance from the camera, not depth z; needs --calib."
     )
+    sparse_kind: str | None = option(
+        None,
+        "What sparse depth holds: inverse, 1/z; or disparity:B in pixels, with B = baseline in"
+        " metres × focal length in pixels.  [default: depth z]",
+        metavar="KIND",
+    )
     registration: str = option(
         "auto",
         "Whether the image is moved to the points: auto, if their depth edges show"
@@ -204,6 +212,34 @@ class ReadOptions:
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
             raise UsageError(f"--unit-scale must be above 0, got {self.unit_scale:g}")
+        inverse_factor("--sparse-kind", self.sparse_kind)
+
+
+def inverse_factor(option: str, kind: str | None) -> float | None:
+    """Returns depth × value of what a file of this kind holds; None for depth itself.
+
+    Args:
+        option: Name of what states the kind, for a message.
+        kind: "depth" or None; "inverse"; or "disparity:B", with B in metres × pixels.
+
+    Raises:
+        UsageError: There is no such kind.
+    """
+    if kind in (None, "depth"):
+        return None
+    if kind == "inverse":
+        return 1.0
+    name, _, number = str(kind).partition(":")
+    try:
+        factor = float(number)
+    except ValueError:
+        factor = math.nan
+    if name != "disparity" or not 0 < factor < math.inf:
+        raise UsageError(
+            f"{option} is depth, inverse, or disparity:B with the baseline in metres × the focal"
+            f" length in pixels, such as disparity:386.1, not {kind!r}"
+        )
+    return factor
 
 
 Unmatched = tuple[Path, str]

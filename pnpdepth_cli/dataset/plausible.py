@@ -8,26 +8,24 @@ the option that mends.
 | a return is somewhere | none of x y z is finite, or it is within 1 mm of the sensor | dropped |
 | beams end at different places | one x y z on 0.5 % of the points, at least 3 | dropped |
 | a coordinate is a number | some of x y z are none, or beyond 100 km; stops at 10 % | dropped |
-| a surface has several depths | the largest on 0.5 %, at least 3, far above the rest | unknown |
-| depths are of one order | above 1,000 times the median | unknown |
+| a surface has several depths | `dataset.range_ends` | unknown, or warns |
 | depth is in metres | the median; whole numbers in a float file | stops |
 | a deep view is near | floats of a median above 200 m, from near to twice as far | warns |
-| two files of a frame agree | their ratio's median is a quotient of common scales | stops |
+| two files of a frame agree | their order is one, their ratio 1: `dataset.agreement` | stops |
 | a list holds pixels | all within 0…1 or −1…1; many below 0 | stops |
 | pixels are of this image | all in the upper left corner | warns |
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.dataset.range_ends import far_end, far_values, near_end
 from pnpdepth_cli.errors import InputError, NoPointsError
-from pnpdepth_cli.io.depth import metres, scale_warning
+from pnpdepth_cli.io.depth import metres
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.sensors.projection import DropCounter, Mask
@@ -36,11 +34,7 @@ _AT_SENSOR_M = 1e-3
 _FARTHEST_M = 1e5  # of a coordinate of a scan
 _BROKEN = 0.1  # of the points; more that are no numbers are another format
 _SAME, _LEAST_SAME = 0.005, 3  # of the numbers, and how many, that no surface shares
-_EQUAL = 1e-5  # relative difference of ranges that were computed from one number
 _FEW = 10  # fewer numbers decide nothing
-_FAR_ABOVE, _FAR_M = 1.5, 40.0  # times the largest of the rest, and metres
-_FAR_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the sky may exceed
-_FAR = 1000.0  # times the median depth; no point of an image is farther
 _CODES = 100.0  # median from which floats that are whole numbers are codes
 _COMMON_M = (0.2, 200.0)
 _MIDDLE_M = (0.5, 80.0)  # medians of most frames
@@ -49,7 +43,6 @@ _DEEP = 2.0  # times a tenth of the depths is another tenth farther; not so belo
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 # Numbers per metre that are no codes: mm, cm, inches, dm, feet, m; and steps of 0.25 and 5 mm.
 _UNITS = (1000.0, 100.0, 39.3701, 10.0, 3.28084, 1.0, 4000.0, 200.0)
-_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
@@ -91,8 +84,12 @@ def scan_returns(
     row = row[drops.keep(seen, "without return, as they are at the sensor")]
     apart = ~_at_one_place(xyz[row].astype(np.float64))
     row = row[drops.keep(apart, "without return, as they are at one and the same place")]
-    near = ~_far_plane(range_m[row])[0]
+    near = ~far_end(range_m[row]).is_none
     row = row[drops.keep(near, "without return, as they are at one range far beyond all others")]
+    beyond = ~near_end(range_m[row]).is_none
+    row = row[
+        drops.keep(beyond, "without return, as they are at one range, nearer than all others")
+    ]
     # coordinates that are none
     if np.count_nonzero(odd[row]) > _BROKEN * len(xyz):
         first = int(row[odd[row]][0])
@@ -130,44 +127,6 @@ def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
     return np.asarray((mixed == keys[counts.argmax()]) & is_shared)
 
 
-def _far_plane(values: NDArray[np.float64]) -> tuple[Mask, float, float]:
-    """(N,) true for the sky, its value, and 98 % of the rest."""
-    none = np.zeros(len(values), bool), 0.0, 0.0
-    if len(values) < _FEW:
-        return none
-    largest = float(values.max())
-    same = values >= largest * (1 - _EQUAL)
-    rest = values[~same]
-    if not rest.size or np.count_nonzero(same) < max(_LEAST_SAME, _SAME * len(values)):
-        return none
-    most = float(np.quantile(rest, 0.98))
-    if largest >= _FAR_BEYOND * most:  # a renderer may mix the two at edges of the sky
-        return values > math.sqrt(largest * most), largest, most
-    if largest >= max(_FAR_ABOVE * float(rest.max()), _FAR_M):
-        return same, largest, most
-    return none
-
-
-def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
-    """Returns which of the known depths (N,) are no depth, and lines for a person."""
-    values = np.asarray(depth, np.float64)
-    far, largest, most = _far_plane(values)
-    total = f"{np.count_nonzero(far):,} of {len(values):,}"
-    if far.any():
-        return far, [
-            f"{total} depths are of the sky or a far plane, at {metres(largest)} {unit}, where 98 %"
-            f" of the others are at most {metres(most)} {unit}; taken as unknown"
-        ]
-    median = float(np.median(values)) if len(values) >= _FEW else math.inf
-    far = values > _FAR * median
-    note = (
-        f"dropped {np.count_nonzero(far):,} of {len(values):,} points more than {_FAR:,.0f} times"
-        f" as far as the median of {metres(median)} {unit}; the farthest was at"
-        f" {metres(float(values.max(initial=0)))} {unit}"
-    )
-    return far, [note] if far.any() else []
-
-
 def plausible_map(
     values: NDArray[np.float32],
     reading: Reading,
@@ -199,8 +158,14 @@ def plausible_map(
     divisor, lines = divisor_to_metres(
         values[values > 0], reading, what, option, stated, of_integers=of_integers
     )
-    notes = [*(f"{what}: {note}" for note in notes), *lines]
+    notes = [named(what, note) for note in notes] + lines
     return values / np.float32(divisor), notes
+
+
+def named(what: str, note: str) -> str:
+    """Returns the line with the name of its depths, behind its mark if it is a warning."""
+    text = note.removeprefix("warning: ")
+    return f"{what}: {text}" if text == note else f"warning: {what}: {text}"
 
 
 def divisor_to_metres(
@@ -270,34 +235,12 @@ def divisor_to_metres(
         advice = f"give numbers per metre with {option} (now {now:g})"
     else:
         first, *others = (f"{s:g}" for s in better)
-        made = [f"{metres(median * now / s)} m" for s in better]
-        advice = f"{option} {first} (now {now:g}) would make it {made[0]}"
-        advice += "".join(f", {s} {m}" for s, m in zip(others, made[1:], strict=True))
+        texts = [f"{metres(median * now / s)} m" for s in better]
+        advice = f"{option} {first} (now {now:g}) would make it {texts[0]}"
+        advice += "".join(f", {s} {m}" for s, m in zip(others, texts[1:], strict=True))
     if likely or scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
-
-
-def check_same_scale(
-    sparse: NDArray[np.float32], gt: NDArray[np.float32], readings: Mapping[str, Reading | None]
-) -> list[str]:
-    """Returns a warning if ground truth and sparse depth (H, W) differ by a factor.
-
-    Raises:
-        InputError: A scale that was assumed explains it.
-    """
-    both = (sparse > 0) & (gt > 0)
-    if int(both.sum()) < _FEW:
-        return []
-    ratio = float(np.median(gt[both] / sparse[both]))
-    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
-        return []
-    scale_warning("sparse points", 1 / ratio, readings)
-    return [
-        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
-        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give"
-        " --depth-scale, or a list with gt_scale"
-    ]
 
 
 def check_pixels(

@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays, sparse_depth
+from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     ReadOptions,
     ScanOptions,
+    inverse_factor,
 )
 from pnpdepth_cli.dataset.neighbours import read_neighbours
-from pnpdepth_cli.dataset.plausible import OF_DATA_SET, check_same_scale, plausible_map
+from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
@@ -71,7 +73,7 @@ def read_frame(
     gt, compared = None, list[str]()
     if truth is not None:
         gt = files.part.apply(truth.values)
-        compared = _compare(files, gt, truth.reading, sparse, given)
+        compared = _compare(files, options, gt, truth.reading, sparse, given)
     # The camera, and with it the points of neighbouring frames.
     size = size or given.size
     camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)
@@ -142,6 +144,8 @@ def _read_ground_truth(
     """The ground truth of an image (H, W): a projected scan, or a depth map."""
     (scale, of_integers), of_scan = _scale_of(files, options, "gt"), options.scan.over(files)
     if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
+        if files.kind_of_gt is not None:
+            raise UsageError(f"{source} is a scan, so gt_kind does not apply")
         scan = read_scan_points(
             source, of_scan, size, files.image_file, scale=scale, of_integers=of_integers
         )
@@ -153,6 +157,8 @@ def _read_ground_truth(
     if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
         own = arrays.raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
         file = file if own.reading.assumed else own
+    if (factor := inverse_factor("gt_kind", files.kind_of_gt)) is not None:
+        file, scale = arrays.depth_of_inverse(file, factor, scale), None
     # Pixels that a mask or the gate rules out are unknown.
     values, reading = arrays.apply_masks(file.values, files.masks), file.reading
     if files.gt_other_size and size is not None and values.shape != size:
@@ -199,8 +205,9 @@ def _sample_sparse(
     seed: int,
 ) -> sparse_depth.SparseDepth:
     """Points sampled from the ground truth."""
-    if options.sparse_range:
-        raise UsageError("--sparse-range is of sparse depth from a file, and there is none")
+    if options.sparse_range or options.sparse_kind is not None:
+        name = "--sparse-range" if options.sparse_range else "--sparse-kind"
+        raise UsageError(f"{name} is of sparse depth from a file, and there is none")
     if options.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
@@ -234,6 +241,11 @@ def _read_sparse(
         raise UsageError(f"{path} is a COLMAP model; --unit-scale is its scale, not --depth-scale")
     if options.unit_scale is not None and not is_model:
         raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
+    kind = options.sparse_kind or files.kind_of_sparse
+    if kind is not None and (is_model or is_scan):
+        raise UsageError(f"{path} is no depth map or list, so --sparse-kind does not apply")
+    if options.sparse_range and kind is not None:
+        raise UsageError("--sparse-range is of distances, and --sparse-kind of another kind")
     if options.sparse_range and (is_model or is_scan):
         raise UsageError(f"{path} is no depth map or list, so --sparse-range does not apply")
     # Its points in the image.
@@ -246,7 +258,14 @@ def _read_sparse(
     elif is_scan:
         sparse = read_scan_points(path, scan, size, image, scale=scale, of_integers=of_integers)
     else:
-        sparse = sparse_depth.read_map_points(path, options, size, scale, of_integers=of_integers)
+        sparse = sparse_depth.read_map_points(
+            path,
+            options,
+            size,
+            scale,
+            of_integers=of_integers,
+            inverse=inverse_factor("--sparse-kind", kind),
+        )
         if options.sparse_range:
             sparse = sparse_depth.depth_of_distances(sparse, scan, image)
     # Those that are sure enough, in the part of the frame.
@@ -295,6 +314,7 @@ def _hold_out(
 
 def _compare(
     files: FrameFiles,
+    options: ReadOptions,
     gt: NDArray[np.float32],
     reading: Reading,
     sparse: sparse_depth.SparseDepth,
@@ -324,5 +344,12 @@ def _compare(
             " are the sparse depth itself, so errors against it show nothing; give another --gt,"
             " or keep points out with --holdout"
         )
+    # Their order, and then their ratio.
+    both = f"the sparse depth and the ground truth {files.gt}"
+    if (reversed_order := check_order(both, depth, gt)) is not None:
+        if options.sparse_kind is files.kind_of_sparse is files.kind_of_gt is None:
+            raise InputError(reversed_order)
+        return [*notes, f"warning: {reversed_order}"]
     by_option = {"--depth-scale": sparse.reading, _gt_scale_option(files): reading}
-    return notes + check_same_scale(depth, gt, by_option)
+    warning = unit_warning("sparse points", compare_depths(depth, gt), by_option)
+    return notes if warning is None else [*notes, warning]

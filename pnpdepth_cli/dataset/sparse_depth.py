@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_values
+from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, named
+from pnpdepth_cli.dataset.range_ends import far_values
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (
@@ -23,7 +24,7 @@ from pnpdepth_cli.io.colmap_model import (
 )
 from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.file_bytes import fingerprint
-from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
+from pnpdepth_cli.io.formats import SATURATED_CODE, DepthFile, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS, Size
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
@@ -101,6 +102,7 @@ def read_map_points(
     scale: float | None,
     *,
     of_integers: str = "",
+    inverse: float | None = None,
 ) -> SparseDepth:
     """Returns the points of a depth map or a list that the camera sees.
 
@@ -110,12 +112,19 @@ def read_map_points(
         size: (H, W) of the image; None for the map's own.
         scale: Numbers per metre that the user states. None: the file's own.
         of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
 
     Raises:
         InputError: The file cannot be read, or its numbers are no depth of this image.
     """
     # The points as they are stored, without far values.
     points, reading = read_sparse(path, size=size, scale=scale)
+    if inverse is not None:
+        stored = DepthFile(values=points.depth, reading=reading)
+        of_kind = arrays.depth_of_inverse(stored, inverse, scale)
+        # these are metres now, of which no scale is stated
+        scale, reading = None, of_kind.reading
+        points = replace(points, depth=of_kind.values).select(of_kind.values > 0)
     far, lines = far_values(points.depth)
     points = points.select(~far)
     depth, own = points.depth, points.size
@@ -149,7 +158,7 @@ def read_map_points(
         points=replace(points, depth=points.depth / np.float32(divisor)),
         reading=reading,
         record=replace(arrays.record_of(path, reading), dropped=dropped),
-        notes=(*(f"sparse: {line}" for line in lines), *of_pixels, *warnings),
+        notes=(*(named("sparse", line) for line in lines), *of_pixels, *warnings),
     )
 
 
@@ -221,7 +230,7 @@ def read_colmap_points(
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     if lost := describe_dropped(dropped):
         notes.append(f"sparse: dropped {lost}")
-    notes += [f"sparse: {line}" for line in lines]
+    notes += [named("sparse", line) for line in lines]
     if unit == MODEL_UNITS:
         notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +48,6 @@ _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
 _OTHER_SIZE_SCALE = 1000.0
 """Codes per metre of a map of another size than its image: of phones, ARKitScenes and ScanNet."""
-# Quotients of codes per metre in use, which a wrong one gives, within a tenth.
-_SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 256.0, 5000.0)
-_QUOTIENT_TOLERANCE = math.log(1.1)
 
 
 def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
@@ -307,38 +302,6 @@ def describe_range(
     low, high = metres(float(known.min())), metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"
     return f"{count}, {extent} {unit} ({source}{hint})"
-
-
-def scale_warning(what: str, ratio: float, readings: Mapping[str, Reading | None]) -> str | None:
-    """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
-
-    Args:
-        what: The depths, in the plural.
-        ratio: Median of depth / ground truth; NaN if nothing can be compared.
-        readings: How the depths were read, then the ground truth, by the option of the scale.
-
-    Raises:
-        InputError: There is such a multiple, and one of the scales was assumed.
-    """
-    quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
-    near = (q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE)
-    if (factor := next(near, None)) is None:
-        return None
-    sides = zip(readings.items(), (factor, 1 / factor), strict=True)
-    integer = [(option, read, by) for (option, read), by in sides if read and read.scale]
-    unstated = [side for side in integer if "(from the file)" not in side[1].source]
-    advice = " or ".join(
-        f"{option} {(read.scale or 1) * by:.6g} (now {read.scale:g})"
-        for option, read, by in unstated or integer
-    )
-    about = f"{factor:.4g}" if factor >= 1 else f"1/{1 / factor:.4g}"
-    fact = (
-        f"{what} are {ratio:.4g} times the ground truth (median), about {about}: a scale is"
-        f" probably wrong; {f'{advice} would remove it' if advice else 'float files hold metres'}"
-    )
-    if assumed := [f"{option} {read.scale:g}" for option, read, _ in integer if read.assumed]:
-        raise InputError(f"{fact}, {' '.join(assumed)} keeps it")
-    return f"warning: {fact}"
 
 
 def metres(value: float) -> str:
