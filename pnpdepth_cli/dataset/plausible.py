@@ -23,11 +23,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.dataset.agreement import compare_depths
 from pnpdepth_cli.dataset.range_ends import far_end, far_values, near_end
 from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.depth import metres
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.projection import DropCounter, Mask
 
 _AT_SENSOR_M = 1e-3
@@ -45,6 +46,7 @@ _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
 _UNITS = (1000.0, 100.0, 39.3701, 10.0, 3.28084, 1.0, 4000.0, 200.0)
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
+_DOWN, _PART_OF_ROWS = 0.6, 0.3  # rank correlation; of the image's height, that points cover
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
 
 OF_DATA_SET = "the data set"
@@ -241,6 +243,25 @@ def divisor_to_metres(
     if likely or scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
+
+
+def check_rows(points: SparsePoints[NDArray[np.float32]]) -> list[str]:
+    """Returns a warning if depth grows towards the bottom of the image, where floors are nearest.
+
+    Its rank correlation with the row is −0.94 to 0.24 in 121 frames of seven sets, indoors and
+    outdoors. Of disparity and 1/depth it is the opposite, and of rows from the bottom up.
+    """
+    y = points.xy[:, 1].astype(np.float64)
+    if len(y) < _MANY or np.ptp(y) < _PART_OF_ROWS * points.size[0]:
+        return []
+    found = compare_depths(points.depth, y + 1)
+    if found.rank < _DOWN:
+        return []
+    return [
+        "warning: sparse: larger values are at the bottom of the image (rank correlation"
+        f" {found.rank:.2f}), where floors are nearest: disparity or 1/depth, which --sparse-kind"
+        " reads, or rows from the bottom up?"
+    ]
 
 
 def check_pixels(

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.dataset import arrays, sparse_depth
 from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
 from pnpdepth_cli.dataset.frame_files import (
@@ -27,7 +28,7 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, holds_integers, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
-from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.rgb import orientation_in, read_rgb
 from pnpdepth_cli.points import METRES, Size, SparsePoints
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
@@ -85,6 +86,8 @@ def read_frame(
     contradicted = any(each.contradicts_images for each in neighbours)
     stated = sparse.camera is not None or files.one_view or options.registration == "off"
     one_view = contradicted or stated
+    if rgb is not None and not one_view:
+        compared += _orientation_warning(files, files.part.apply(rgb), given)
     # What a record and a person should know.
     found["sparse"] = sparse.record, [*sparse.notes]
     sources = {name: found[name] for name in ("image", "sparse", "gt") if name in found}
@@ -272,6 +275,23 @@ def _read_sparse(
     if files.sparse_mask is not None:
         sparse = sparse.confident(files.sparse_mask, files.min_confidence)
     return sparse.in_part(files.part)
+
+
+def _orientation_warning(
+    files: FrameFiles, rgb: NDArray[np.float32], points: SparsePoints
+) -> list[str]:
+    """A warning if the points fit the image clearly better mirrored or turned."""
+    known = evidence(np.ascontiguousarray(rgb), points)
+    turned = None if known is None else better_orientation([known])
+    if turned is None:
+        return []
+    way_out = "; give both as they are stored, or both turned"
+    if files.image_file is not None and orientation_in(files.image_file) != 1:
+        way_out = f": the EXIF orientation of {files.image_file} is applied, that of depth is not"
+    return [
+        f"warning: the image's edges meet the depth of {files.sparse or files.gt} better if it is"
+        f" {turned}{way_out}"
+    ]
 
 
 def _camera_of(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, named
+from pnpdepth_cli.dataset.plausible import check_pixels, check_rows, divisor_to_metres, named
 from pnpdepth_cli.dataset.range_ends import far_values
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -154,6 +154,8 @@ def read_map_points(
         depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
     )
     points = points.select(inside)
+    if inverse is None:
+        warnings += check_rows(points)
     return SparseDepth(
         points=replace(points, depth=points.depth / np.float32(divisor)),
         reading=reading,

@@ -23,7 +23,8 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of, parse_npy
 
-_FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
+_FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)  # the last are of painted points
+_USUAL, _LEAST_ROWS = 8, 100  # fields a point; more need so many points to be recognised
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
 _SMALLEST = 1e-3  # numbers near 0 are alike
 _AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
@@ -85,7 +86,8 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     # beams without return say nothing: more zeros in a row than a point has numbers
     zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
     masked = np.ma.array(features, mask=np.broadcast_to(zeros > max(_FIELD_COUNTS), features.shape))
-    explained = {count: _explained_variance(masked, count) for count in _FIELD_COUNTS}
+    counts = [n for n in _FIELD_COUNTS if n <= _USUAL or len(numbers) >= _LEAST_ROWS * n]
+    explained = {count: _explained_variance(masked, count) for count in counts}
     most = max(explained.values())  # which multiples of the true count reach, too
     if most < _LEAST_EXPLAINED:
         fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"

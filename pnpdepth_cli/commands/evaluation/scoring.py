@@ -60,6 +60,10 @@ _CROPS = {
 }
 
 
+_CUT, _WHOLE = (352, 1216), (375, 1242)
+"""(H, W) of KITTI's frames cut at the bottom, in the middle, and of most frames they are from."""
+
+
 def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequest) -> FrameRecord:
     """Returns the scores of a frame's files, or why it has none.
 
@@ -283,8 +287,14 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
         fact = f"crop nyu is for frames of 640×480 but this one is {width}×{height}"
         raise InputError(f"{fact}; --protocol paper scores any size")
     top, bottom, left, right = _CROPS[crop]
-    rows, columns = (top * height, bottom * height), (left * width, right * width)
-    return slice(*map(int, rows)), slice(*map(int, columns))
+    # Frames that were cut to KITTI's usual part have the crop of the whole frame they are from.
+    cut_rows = cut_columns = 0
+    if size == _CUT and crop in ("garg", "eigen"):
+        height, width = _WHOLE
+        cut_rows, cut_columns = height - size[0], (width - size[1]) // 2
+    rows = [int(end * height) - cut_rows for end in (top, bottom)]
+    columns = [int(end * width) - cut_columns for end in (left, right)]
+    return slice(*np.clip(rows, 0, size[0])), slice(*np.clip(columns, 0, size[1]))
 
 
 def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:
