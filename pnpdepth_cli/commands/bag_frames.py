@@ -218,7 +218,7 @@ def _write_calibration(request: FramesRequest, bag: Bag, sensors: Sensors, say: 
     return camera
 
 
-def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.floating]]]:
     """Yields the image and the points of a few frames."""
     scans = sorted((folder / "sparse").iterdir())
     for scan in scans[:: math.ceil(len(scans) / _COMPARED_FRAMES)]:

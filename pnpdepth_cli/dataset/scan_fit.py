@@ -164,10 +164,9 @@ def _moved(
     about_x, about_y = -float(down_deg[row, 0]), float(right_deg[0, column])
     for fine in (0.0, -0.15, 0.15):
         turn = Rotation.from_euler("xy", (about_x, about_y + fine), degrees=True).as_matrix()
-        half = [round(2 * each) / 2 + 0.0 for each in (about_x, about_y)]  # as exact as this is
-        text = (
-            f"with the extrinsics turned by {half[0]:g}° about the camera's x and {half[1]:g}° about"
-            " y"
+        text = (  # whole degrees, as a jump lies half a degree beside the edge that it is of
+            f"with the extrinsics turned by {round(about_x)}° about the camera's x and"
+            f" {round(about_y)}° about y"
         )
         yield seen @ turn.T, _TURNED, text
     for roll in _ROLLS_DEG:

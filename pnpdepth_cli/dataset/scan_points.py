@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.dataset.plausible import scan_returns
+from pnpdepth_cli.dataset.plausible import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.scan_fit import fit_warning
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
@@ -41,6 +41,7 @@ _NEXT_TO_NONE = 0.05  # of the points with them inverted; with fewer, extrinsics
 _THIN = 0.5  # largest variance of a scan's rays along its thin direction, of the next
 _AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected in the image
 _MOST_OUTSIDE = 1 / 3  # of the points ahead; more outside the image give a warning
+_FARTHEST_SCANNER_M = 20.0  # from its camera; farther apart are the origins of maps
 _CLEARLY_BETTER = 1.0  # in standard deviations by chance, of a camera that replaces the named one
 _CHANCE_PX = 80.0  # shifts by which the spread by chance is known
 _CAMERAS = 4  # of KITTI; more of a calibration are not tried
@@ -79,7 +80,16 @@ def read_scan_points(
     warnings = check_size(named, calibration.camera, size, image)
     # The returns of the scan.
     stored, source = read_scan(path)
-    xyz, no_returns, mended = scan_returns(path, stored, scale, of_integers=of_integers)
+    of_scanner = _of_scanner(calibration, stored)
+    xyz: NDArray[np.floating] = stored
+    if of_scanner:
+        xyz, no_returns, mended = scan_returns(path, stored, scale, of_integers=of_integers)
+    else:
+        xyz, no_returns, mended = cloud_points(path, stored, None if of_integers else scale)
+        mended.append(
+            "sparse: a cloud that no scanner at its origin measured; points behind nearer ones are"
+            " taken for hidden"
+        )
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, xyz)]
         calibration, note = choose_camera(calibration, frames)
@@ -94,12 +104,19 @@ def read_scan_points(
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
         warnings += check_direction(xyz, camera, scanner, size)
     # They are projected, and what seems wrong is warned of.
-    points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
+    points = project_velodyne(
+        xyz,
+        camera,
+        scanner,
+        size,
+        keep_occluded=options.keep_occluded,
+        has_scanner=of_scanner,
+    )
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
     if image is not None and not calibration.rectified:
         visible = points  # an occluded point is no evidence about the edges of the image
         if options.keep_occluded:
-            visible = project_velodyne(xyz, camera, scanner, size)
+            visible = project_velodyne(xyz, camera, scanner, size, has_scanner=of_scanner)
         others = _other_cameras(options, image)
         warnings += fit_warning(visible, xyz, calibration, others, read_rgb(image).values)
     # What a person should know, and what a record keeps.
@@ -146,9 +163,16 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
     return calibration, named
 
 
+def _of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
+    """Whether the points were measured from their origin, by the pose and by their directions."""
+    assert calibration.scanner is not None
+    away_m = float(np.linalg.norm(calibration.scanner.translation))
+    return away_m <= _FARTHEST_SCANNER_M and has_scanner(stored)
+
+
 def choose_camera(
     raw: Calibration,
-    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.floating]]],
     topic: str = "",
 ) -> tuple[Calibration, str]:
     """Returns the camera of images that may be rectified, and a line that says which it is.

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.plausible import check_pixels, check_rows, divisor_to_metres, named
+from pnpdepth_cli.dataset.plausible import (
+    check_pixels,
+    check_rows,
+    divisor_to_metres,
+    interpolation_warning,
+    named,
+)
 from pnpdepth_cli.dataset.range_ends import far_values
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -25,12 +31,13 @@ from pnpdepth_cli.io.colmap_model import (
 from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, DepthFile, Reading
-from pnpdepth_cli.points import METRES, MODEL_UNITS, Size
+from pnpdepth_cli.points import METRES, MODEL_UNITS, Size, in_frame
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
     DropCounter,
     Points,
+    as_depth_image,
     behind_foreground,
     describe_dropped,
     hidden_among,
@@ -40,6 +47,7 @@ from pnpdepth_cli.sensors.projection import (
 
 # A 16-bit file in model units holds depths up to at least so many times the model's extent.
 _SIZES_IN_RANGE = 8.0
+_FEW_TO_HIDE = 100  # points; so few are no surface that could hide others
 _LEAST_TRACK = 3  # images that observe a point: two rays meet anywhere along one of them
 _MOST_REPROJECTION_PX = 2.0  # mean error of a point; COLMAP itself keeps up to 4 pixels
 
@@ -128,11 +136,15 @@ def read_map_points(
     far, lines = far_values(points.depth)
     points = points.select(~far)
     depth, own = points.depth, points.size
+    is_map = bool((points.xy == np.floor(points.xy)).all() and in_frame(points.xy, own).all())
     size = size or own
     arrays.check_same_view(str(path), own, size)
     # What a person should know of them.
     lines = [describe_range(depth, reading), *lines]
     lines += [arrays.moved_note(own, size)] if own != size else []
+    if inverse is None and is_map:
+        blurred = interpolation_warning(as_depth_image(points))
+        lines += [] if blurred is None else [blurred]
     # Points that the camera does not see go.
     hidden, dropped = None, dict[str, int]()
     if options.foreground is not None:
@@ -282,7 +294,12 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     seen, xy = drops.keep_seen(seen, camera, camera.size)
     # Without tracks, nothing else tells which points the camera sees.
     notes = list[str]()
-    if untracked:
+    if untracked and len(xy) < _FEW_TO_HIDE:
+        notes = [
+            f"sparse: {name} has no tracks; the {len(xy):,} points are too few to tell which are"
+            " hidden by others, so all are used"
+        ]
+    elif untracked:
         visible = drops.keep(~hidden_among(xy, seen[:, 2], camera.size), "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
         notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]

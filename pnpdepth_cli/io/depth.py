@@ -40,6 +40,10 @@ SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 Points = SparsePoints[NDArray[np.float32]]
 
 _TEXT_SUFFIXES = (".csv", ".txt")
+_WIDE = 2.4  # widths over heights, of images that are cut for driving
+_MANY_CODES = 1000  # of a map; fewer tell nothing of their order
+_ROUGHER = 3.0  # times; of maps of four sets, exchanged bytes are 40 times rougher
+_NEAR_END, _LEAST_AT_END = 64_000, 0.001  # codes, and of the codes, that a sensor does not reach
 _MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
 _MANY_ROWS = 200  # of so few columns, which no depth map has
 _BELOW_ZERO = 0.1  # of the rows
@@ -113,8 +117,11 @@ def depth_from_stored(
     lost = f", {below:,} pixels below 0 taken as unknown" if below else ""
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(source + lost))
+    _check_codes(path, values, is_stated=scale is not None)
     own = stored.reading.scale
     assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
+    if values.shape[1] > _WIDE * values.shape[0]:  # of no phone or depth camera
+        assumed = KITTI_SCALE
     divisor = scale or own or assumed
     source += f" ÷ {divisor:.12g}"
     if scale is None and own is not None:
@@ -129,6 +136,39 @@ def depth_from_stored(
     metres = values.astype(np.float64) / divisor
     reading = Reading(source + lost, divisor, assumed=scale is None and own is None)
     return DepthFile(values=known_metres(metres), reading=reading)
+
+
+def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) -> None:
+    """Raises InputError for 16-bit codes whose bytes are exchanged, or that are normalised.
+
+    Neighbours in a row are nearly alike, but not if their bytes are exchanged. Codes that reach the
+    largest one without a gap were stretched to 16 bits, and are no depth unless a scale is stated.
+    """
+    if values.dtype != np.uint16:
+        return
+    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
+    if np.count_nonzero(known) < _MANY_CODES:
+        return
+    codes = np.asarray(values[known], np.uint16)
+    if _roughness(codes) > _ROUGHER * _roughness(codes.byteswap()):
+        raise InputError(
+            f"{path}: its numbers are far smoother with their two bytes exchanged, so they were"
+            " stored in the wrong order; save array.byteswap()"
+        )
+    near_end = int(np.count_nonzero(codes > _NEAR_END))
+    at_end = int(np.count_nonzero(values == formats.SATURATED_CODE))
+    if not is_stated and at_end and near_end >= max(at_end, _LEAST_AT_END * len(codes)):
+        raise InputError(
+            f"{path}: its numbers reach {formats.SATURATED_CODE} without a gap, as those of a map"
+            " that was normalised to 16 bits; save metres × a scale, or give the scale with"
+            " --depth-scale"
+        )
+
+
+def _roughness(codes: NDArray[np.uint16]) -> float:
+    """Mean difference of neighbours in units of the standard deviation; 0 of equal codes."""
+    values = codes.astype(np.float64)
+    return float(np.abs(np.diff(values)).mean() / (values.std() + 1e-9))
 
 
 def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:

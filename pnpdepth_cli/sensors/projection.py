@@ -110,6 +110,7 @@ def project_velodyne(
     size: Size,
     *,
     keep_occluded: bool = False,
+    has_scanner: bool = True,
 ) -> Points:
     """Returns the scan as sparse depth in an image, in the scan's order.
 
@@ -119,6 +120,8 @@ def project_velodyne(
         scanner: The scanner's pose.
         size: (H, W) of the image.
         keep_occluded: Whether points behind the foreground stay.
+        has_scanner: Whether the points were measured from their origin. If not, only their own
+            positions tell which of them are hidden.
 
     Raises:
         NoPointsError: No point is visible in the image.
@@ -131,7 +134,10 @@ def project_velodyne(
     if not keep_occluded:
         focal_px = float(camera.intrinsics[0, 0])
         origin = np.asarray(camera.intrinsics @ scanner.translation)
-        hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
+        if has_scanner:
+            hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
+        else:
+            hidden = hidden_among(xy, seen[:, 2], size)
         visible = drops.keep(~hidden, "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
     if not len(xy):

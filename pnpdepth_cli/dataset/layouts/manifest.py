@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, inverse_factor
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import decode_text, one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "sparse_mask", "gt", "calib", "mask")
@@ -40,7 +40,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     frames: dict[int, FrameFiles] = {}
     broken = list[Unmatched]()
     for number, row in _rows(root):
-        paths = {column: root.parent / row[column] for column in _PATHS if column in row}
+        paths = {c: _path_of(root.parent, row[c]) for c in _PATHS if c in row}
         try:
             frames[number] = _frame(row, paths)
         except (ValueError, OverflowError, UsageError) as error:
@@ -61,12 +61,20 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     return [*broken, *named]
 
 
+def _path_of(folder: Path, text: str) -> Path:
+    """The file of a cell; backslashes part folders where no file has them in its name."""
+    path = folder / text
+    return path if path.exists() or "\\" not in text else folder / text.replace("\\", "/")
+
+
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """The number of each line, and its texts by column."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
+        text = decode_text(read_bytes(path))
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file; give CSV") from error
+    if "\n" not in text:  # of old spreadsheets
+        text = text.replace("\r", "\n")
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
