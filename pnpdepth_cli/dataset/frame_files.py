@@ -110,6 +110,9 @@ class FrameFiles:
     one_view: bool = False
     """Whether the data set says that image and depth are of one view, pixel by pixel."""
     group: str | None = None  # the sequence it belongs to; None derives it from the name
+    is_first: bool = field(default=True, compare=False)
+    """Whether it is one of the first of its sequence, of which it is searched how image and points
+    belong together."""
 
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks):

@@ -86,7 +86,7 @@ def read_frame(
     contradicted = any(each.contradicts_images for each in neighbours)
     stated = sparse.camera is not None or files.one_view or options.registration == "off"
     one_view = contradicted or stated
-    if rgb is not None and not one_view:
+    if rgb is not None and not one_view and files.is_first:
         compared += _orientation_warning(files, files.part.apply(rgb), given)
     # What a record and a person should know.
     found["sparse"] = sparse.record, [*sparse.notes]
@@ -259,7 +259,15 @@ def _read_sparse(
             raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
         sparse = sparse_depth.read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif is_scan:
-        sparse = read_scan_points(path, scan, size, image, scale=scale, of_integers=of_integers)
+        sparse = read_scan_points(
+            path,
+            scan,
+            size,
+            image,
+            scale=scale,
+            of_integers=of_integers,
+            search=files.is_first,
+        )
     else:
         sparse = sparse_depth.read_map_points(
             path,
@@ -311,7 +319,7 @@ def _camera_of(
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
-        return _read_sparse(files, options, size).points
+        return _read_sparse(replace(files, is_first=False), options, size).points
     rgb, truth, _ = _read_pixels(files, options)
     return _sample_sparse(files, options, rgb, truth, seed).points
 

@@ -56,6 +56,7 @@ def read_scan_points(
     *,
     scale: float | None = None,
     of_integers: str = "",
+    search: bool = True,
 ) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
@@ -67,6 +68,7 @@ def read_scan_points(
             leaves that open.
         scale: Numbers of the scan per metre that the user states.
         of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        search: Whether it is searched how image and scan belong together.
 
     Raises:
         InputError: A file cannot be read, or calibration and image do not fit together.
@@ -113,7 +115,7 @@ def read_scan_points(
         has_scanner=of_scanner,
     )
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
-    if image is not None and not calibration.rectified:
+    if search and image is not None and not calibration.rectified:
         visible = points  # an occluded point is no evidence about the edges of the image
         if options.keep_occluded:
             visible = project_velodyne(xyz, camera, scanner, size, has_scanner=of_scanner)

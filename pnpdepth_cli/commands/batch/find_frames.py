@@ -24,6 +24,7 @@ from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
+_SEARCHED = 3  # frames of a sequence, of which it is searched how image and points belong together
 ESTIMATED = "estimated from the images"
 """Where the motion of frames without poses is from."""
 
@@ -102,6 +103,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     _check_names(frames, request.refine)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
+    for sequence in sequences_of(frames).values():
+        for index in sequence[_SEARCHED:]:
+            frames[index] = replace(frames[index], is_first=False)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
