@@ -370,7 +370,7 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
     # the unit of clouds is left to what reads the frames, unless the user states it
     of_cloud = None if sensors.is_map or sensors.depth_camera is not None else sensors.scale
-    points, counts, _ = scan_returns(topic, cloud, scale=of_cloud or 1.0)
+    points, counts, _ = scan_returns(topic, cloud, scale=of_cloud or 1.0, of_integers="")
     return points, counts
 
 

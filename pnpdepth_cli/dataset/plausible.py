@@ -58,7 +58,8 @@ _UNIT, _WHOLE_UNIT, _NEAR_UNIT = 1.0, 0.99, 0.9  # ends and a median of maps wit
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
 
 OF_DATA_SET = "the data set"
-"""Whose integers a scale is of that a layout states; floats are not said to be none of it."""
+"""What a scale is of that nobody states of these very numbers; floats are divided by it only where
+they cannot be metres, and nothing is said."""
 
 MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
 """The smallest and the largest median, metres, of depth maps and of ranges of scans."""
@@ -69,7 +70,7 @@ def scan_returns(
     xyz: NDArray[np.floating],
     scale: float | None = None,
     *,
-    of_integers: str = "",
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[NDArray[np.float32], dict[str, int], list[str]]:
     """Returns the points (N, 3) of a scan that are returns, in metres; counts; lines for a person.
 
@@ -77,7 +78,8 @@ def scan_returns(
         path: Path or topic of the scan.
         xyz: (N, 3) in the scanner's coordinates, as they are stored.
         scale: Numbers per metre that the user states.
-        of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        of_integers: The other file of the frame whose integers that scale is of. Empty: it is
+            stated of these numbers.
 
     Raises:
         InputError: Many coordinates are none of a scan, or are implausible in metres.
@@ -193,7 +195,7 @@ def plausible_map(
     option: str,
     scale: float | None,
     *,
-    of_integers: str = "",
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[NDArray[np.float32], list[str]]:
     """Returns a depth map (H, W) in metres without what is no depth, and lines for a person.
 
@@ -203,7 +205,8 @@ def plausible_map(
         what: Name of the depths in lines for a person.
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
-        of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        of_integers: The other file of the frame whose integers that scale is of. Empty: it is
+            stated of these numbers.
 
     Raises:
         InputError: The depths are implausible in metres.
@@ -260,7 +263,7 @@ def divisor_to_metres(
     scale: float | None,
     medians: tuple[float, float] = MAPS,
     *,
-    of_integers: str = "",
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[float, list[str]]:
     """Returns what depths are divided by to be metres, mostly 1, and lines for a person.
 
@@ -275,8 +278,8 @@ def divisor_to_metres(
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
         medians: The smallest and the largest that is plausible.
-        of_integers: The other file of the frame whose integers the scale is of. Empty: it is of
-            these depths.
+        of_integers: The other file of the frame whose integers the scale is of. Empty: it is
+            stated of these depths.
 
     Raises:
         InputError: They are implausible, and nothing that the user states explains it.

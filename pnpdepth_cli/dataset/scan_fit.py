@@ -23,7 +23,7 @@ from pnpdepth_cli.io.calibration import Calibration
 from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.edge_fit import EdgeMap, edge_map, jump_weights
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
-from pnpdepth_cli.sensors.projection import Points, project_velodyne
+from pnpdepth_cli.sensors.projection import Points, points_in_image, project_velodyne
 
 _MOST_TURN_DEG, _LEAST_TURN_DEG = 9.0, 1.0  # about the camera's x and y
 _ROLLS_DEG = (-8.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.5, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
@@ -32,7 +32,8 @@ _AHEAD_M = (-3.0, -2.5, -2.0, -1.5, -1.0, -0.75, -0.5, 0.5, 0.75, 1.0, 1.5, 2.0,
 _TALLEST = 1 / 3  # of the image's height, by which points are shifted at most
 _GOOD = 3.5  # score from which the other axes and cameras are not looked at
 _RESIZED = 0.1  # log ratio of the image's size and twice the principal point
-_SAME_RATIO = 0.05  # of the two sides' such ratios, where an image was resized
+_SAME_RATIO = 0.12  # of the two sides' such ratios, where an image was resized
+_ABOUT = np.linspace(0.88, 1.12, 49)  # times that ratio, as principal points are not in the middle
 
 _MANY_JUMPS, _SOME_JUMPS = 300, 100  # points at jumps of depth; fewer tell less, or nothing
 _BY_CHANCE = 1.7  # a scan of many jumps that belongs to its image has more
@@ -52,8 +53,9 @@ class _Needed(NamedTuple):
 
 _TURNED = _Needed(of_many=((5.2, 1.5), (4.2, 2.5)), of_some=(5.5, 3.0))
 _ROLLED = _Needed(of_many=((3.3, 1.7),), of_some=(5.5, 3.0))
-_ANOTHER_TIME = _Needed(of_many=((3.3, 1.4),), of_some=(4.5, 2.5))
+_ANOTHER_TIME = _Needed(of_many=((3.3, 1.4),), of_some=(4.2, 2.4))
 _OTHER = _Needed(of_many=((3.3, 1.2),), of_some=(3.7, 1.2))
+_OF_OTHER_SIZE = _Needed(of_many=((4.0, 2.0),), of_some=(4.5, 2.5))
 
 
 class _Fit(NamedTuple):
@@ -143,11 +145,38 @@ def _fits(
     ]
     # The scan by other axes and cameras, whose points have other jumps.
     if as_it_is < _GOOD:
-        for text, each in _other_readings(own, others, points.size).items():
+        for text, each in _other_readings(own, others).items():
             other = _project(scan, each, points.size)
             if other is not None and (of_other := jump_weights(other)) is not None:
                 found.append(_Fit(standing(other.xy.astype(np.float64), of_other), _OTHER, text))
+        # The calibration of an image that was resized.
+        resized, factor = _resized(own, points.size)
+        other = None if resized is None else _project(scan, resized, points.size)
+        if other is not None and (of_other := jump_weights(other)) is not None:
+            scores = [standing((other.xy + 0.5) * about - 0.5, of_other) for about in _ABOUT]
+            factor *= float(_ABOUT[int(np.argmax(scores))])
+            text = f"with the intrinsics × {factor:.3g}, as of an image that was resized"
+            found.append(_Fit(max(scores), _OF_OTHER_SIZE, text))
     return as_it_is, found
+
+
+def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
+    """The calibration of the image (H, W) if it was resized, and by what; None if it was not.
+
+    An image that was resized has its principal point elsewhere than in its middle, by one factor in
+    both directions.
+    """
+    centre = own.camera.intrinsics[:2, 2] + 0.5
+    if centre.min() <= 0:
+        return None, 1.0
+    across, down = size[1] / (2 * centre[0]), size[0] / (2 * centre[1])
+    factor = math.sqrt(across * down)
+    if abs(math.log(across / down)) > _SAME_RATIO or abs(math.log(factor)) < _RESIZED:
+        return None, 1.0
+    intrinsics = own.camera.intrinsics.copy()
+    intrinsics[:2] *= factor
+    intrinsics[:2, 2] += 0.5 * factor - 0.5
+    return replace(own, camera=replace(own.camera, intrinsics=intrinsics, size=size)), factor
 
 
 def _moved(
@@ -178,10 +207,8 @@ def _moved(
         yield seen + np.array([0.0, 0.0, ahead_m]), _ANOTHER_TIME, text
 
 
-def _other_readings(
-    own: Calibration, others: Mapping[str, Calibration], size: Size
-) -> dict[str, Calibration]:
-    """Calibrations of other axes of the scan, of another size of the image, and the others."""
+def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
+    """Calibrations of other axes of the scan, and the others."""
     assert own.scanner is not None
     readings = dict[str, Calibration]()
     for text, matrix in (
@@ -196,17 +223,16 @@ def _other_readings(
     ):
         scanner = own.scanner @ Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
         readings[text] = replace(own, scanner=scanner)
-    # An image that was resized has its principal point elsewhere than in its middle.
-    camera = own.camera
-    centre = camera.intrinsics[:2, 2] + 0.5
-    across, down = size[1] / (2 * centre[0]), size[0] / (2 * centre[1])
-    same = abs(math.log(across / down)) < _SAME_RATIO if min(across, down) > 0 else False
-    if same and abs(math.log(across)) > _RESIZED:
-        full = round(size[0] / down), round(size[1] / across)
-        resized = replace(camera, size=full).resized(*size)
-        text = f"with the intrinsics × {across:.3g}, as of an image that was resized"
-        readings[text] = replace(own, camera=resized)
     return readings | dict(others)
+
+
+def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) -> dict[str, int]:
+    """Returns how many points of a scan (N, 3) are in the image (H, W), by other axes of it."""
+    found = dict[str, int]()
+    for text, each in _other_readings(own, {}).items():
+        assert each.scanner is not None
+        found[text] = len(points_in_image(each.scanner.apply(scan), each.camera, size)[0])
+    return found
 
 
 def _project(scan: NDArray[np.floating], reading: Calibration, size: Size) -> Points | None:

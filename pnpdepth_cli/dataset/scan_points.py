@@ -14,7 +14,7 @@ from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.plausible import cloud_points, has_scanner, scan_returns
-from pnpdepth_cli.dataset.scan_fit import fit_warning
+from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -106,14 +106,21 @@ def read_scan_points(
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
         warnings += check_direction(xyz, camera, scanner, size)
     # They are projected, and what seems wrong is warned of.
-    points = project_velodyne(
-        xyz,
-        camera,
-        scanner,
-        size,
-        keep_occluded=options.keep_occluded,
-        has_scanner=of_scanner,
-    )
+    try:
+        points = project_velodyne(
+            xyz,
+            camera,
+            scanner,
+            size,
+            keep_occluded=options.keep_occluded,
+            has_scanner=of_scanner,
+        )
+    except NoPointsError as error:
+        inside = points_by_reading(xyz, calibration, size)
+        text, count = max(inside.items(), key=lambda item: item[1])
+        if not count:
+            raise
+        raise NoPointsError(f"{error}; {text}, {count:,} points would be in the image") from error
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
     if search and image is not None and not calibration.rectified:
         visible = points  # an occluded point is no evidence about the edges of the image

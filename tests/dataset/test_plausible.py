@@ -81,11 +81,12 @@ def test_a_scan_in_millimetres_is_read_by_the_option() -> None:
     np.testing.assert_allclose(points, SCAN, rtol=1e-6)
     assert "÷ 1000" in notes[0]
     assert len(scan_returns("a.pcd", 1000 * SCAN, 1.0)[2]) == 1  # kept, with a warning
+    np.testing.assert_array_equal(scan_returns("a.pcd", SCAN, 256.0)[0], SCAN)  # of a data set
 
 
 @pytest.mark.parametrize("scale", [3.28084, 10.0, 256.0])
 def test_a_stated_scale_is_obeyed_unless_it_is_of_the_other_files_integers(scale: float) -> None:
-    points, _, (note,) = scan_returns("a.pcd", SCAN, scale)
+    points, _, (note,) = scan_returns("a.pcd", SCAN, scale, of_integers="")
     np.testing.assert_allclose(points, SCAN / scale, rtol=1e-5)
     assert f"÷ {scale:g}" in note
     points, _, (note,) = scan_returns("a.pcd", SCAN, scale, of_integers="gt.png")
