@@ -29,6 +29,8 @@ def write_bag(
     depth: str = "",
     depth_frame: str = "camera",
     depth_focal: float = FOCAL_PX,
+    depth_topic: str = "/depth/image_raw",
+    unit: tuple[str, float] | None = None,
 ) -> Path:
     """A bag of ROS 1 (.bag), ROS 2 with MCAP (.mcap) or SQLite (a folder), by the path's suffix.
 
@@ -37,11 +39,13 @@ def write_bag(
     there. With `poses`, base moves 0.3 m along x from one image to the next: "/odom", or the
     camera does: "/vio/pose". `compression` is rosbags' of the chunks. `clock_s` is added to the
     stamps of the scans. With `depth`, an encoding such as "16UC1" or "32FC1; compressedDepth",
-    `depth_m` is there instead of scans.
+    `depth_m` is there instead of scans. `unit` is a topic and the metres of a code that it states.
     """
 
     def messages() -> Iterator[tuple[str, int, str, Fields]]:
         start, step = 1_700_000_000 * 10**9, 30_000_000
+        if unit is not None:
+            yield unit[0], start, "std_msgs/msg/Float32", {"data": np.float32(unit[1])}
         yield "/tf_static", start, "tf2_msgs/msg/TFMessage", {"transforms": _transforms()}
         for number in range(frames + 1):
             time_ns = start + step * number
@@ -65,7 +69,8 @@ def write_bag(
                 info = _camera_info(stamp, depth_focal, depth_focal)
                 yield ("/depth/camera_info", later_ns, *info)
                 suffix = "/compressedDepth" if "compressed" in depth else ""
-                yield (f"/depth/image_raw{suffix}", later_ns, *_depth(stamp, depth))
+                coded = _depth(stamp, depth, 0.001 if unit is None else unit[1])
+                yield (f"{depth_topic}{suffix}", later_ns, *coded)
             else:
                 stamp = _header(time_ns + 4_000_000 + round(clock_s * 1e9), "lidar")
                 yield (POINTS, later_ns, *_cloud(stamp))
@@ -186,10 +191,13 @@ def depth_m() -> np.ndarray:
     return depth
 
 
-def _depth(header: Fields, kind: str) -> tuple[str, Fields]:
-    """The message of `depth_m`."""
+def _depth(header: Fields, kind: str, unit_m: float = 0.001) -> tuple[str, Fields]:
+    """The message of `depth_m`, whose codes have so many metres."""
     depth, (encoding, _, compressed) = depth_m(), kind.partition("; ")
-    codes = (1000 * depth).astype("<u2") if encoding == "16UC1" else depth.astype("<f4")
+    kinds = {"32FC1": "<f4", "64FC1": "<f8"}
+    codes = (depth / unit_m).round().astype("<u2")
+    if encoding in kinds:
+        codes = depth.astype(kinds[encoding])
     if not compressed:
         return _image(header, codes, encoding)
     # compressed_depth_image_transport with depth_quantization = 100, depth_max = 10

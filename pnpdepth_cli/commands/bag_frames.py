@@ -57,6 +57,7 @@ _COMPARED_FRAMES = 5
 _LONGEST_GAP_S = 0.5  # longest time between two poses that one is interpolated from
 _DELAYS = 20  # messages of each topic, from the first, whose delay is measured
 _SLOWEST_S = 1.0  # a larger difference of delays is that of two clocks
+_REGISTERED = re.compile("aligned|registered")  # in topics of registered depth
 _SAME_K = 0.05  # relative difference of intrinsics of one camera that was calibrated twice
 
 Say = Callable[[str], None]
@@ -87,6 +88,9 @@ def write_frames(request: FramesRequest, say: Say) -> int:
         check_topics(bag, request.topics, (*IMAGES, *CLOUDS, *ODOMETRY, *POSES))
         sensors = sensors_of(bag, request.topics, say)
         say(f"topics: images of {sensors.images}, points of {sensors.points}")
+        sensors, of_scale = _with_scale(bag, sensors, request.depth_scale)
+        if of_scale:
+            say(of_scale)
         _clear(request)
         offset = request.clock_offset
         if offset is None:
@@ -234,7 +238,7 @@ def _write_calibration(
     return camera, True
 
 
-def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.floating]]]:
     """Yields the image and the points of a few frames."""
     scans, images = _written(folder, "sparse"), _written(folder, "rgb")
     step = math.ceil(len(scans) / _COMPARED_FRAMES)
@@ -293,6 +297,8 @@ class Sensors:
     """Whether the points are depth images of the images' own camera."""
     depth_camera: Camera | None = None
     """Camera of depth images of another camera. None: of the images' own, or clouds."""
+    scale: float | None = None
+    """Numbers per metre of the points. None: as ROS has them (REP 118)."""
 
 
 def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
@@ -304,6 +310,14 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     topics = bag.topics(IMAGES)
     first = {n: each[2] for n in topics for each in itertools.islice(bag.messages([n]), 1)}
     depths = {n: topics[n] for n, message in first.items() if messages.is_depth(message, n)}
+    if not set(wanted) & set(depths) and len(first) > 1:
+        # grey images of 16 bits beside others: named by the user, or nothing else gives points
+        grey = {n: topics[n] for n in first if n not in depths and messages.is_wide_grey(first[n])}
+        named = {n: grey[n] for n in grey if n in wanted}
+        nothing = not depths and not bag.topics(CLOUDS) and len(grey) < len(first)
+        for name in named or (grey if nothing else {}):
+            depths[name] = topics[name]
+            say(f"topics: {name}, grey images of 16 bits, is taken for depth")
     colours = {name: topics[name] for name in first if name not in depths}
     # Points are clouds, unless depth images are named or alone.
     images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
@@ -320,15 +334,40 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     found = messages.camera_of_bag(bag, images), messages.camera_of_bag(bag, points)
     of_images, of_depth = (None if each is None else each[0].camera for each in found)
     if of_depth is None:
-        if points not in registered:
-            say(f"warning: {points} has no camera_info; its pixels are taken for the images'")
+        _say_unregistered(points, points in registered, say)
         return same
     if of_images is not None:
         close = np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
         alike = points in registered and of_images.size == of_depth.size and close
-        if alike or of_images.source == of_depth.source:
+        if of_images.source == of_depth.source:  # the only camera_info of the bag
+            _say_unregistered(points, points in registered, say)
+            return same
+        if alike:
             return same
     return Sensors(images=images, points=points, depth_camera=of_depth)
+
+
+def _say_unregistered(points: str, is_registered: bool, say: Say) -> None:
+    """Warns of depth images in another frame than the images', whose camera nothing tells."""
+    if is_registered or _REGISTERED.search(points):
+        return
+    say(
+        f"warning: {points} has no camera_info and is in another frame than the images; its pixels"
+        " are taken for the images', which is wrong unless it is registered to them"
+    )
+
+
+def _with_scale(bag: Bag, sensors: Sensors, stated: float | None) -> tuple[Sensors, str | None]:
+    """The topics with the scale that the user or the bag states, and a line that says so."""
+    if stated is not None:
+        line = f"points: ÷ {stated:g}, as --depth-scale states"
+        return replace(sensors, scale=stated), line
+    unit = messages.depth_unit(bag, sensors.points)
+    if unit is None:
+        return sensors, None
+    topic, unit_m = unit
+    line = f"points: {1000 * unit_m:g} mm a code, as {topic} says; --depth-scale to change"
+    return replace(sensors, scale=1 / unit_m), line
 
 
 def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32], dict[str, int]]:
@@ -341,7 +380,7 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
     if not sensors.is_map and sensors.depth_camera is None:
         cloud = messages.cloud_points(message, topic)
     else:
-        depth = messages.depth_image(message, topic)
+        depth = messages.depth_image(message, topic, sensors.scale)
         if not depth.any():
             raise NoPointsError(f"{topic}: a depth image without depth")
         if sensors.depth_camera is None:
@@ -349,8 +388,9 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         rows, columns = np.nonzero(depth)
         xy = np.column_stack([columns, rows]).astype(np.float64)
         cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
-    # the unit is left to what reads the frames
-    points, counts, _ = scan_returns(topic, cloud, scale=1.0)
+    # the unit of clouds is left to what reads the frames, unless the user states it
+    of_cloud = None if sensors.is_map or sensors.depth_camera is not None else sensors.scale
+    points, counts, _ = scan_returns(topic, cloud, scale=of_cloud or 1.0, of_integers="")
     return points, counts
 
 

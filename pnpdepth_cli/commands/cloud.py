@@ -14,7 +14,7 @@ from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import camera_of_exif, camera_of_file, image_of_size
 from pnpdepth_cli.dataset.frame_record import Pose
-from pnpdepth_cli.dataset.plausible import far_values
+from pnpdepth_cli.dataset.range_ends import far_values
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames

@@ -159,5 +159,7 @@ def simulate_scan(
 def _dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:
     """The dense depth (H, W), and lines for a person."""
     dense = read_depth(path, scale=scale)
-    values, notes = plausible_map(dense.values, dense.reading, "depth", "--depth-scale", scale)
+    values, notes = plausible_map(
+        dense.values, dense.reading, "depth", "--depth-scale", scale, of_integers=""
+    )
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]

@@ -92,6 +92,8 @@ class FramesRequest:
         None, "Only the frames of these numbers, from 0.", metavar="FIRST LAST"
     )
     every: int = option(1, "Only every N-th of these.", metavar="N", least=1)
+    depth_scale: float | None = None
+    """Numbers per metre of the points. None: what the bag says, else millimetres of integers."""
     overwrite: bool = False
 
     def __post_init__(self) -> None:

@@ -9,8 +9,8 @@ correlation of two maps, computed for all shifts at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,6 +39,9 @@ REGISTERED, CHANCE = 3.0, 3.0
 From `REGISTERED` on, an image is not moved. An unrelated image reaches `CHANCE` by
 chance somewhere. So the best of all registrations must have it for one frame, and twice it for
 more."""
+
+_TURNED, _TURNED_MORE = 2.0, 4.0
+"""Evidence for another orientation, alone and above that for the image as it is."""
 
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
@@ -185,6 +188,42 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     )
 
 
+def better_orientation(frames: Sequence[Evidence]) -> str | None:
+    """Returns how the depth of frames of one size is turned or mirrored against the image, or None.
+
+    None also where the image belongs to its points as it is, and where the evidence for another
+    orientation is no better than chance.
+    """
+    height, width = frames[0].size
+    scale = min(1.0, _LONGEST_PX / max(height, width))
+    right, bottom = width * scale, height * scale  # of the reduced image
+
+    def factor(orient: Callable[[Floats], Floats]) -> float:
+        turned = [replace(frame, between=orient(frame.between)) for frame in frames]
+        maps = [frame.log_likelihood(1.0) for frame in turned]
+        return _bayes_factor(frames, maps, tuple(count // 2 for count in maps[0].shape))
+
+    as_it_is = factor(lambda at: at)
+    if as_it_is > REGISTERED:
+        return None
+    across, down = np.array([right, 0.0]), np.array([0.0, bottom])
+    orientations: dict[str, Callable[[Floats], Floats]] = {
+        "mirrored left to right": lambda at: np.abs(across - at),
+        "upside down, its rows from the bottom up": lambda at: np.abs(down - at),
+        "turned by 180°": lambda at: across + down - at,
+    }
+    if height == width:
+        orientations |= {
+            "turned by 90°": lambda at: np.column_stack([bottom - at[:, 1], at[:, 0]]),
+            "turned by −90°": lambda at: np.column_stack([at[:, 1], right - at[:, 0]]),
+            "with x and y exchanged": lambda at: at[:, ::-1],
+            "with x and y exchanged, and turned by 180°": lambda at: (across + down - at)[:, ::-1],
+        }
+    factors = {text: factor(orient) for text, orient in orientations.items()}
+    best = max(factors, key=lambda text: factors[text])
+    return best if factors[best] > max(_TURNED, as_it_is + _TURNED_MORE) else None
+
+
 def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
     """Returns the registration that frames of one size have in common: the posterior's mean.
 
@@ -206,6 +245,9 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     unmoved = [frame.log_likelihood(1.0) for frame in usable]
     middle = tuple(count // 2 for count in unmoved[0].shape)
     if _bayes_factor(usable, unmoved, middle) > REGISTERED:
+        return None
+    # Depth that is mirrored or turned is no matter of zoom and shift.
+    if better_orientation(usable) is not None:
         return None
     # The posterior over zoom, down and right: likelihood of all frames, and prior.
     total = np.stack([np.sum([e.log_likelihood(zoom) for e in usable], axis=0) for zoom in _ZOOMS])

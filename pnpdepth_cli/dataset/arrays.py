@@ -141,6 +141,23 @@ def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
     return DepthFile(values=values, reading=Reading("float32 without a header"))
 
 
+def depth_of_inverse(file: DepthFile, factor: float, scale: float | None) -> DepthFile:
+    """Returns depth in metres of the numbers of a file that hold disparity or 1/depth.
+
+    Args:
+        file: Numbers of any shape, 0 where unknown, as `read_depth` returns them.
+        factor: Depth × number, of `inverse_factor`.
+        scale: Numbers per unit that the user states. Integers are divided by it already.
+    """
+    values = file.values.astype(np.float64)
+    if file.reading.scale is None and scale is not None:
+        values = values / scale
+    with np.errstate(divide="ignore"):
+        depth = known_metres(np.where(values > 0, factor / values, 0))
+    source = f"{file.reading.source}, depth = {factor:g} / value"
+    return DepthFile(values=depth, reading=Reading(source, assumed=file.reading.assumed))
+
+
 def camera_of_file(
     path: Path, number: int | None, size: Size, image: Path | None = None
 ) -> tuple[Camera, list[str]]:

@@ -95,6 +95,10 @@ class FrameFiles:
     camera: int | None = None  # which camera of the calibration
     sparse_scale: float | None = None  # codes per metre of integer sparse depth
     gt_scale: float | None = None  # codes per metre of integer ground truth
+    scales_stated: bool = field(default=False, compare=False)
+    """Whether the user states the scales of these very files, so that floats are divided, too."""
+    kind_of_sparse: str | None = None  # what `sparse` holds, as `ReadOptions.sparse_kind`
+    kind_of_gt: str | None = None  # what `gt` holds
     part: FramePart = WHOLE
     pose: Pose | None = None
     """x_world = pose · (x, 1) for x in the camera's coordinates, in KITTI odometry camera 0's."""
@@ -106,6 +110,9 @@ class FrameFiles:
     one_view: bool = False
     """Whether the data set says that image and depth are of one view, pixel by pixel."""
     group: str | None = None  # the sequence it belongs to; None derives it from the name
+    is_first: bool = field(default=True, compare=False)
+    """Whether it is one of the first of its sequence, of which it is searched how image and points
+    belong together."""
 
     def __post_init__(self) -> None:
         for source in (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks):
@@ -177,7 +184,8 @@ class ReadOptions:
 
     depth_scale: float | None = option(
         None,
-        "Integer depth files hold metres × S.  [default: from the file, else 256]",
+        "Depth files hold metres × S; beside a file of integers, float files hold metres."
+        "  [default: from the file, else 256; of floats 1]",
         metavar="S",
     )
     unit_scale: float | None = option(
@@ -185,6 +193,12 @@ class ReadOptions:
     )
     sparse_range: bool = option(
         False, "Sparse depth is the distance from the camera, not depth z; needs --calib."
+    )
+    sparse_kind: str | None = option(
+        None,
+        "What sparse depth holds: inverse, 1/z; or disparity:B in pixels, with B = baseline in"
+        " metres × focal length in pixels.  [default: depth z]",
+        metavar="KIND",
     )
     registration: str = option(
         "auto",
@@ -201,6 +215,34 @@ class ReadOptions:
     def __post_init__(self) -> None:
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
             raise UsageError(f"--unit-scale must be above 0, got {self.unit_scale:g}")
+        inverse_factor("--sparse-kind", self.sparse_kind)
+
+
+def inverse_factor(option: str, kind: str | None) -> float | None:
+    """Returns depth × value of what a file of this kind holds; None for depth itself.
+
+    Args:
+        option: Name of what states the kind, for a message.
+        kind: "depth" or None; "inverse"; or "disparity:B", with B in metres × pixels.
+
+    Raises:
+        UsageError: There is no such kind.
+    """
+    if kind in (None, "depth"):
+        return None
+    if kind == "inverse":
+        return 1.0
+    name, _, number = str(kind).partition(":")
+    try:
+        factor = float(number)
+    except ValueError:
+        factor = math.nan
+    if name != "disparity" or not 0 < factor < math.inf:
+        raise UsageError(
+            f"{option} is depth, inverse, or disparity:B with the baseline in metres × the focal"
+            f" length in pixels, such as disparity:386.1, not {kind!r}"
+        )
+    return factor
 
 
 Unmatched = tuple[Path, str]

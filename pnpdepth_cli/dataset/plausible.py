@@ -8,64 +8,78 @@ the option that mends.
 | a return is somewhere | none of x y z is finite, or it is within 1 mm of the sensor | dropped |
 | beams end at different places | one x y z on 0.5 % of the points, at least 3 | dropped |
 | a coordinate is a number | some of x y z are none, or beyond 100 km; stops at 10 % | dropped |
-| a surface has several depths | the largest on 0.5 %, at least 3, far above the rest | unknown |
-| depths are of one order | above 1,000 times the median | unknown |
+| a surface has several depths | `dataset.range_ends` | unknown, or warns |
 | depth is in metres | the median; whole numbers in a float file | stops |
 | a deep view is near | floats of a median above 200 m, from near to twice as far | warns |
-| two files of a frame agree | their ratio's median is a quotient of common scales | stops |
+| two files of a frame agree | their order is one, their ratio 1: `dataset.agreement` | stops |
 | a list holds pixels | all within 0…1 or −1…1; many below 0 | stops |
 | pixels are of this image | all in the upper left corner | warns |
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.dataset.agreement import compare_depths
+from pnpdepth_cli.dataset.range_ends import far_end, far_values, near_end
 from pnpdepth_cli.errors import InputError, NoPointsError
-from pnpdepth_cli.io.depth import metres, scale_warning
+from pnpdepth_cli.io.depth import metres
 from pnpdepth_cli.io.formats import Reading
-from pnpdepth_cli.points import in_frame
+from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.sensors.projection import DropCounter, Mask
 
 _AT_SENSOR_M = 1e-3
 _FARTHEST_M = 1e5  # of a coordinate of a scan
 _BROKEN = 0.1  # of the points; more that are no numbers are another format
+_MANY_RETURNS, _CELL_DEG = 1000, 0.25
+_SEVERAL, _MOST_SEVERAL = 0.26, 0.12  # log ratio of ranges (1.3), and of the cells that have it
 _SAME, _LEAST_SAME = 0.005, 3  # of the numbers, and how many, that no surface shares
-_EQUAL = 1e-5  # relative difference of ranges that were computed from one number
 _FEW = 10  # fewer numbers decide nothing
-_FAR_ABOVE, _FAR_M = 1.5, 40.0  # times the largest of the rest, and metres
-_FAR_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the sky may exceed
-_FAR = 1000.0  # times the median depth; no point of an image is farther
 _CODES = 100.0  # median from which floats that are whole numbers are codes
 _COMMON_M = (0.2, 200.0)
 _MIDDLE_M = (0.5, 80.0)  # medians of most frames
 _DEEP = 2.0  # times a tenth of the depths is another tenth farther; not so below an aircraft
 # Codes per metre in use, most likely first: millimetres, KITTI, TUM RGB-D, centimetres.
 _COMMON_SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0)
-_UNITS = (1000.0, 100.0, 10.0, 1.0)  # per metre, of numbers that are no codes
-_OTHER_SCALE = 1.5  # ratio of ground truth to sparse depth that no noise explains
+# Numbers per metre that are no codes: mm, cm, inches, dm, feet, m; and steps of 0.25 and 5 mm.
+_UNITS = (1000.0, 100.0, 39.3701, 10.0, 3.28084, 1.0, 4000.0, 200.0)
 _SWAPPED = 0.05  # of the points; more outside the image, but inside it turned, have x and y swapped
+_RELATIVE, _RELATIVE_FEW, _NEARLY_ALL = 1.05, 5, 0.9  # largest, of so many points, and of these
+_LARGER, _ALIKE = 1.25, 1.08  # times the image, in both directions alike
+_SQUARE = 0.97  # of the other side, up to which the points of a square reach
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
+_DOWN, _PART_OF_ROWS = 0.6, 0.3  # rank correlation; of the image's height, that points cover
+_MANY_BESIDE, _RUN_DOWN = 100, 0.15  # pixels beside unknown ones, and how many of them run down
+_UNIT, _WHOLE_UNIT, _NEAR_UNIT = 1.0, 0.99, 0.9  # ends and a median of maps within 0…1
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
+
+OF_DATA_SET = "the data set"
+"""What a scale is of that nobody states of these very numbers; floats are divided by it only where
+they cannot be metres, and nothing is said."""
 
 MAPS, SCANS = (0.02, 1000.0), (0.05, 300.0)
 """The smallest and the largest median, metres, of depth maps and of ranges of scans."""
 
 
 def scan_returns(
-    path: Path | str, xyz: NDArray[np.floating], scale: float | None = None
+    path: Path | str,
+    xyz: NDArray[np.floating],
+    scale: float | None = None,
+    *,
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[NDArray[np.float32], dict[str, int], list[str]]:
     """Returns the points (N, 3) of a scan that are returns, in metres; counts; lines for a person.
 
     Args:
         path: Path or topic of the scan.
         xyz: (N, 3) in the scanner's coordinates, as they are stored.
-        scale: Numbers per metre that the user states; used where metres are implausible.
+        scale: Numbers per metre that the user states.
+        of_integers: The other file of the frame whose integers that scale is of. Empty: it is
+            stated of these numbers.
 
     Raises:
         InputError: Many coordinates are none of a scan, or are implausible in metres.
@@ -82,8 +96,12 @@ def scan_returns(
     row = row[drops.keep(seen, "without return, as they are at the sensor")]
     apart = ~_at_one_place(xyz[row].astype(np.float64))
     row = row[drops.keep(apart, "without return, as they are at one and the same place")]
-    near = ~_far_plane(range_m[row])[0]
+    near = ~far_end(range_m[row]).is_none
     row = row[drops.keep(near, "without return, as they are at one range far beyond all others")]
+    beyond = ~near_end(range_m[row]).is_none
+    row = row[
+        drops.keep(beyond, "without return, as they are at one range, nearer than all others")
+    ]
     # coordinates that are none
     if np.count_nonzero(odd[row]) > _BROKEN * len(xyz):
         first = int(row[odd[row]][0])
@@ -99,10 +117,65 @@ def scan_returns(
     dropped = {why: count for why, count in drops.dropped.items() if count}
     notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
     divisor, lines = divisor_to_metres(
-        range_m[row], Reading("scan"), f"{path}: range", "--depth-scale", scale, SCANS
+        range_m[row],
+        Reading("scan"),
+        f"{path}: range",
+        "--depth-scale",
+        scale,
+        SCANS,
+        of_integers=of_integers,
     )
     points = np.ascontiguousarray(xyz[row], np.float32) / np.float32(divisor)
     return points, dropped, [*notes, *lines]
+
+
+def cloud_points(
+    path: Path | str, xyz: NDArray[np.floating], scale: float | None = None
+) -> tuple[NDArray[np.float64], dict[str, int], list[str]]:
+    """Returns the points (N, 3) of a cloud that no scanner at its origin measured; as above.
+
+    Its coordinates are of a map or a survey, so they have no range, and no limit.
+
+    Raises:
+        NoPointsError: No point is a number.
+    """
+    drops = DropCounter()
+    known = np.isfinite(xyz).all(axis=1)
+    row = np.flatnonzero(drops.keep(known, "with a coordinate that is none"))
+    if not len(row):
+        raise NoPointsError(f"{path}: none of its {len(xyz):,} points has coordinates")
+    dropped = {why: count for why, count in drops.dropped.items() if count}
+    notes = [f"sparse: dropped {n:,} of {len(xyz):,} points {why}" for why, n in dropped.items()]
+    if scale is not None and scale != 1:
+        notes.append(f"{path}: ÷ {scale:g}, as is stated")
+    return np.asarray(xyz[row], np.float64) / (scale or 1.0), dropped, notes
+
+
+def has_scanner(xyz: NDArray[np.floating]) -> bool:
+    """Returns whether points (N, 3) may be of one scanner at their origin.
+
+    A scanner sees one surface in each direction. Of cells of a quarter of a degree with two points
+    or more, 7 % at most have surfaces at very different ranges in five scans of KITTI, and 17 to
+    29 % where the same scans are moved 10 m away.
+    """
+    range_m = np.linalg.norm(np.asarray(xyz, np.float64), axis=1)
+    usable = np.isfinite(range_m) & (range_m > _AT_SENSOR_M)
+    if np.count_nonzero(usable) < _MANY_RETURNS:
+        return True
+    points, range_m = np.asarray(xyz, np.float64)[usable], range_m[usable]
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    elevation = np.degrees(np.arcsin(np.clip(points[:, 2] / range_m, -1, 1)))
+    cell = np.floor(azimuth / _CELL_DEG) * 4096 + np.floor(elevation / _CELL_DEG)
+    _, place, counts = np.unique(cell, return_inverse=True, return_counts=True)
+    log_range = np.log(range_m)
+    nearest, farthest = np.full(len(counts), np.inf), np.full(len(counts), -np.inf)
+    np.minimum.at(nearest, place, log_range)
+    np.maximum.at(farthest, place, log_range)
+    shared = counts >= 2
+    if np.count_nonzero(shared) < _MANY_RETURNS / 10:
+        return True
+    several = (farthest - nearest)[shared] > _SEVERAL
+    return float(several.mean()) < _MOST_SEVERAL
 
 
 def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
@@ -115,46 +188,14 @@ def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
     return np.asarray((mixed == keys[counts.argmax()]) & is_shared)
 
 
-def _far_plane(values: NDArray[np.float64]) -> tuple[Mask, float, float]:
-    """(N,) true for the sky, its value, and 98 % of the rest."""
-    none = np.zeros(len(values), bool), 0.0, 0.0
-    if len(values) < _FEW:
-        return none
-    largest = float(values.max())
-    same = values >= largest * (1 - _EQUAL)
-    rest = values[~same]
-    if not rest.size or np.count_nonzero(same) < max(_LEAST_SAME, _SAME * len(values)):
-        return none
-    most = float(np.quantile(rest, 0.98))
-    if largest >= _FAR_BEYOND * most:  # a renderer may mix the two at edges of the sky
-        return values > math.sqrt(largest * most), largest, most
-    if largest >= max(_FAR_ABOVE * float(rest.max()), _FAR_M):
-        return same, largest, most
-    return none
-
-
-def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
-    """Returns which of the known depths (N,) are no depth, and lines for a person."""
-    values = np.asarray(depth, np.float64)
-    far, largest, most = _far_plane(values)
-    total = f"{np.count_nonzero(far):,} of {len(values):,}"
-    if far.any():
-        return far, [
-            f"{total} depths are of the sky or a far plane, at {metres(largest)} {unit}, where 98 %"
-            f" of the others are at most {metres(most)} {unit}; taken as unknown"
-        ]
-    median = float(np.median(values)) if len(values) >= _FEW else math.inf
-    far = values > _FAR * median
-    note = (
-        f"dropped {np.count_nonzero(far):,} of {len(values):,} points more than {_FAR:,.0f} times"
-        f" as far as the median of {metres(median)} {unit}; the farthest was at"
-        f" {metres(float(values.max(initial=0)))} {unit}"
-    )
-    return far, [note] if far.any() else []
-
-
 def plausible_map(
-    values: NDArray[np.float32], reading: Reading, what: str, option: str, scale: float | None
+    values: NDArray[np.float32],
+    reading: Reading,
+    what: str,
+    option: str,
+    scale: float | None,
+    *,
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[NDArray[np.float32], list[str]]:
     """Returns a depth map (H, W) in metres without what is no depth, and lines for a person.
 
@@ -164,19 +205,54 @@ def plausible_map(
         what: Name of the depths in lines for a person.
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
+        of_integers: The other file of the frame whose integers that scale is of. Empty: it is
+            stated of these numbers.
 
     Raises:
         InputError: The depths are implausible in metres.
     """
     known = values > 0
     far, notes = far_values(values[known])
+    if (warning := interpolation_warning(values)) is not None:
+        notes.append(warning)
     values = values.copy()
     values[known] = np.where(far, np.float32(0), values[known])
     # a scale of integers that is assumed is compared with the other file of the frame instead
     stated = scale or reading.scale
-    divisor, lines = divisor_to_metres(values[values > 0], reading, what, option, stated)
-    notes = [*(f"{what}: {note}" for note in notes), *lines]
+    divisor, lines = divisor_to_metres(
+        values[values > 0], reading, what, option, stated, of_integers=of_integers
+    )
+    notes = [named(what, note) for note in notes] + lines
     return values / np.float32(divisor), notes
+
+
+def interpolation_warning(depth: NDArray[np.float32]) -> str | None:
+    """Returns a warning if a map (H, W) with unknown pixels, 0, was resized by interpolation.
+
+    Values then run down to 0 beside unknown pixels. There, below half of a neighbour are 0.4 % of
+    the pixels at most in 36 maps of five sets, 10 % in the samples, and 22 to 80 % after a resize
+    (but 5 to 10 % of a sparse map at exactly half its size, whose pixels are means of four).
+    """
+    known = depth > 0
+    window = np.ones((3, 3), np.uint8)
+    beside = known & (cv2.erode(known.astype(np.uint8), window, borderValue=1) == 0)
+    count = int(np.count_nonzero(beside))
+    if count < _MANY_BESIDE:
+        return None
+    low = depth[beside] < cv2.dilate(depth, window)[beside] / 2
+    if low.mean() < _RUN_DOWN:
+        return None
+    return (
+        f"warning: {low.mean():.0%} of {count:,} depths beside unknown pixels are below half of a"
+        " neighbour's, as of a map that was resized by interpolation, which mixes depth with"
+        " unknown; resize it by the nearest neighbour"
+    )
+
+
+def named(what: str, note: str) -> str:
+    """Returns the line with the name of its depths, behind its mark if it is a warning."""
+    text = note.removeprefix("warning: ")
+    return f"{what}: {text}" if text == note else f"warning: {what}: {text}"
 
 
 def divisor_to_metres(
@@ -186,10 +262,14 @@ def divisor_to_metres(
     option: str,
     scale: float | None,
     medians: tuple[float, float] = MAPS,
+    *,
+    of_integers: str = OF_DATA_SET,
 ) -> tuple[float, list[str]]:
     """Returns what depths are divided by to be metres, mostly 1, and lines for a person.
 
-    A float file holds metres. A scale that the user states counts only where that cannot be.
+    A float file holds metres, unless the user states a scale of it. One scale may be stated of two
+    files. If one of these holds integers, it is theirs, and floats are divided by it only where
+    they cannot be metres.
 
     Args:
         depth: (N,) known depths, or ranges, as they were read.
@@ -198,6 +278,8 @@ def divisor_to_metres(
         option: Option of the scale.
         scale: Numbers per metre that the user states. None: nothing is stated.
         medians: The smallest and the largest that is plausible.
+        of_integers: The other file of the frame whose integers the scale is of. Empty: it is
+            stated of these depths.
 
     Raises:
         InputError: They are implausible, and nothing that the user states explains it.
@@ -206,51 +288,71 @@ def divisor_to_metres(
         return 1.0, []
     low, high = medians
     median, floats = float(np.median(depth)), reading.scale is None
+    if floats and scale is not None and scale != 1 and not of_integers:
+        made = median / scale
+        lines = [f"{what}: ÷ {scale:g}, as is stated"]
+        if not low <= made <= high:
+            lines.append(f"warning: {what}: median {metres(made)} m is implausible with {option}")
+        return scale, lines
+    # A map within 0…1 is normalised, or a z-buffer.
+    if floats and scale is None and depth.size >= _MANY and float(depth.max()) <= _UNIT:
+        fact = f"{what}: all {depth.size:,} depths are within 0…1, up to {float(depth.max()):.4g}"
+        hint = f"{option} 1 keeps it as metres; another number of it divides"
+        if float(depth.max()) >= _WHOLE_UNIT or median >= _NEAR_UNIT:
+            raise InputError(f"{fact}, as of normalised depth or a z-buffer; {hint}")
+        return 1.0, [f"warning: {fact}: are they metres? {hint}"]
+    # What is implausible as it is read.
     many = floats and median >= _CODES and depth.size >= _FEW
     codes = many and bool((np.rint(depth) == depth).all())
     likely = low <= median <= high and not codes
     far = floats and median > _COMMON_M[1] and depth.size >= _FEW
     near_m, far_m = np.quantile(depth, (0.1, 0.9)) if likely and far else (1.0, 1.0)
     if likely and (far_m <= _DEEP * near_m or scale == 1):
-        return 1.0, []
+        if not floats or scale in (None, 1) or of_integers in ("", OF_DATA_SET):
+            return 1.0, []
+        return 1.0, [
+            f"{what}: floats, read as metres; {option} {scale:g} is of the integers of"
+            f" {of_integers}"
+        ]
     if floats and scale is not None and scale != 1 and low <= median / scale <= high:
         return scale, [f"{what}: ÷ {scale:g}, as {metres(median)} m are implausible"]
+    # All scales in use that would make it plausible, the most likely first.
     kind = " of whole numbers" if codes else ""
     doubt = "far for so deep a view" if likely else "implausible"
     fact = f"{what}: median{kind} {metres(median)} m is {doubt}, the scale is probably wrong"
     now = reading.scale or 1.0
     common = _COMMON_SCALES if codes or not floats else _UNITS
     scales = [(s, limits) for limits in (_MIDDLE_M, _COMMON_M) for s in common]
-    better = next((s for s, (least, most) in scales if least <= median * now / s <= most), None)
-    if better is None or better == now:
+    better = dict.fromkeys(s for s, (least, most) in scales if least <= median * now / s <= most)
+    better.pop(now, None)
+    if not better:
         advice = f"give numbers per metre with {option} (now {now:g})"
     else:
-        made = metres(median * now / better)
-        advice = f"{option} {better:g} (now {now:g}) would make it {made} m"
+        first, *others = (f"{s:g}" for s in better)
+        texts = [f"{metres(median * now / s)} m" for s in better]
+        advice = f"{option} {first} (now {now:g}) would make it {texts[0]}"
+        advice += "".join(f", {s} {m}" for s, m in zip(others, texts[1:], strict=True))
     if likely or scale is not None or not (floats or reading.assumed):
         return 1.0, [f"warning: {fact}: {advice}"]
     raise InputError(f"{fact}: {advice}, {option} {now:g} keeps it")
 
 
-def check_same_scale(
-    sparse: NDArray[np.float32], gt: NDArray[np.float32], readings: Mapping[str, Reading | None]
-) -> list[str]:
-    """Returns a warning if ground truth and sparse depth (H, W) differ by a factor.
+def check_rows(points: SparsePoints[NDArray[np.float32]]) -> list[str]:
+    """Returns a warning if depth grows towards the bottom of the image, where floors are nearest.
 
-    Raises:
-        InputError: A scale that was assumed explains it.
+    Its rank correlation with the row is −0.94 to 0.24 in 121 frames of seven sets, indoors and
+    outdoors. Of disparity and 1/depth it is the opposite, and of rows from the bottom up.
     """
-    both = (sparse > 0) & (gt > 0)
-    if int(both.sum()) < _FEW:
+    y = points.xy[:, 1].astype(np.float64)
+    if len(y) < _MANY or np.ptp(y) < _PART_OF_ROWS * points.size[0]:
         return []
-    ratio = float(np.median(gt[both] / sparse[both]))
-    if 1 / _OTHER_SCALE <= ratio <= _OTHER_SCALE:
+    found = compare_depths(points.depth, y + 1)
+    if found.rank < _DOWN:
         return []
-    scale_warning("sparse points", 1 / ratio, readings)
     return [
-        f"warning: the ground truth is {ratio:.3g} times the sparse depth where both are known"
-        f" (median of {int(both.sum()):,} pixels), so one of their scales is wrong; give"
-        " --depth-scale, or a list with gt_scale"
+        "warning: sparse: larger values are at the bottom of the image (rank correlation"
+        f" {found.rank:.2f}), where floors are nearest: disparity or 1/depth, which --sparse-kind"
+        " reads, or rows from the bottom up?"
     ]
 
 
@@ -266,17 +368,29 @@ def check_pixels(
     # Coordinates that are relative to the image.
     (height, width), inside = size, np.asarray(in_frame(xy, size))
     outside = len(xy) - int(np.count_nonzero(inside))
-    if len(xy) >= _FEW and bool((np.abs(xy) <= 1).all()) and min(size) > 2:
-        low = "−1" if bool((xy < 0).any()) else "0"
+    relative = (np.abs(xy) <= _RELATIVE).all(axis=1)
+    if len(xy) >= _RELATIVE_FEW and relative.mean() >= _NEARLY_ALL and min(size) > 2 * _FEW:
+        low, how = "0", f"multiply them by {width} and {height}"
+        if (xy[relative] < 1 - _RELATIVE).any():
+            low, how = "−1", f"add 1 and multiply them by {width / 2:g} and {height / 2:g}"
         raise InputError(
-            f"{path}: the coordinates of all {len(xy):,} points are within {low}…1, so they are"
-            f" relative to the image; multiply them by {width} and {height} to make them pixels"
+            f"{path}: the coordinates of {np.count_nonzero(relative):,} of {len(xy):,} points are"
+            f" within {low}…1, so they are relative to the image; {how} to make them pixels"
         )
     # Coordinates of an image that was turned.
     if outside > _SWAPPED * len(xy) and bool(in_frame(xy, (width, height)).all()):
         raise InputError(
             f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image,"
             f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"
+        )
+    # Coordinates of a larger image.
+    reach = (np.quantile(xy, 0.99, axis=0) / 0.99 + 1) / (width, height)
+    larger = float(reach.min())
+    is_larger = larger > _LARGER and reach.max() < _ALIKE * larger and outside > _SWAPPED * len(xy)
+    if len(xy) >= _FEW and is_larger and bool((xy >= -0.5).all()):
+        raise InputError(
+            f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image; all"
+            f" are within one that is {larger:.3g} times as large; divide them by that"
         )
     # Coordinates of a scan.
     below = int((xy < -0.5).any(axis=1).sum())
@@ -290,7 +404,10 @@ def check_pixels(
     # Points that all keep within a corner are pixels of a smaller image.
     notes = [f"sparse: {outside:,} points outside the image"] if outside else []
     right, down = (xy.max(axis=0) + 1) / (width, height)
+    last = xy.max(axis=0)
+    square = last.max() < _CORNER * min(size) and last.min() > _SQUARE * last.max()
     corner = max(right, down) < _CORNER and min(right, down) > 0.9 * max(right, down)
+    corner |= square and width != height  # such as 0…255 or per cent
     if len(xy) >= _MANY and corner and (xy.min(axis=0) < 0.1 * xy.max(axis=0)).all():
         notes.append(
             f"warning: all {len(xy):,} points of {path} are in the upper left corner, up to"

@@ -10,22 +10,25 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.dataset import arrays, sparse_depth
+from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
     ReadOptions,
     ScanOptions,
+    inverse_factor,
 )
 from pnpdepth_cli.dataset.neighbours import read_neighbours
-from pnpdepth_cli.dataset.plausible import check_same_scale, plausible_map
+from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
-from pnpdepth_cli.io.depth import describe_range, read_depth
+from pnpdepth_cli.io.depth import describe_range, holds_integers, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
-from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.io.rgb import orientation_in, read_rgb
 from pnpdepth_cli.points import METRES, Size, SparsePoints
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
@@ -71,7 +74,7 @@ def read_frame(
     gt, compared = None, list[str]()
     if truth is not None:
         gt = files.part.apply(truth.values)
-        compared = _compare(files, gt, truth.reading, sparse, given)
+        compared = _compare(files, options, gt, truth.reading, sparse, given)
     # The camera, and with it the points of neighbouring frames.
     size = size or given.size
     camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)
@@ -83,6 +86,8 @@ def read_frame(
     contradicted = any(each.contradicts_images for each in neighbours)
     stated = sparse.camera is not None or files.one_view or options.registration == "off"
     one_view = contradicted or stated
+    if rgb is not None and not one_view and files.is_first:
+        compared += _orientation_warning(files, files.part.apply(rgb), given)
     # What a record and a person should know.
     found["sparse"] = sparse.record, [*sparse.notes]
     sources = {name: found[name] for name in ("image", "sparse", "gt") if name in found}
@@ -140,9 +145,13 @@ def _read_ground_truth(
     files: FrameFiles, options: ReadOptions, source: Path, size: Size | None
 ) -> tuple[DepthFile, FileRecord, list[str]]:
     """The ground truth of an image (H, W): a projected scan, or a depth map."""
-    scale, of_scan = options.depth_scale or files.gt_scale, options.scan.over(files)
+    (scale, of_integers), of_scan = _scale_of(files, options, "gt"), options.scan.over(files)
     if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        scan = read_scan_points(source, of_scan, size, files.image_file, scale=scale)
+        if files.kind_of_gt is not None:
+            raise UsageError(f"{source} is a scan, so gt_kind does not apply")
+        scan = read_scan_points(
+            source, of_scan, size, files.image_file, scale=scale, of_integers=of_integers
+        )
         notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, notes
@@ -151,15 +160,39 @@ def _read_ground_truth(
     if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
         own = arrays.raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
         file = file if own.reading.assumed else own
+    if (factor := inverse_factor("gt_kind", files.kind_of_gt)) is not None:
+        file, scale = arrays.depth_of_inverse(file, factor, scale), None
     # Pixels that a mask or the gate rules out are unknown.
     values, reading = arrays.apply_masks(file.values, files.masks), file.reading
     if files.gt_other_size and size is not None and values.shape != size:
         values = arrays.move_depth(source, values, size)
     option = "--depth-scale" if files.sparse is None else _gt_scale_option(files)
-    values, notes = plausible_map(values, reading, "gt", option, scale)
+    values, notes = plausible_map(values, reading, "gt", option, scale, of_integers=of_integers)
     described = describe_range(values, reading, noun="pixels", option=option)
     truth = DepthFile(values=values, reading=reading)
     return truth, arrays.record_of(source, reading), [f"gt: {described}", *notes]
+
+
+def _scale_of(files: FrameFiles, options: ReadOptions, part: str) -> tuple[float | None, str]:
+    """What is stated of a file's scale: numbers per metre, and whose integers these are.
+
+    `--depth-scale` is of both files of a frame, but of the integers alone if one of them holds
+    integers. What a layout states is of integers only.
+
+    Args:
+        files: The files of the frame.
+        options: What the user states.
+        part: Name of the file, "sparse" or "gt".
+    """
+    own, other = (files.sparse, files.gt) if part == "sparse" else (files.gt, files.sparse)
+    of_layout = files.sparse_scale if part == "sparse" else files.gt_scale
+    if options.depth_scale is None:
+        return of_layout, "" if files.scales_stated else OF_DATA_SET
+    if own is None or other is None or other.is_dir():
+        return options.depth_scale, ""
+    if other.suffix.lower() in SCAN_ONLY_SUFFIXES or not holds_integers(other):
+        return options.depth_scale, ""
+    return options.depth_scale, str(other)
 
 
 def _gt_scale_option(files: FrameFiles) -> str:
@@ -175,8 +208,9 @@ def _sample_sparse(
     seed: int,
 ) -> sparse_depth.SparseDepth:
     """Points sampled from the ground truth."""
-    if options.sparse_range:
-        raise UsageError("--sparse-range is of sparse depth from a file, and there is none")
+    if options.sparse_range or options.sparse_kind is not None:
+        name = "--sparse-range" if options.sparse_range else "--sparse-kind"
+        raise UsageError(f"{name} is of sparse depth from a file, and there is none")
     if options.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
@@ -204,10 +238,17 @@ def _read_sparse(
     path, image, scan = files.sparse, files.image_file, options.scan.over(files)
     assert path is not None
     # What it is: a COLMAP model, a scan, or else a map or a list.
-    is_model, scale = path.is_dir(), options.depth_scale or files.sparse_scale
+    is_model, (scale, of_integers) = path.is_dir(), _scale_of(files, options, "sparse")
     is_scan = not is_model and scan.describes(path)
+    if options.depth_scale is not None and is_model and files.gt is None:
+        raise UsageError(f"{path} is a COLMAP model; --unit-scale is its scale, not --depth-scale")
     if options.unit_scale is not None and not is_model:
         raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
+    kind = options.sparse_kind or files.kind_of_sparse
+    if kind is not None and (is_model or is_scan):
+        raise UsageError(f"{path} is no depth map or list, so --sparse-kind does not apply")
+    if options.sparse_range and kind is not None:
+        raise UsageError("--sparse-range is of distances, and --sparse-kind of another kind")
     if options.sparse_range and (is_model or is_scan):
         raise UsageError(f"{path} is no depth map or list, so --sparse-range does not apply")
     # Its points in the image.
@@ -218,15 +259,47 @@ def _read_sparse(
             raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
         sparse = sparse_depth.read_colmap_points(path, image, size, unit_scale=options.unit_scale)
     elif is_scan:
-        sparse = read_scan_points(path, scan, size, image, scale=scale)
+        sparse = read_scan_points(
+            path,
+            scan,
+            size,
+            image,
+            scale=scale,
+            of_integers=of_integers,
+            search=files.is_first,
+        )
     else:
-        sparse = sparse_depth.read_map_points(path, options, size, scale)
+        sparse = sparse_depth.read_map_points(
+            path,
+            options,
+            size,
+            scale,
+            of_integers=of_integers,
+            inverse=inverse_factor("--sparse-kind", kind),
+        )
         if options.sparse_range:
             sparse = sparse_depth.depth_of_distances(sparse, scan, image)
     # Those that are sure enough, in the part of the frame.
     if files.sparse_mask is not None:
         sparse = sparse.confident(files.sparse_mask, files.min_confidence)
     return sparse.in_part(files.part)
+
+
+def _orientation_warning(
+    files: FrameFiles, rgb: NDArray[np.float32], points: SparsePoints
+) -> list[str]:
+    """A warning if the points fit the image clearly better mirrored or turned."""
+    known = evidence(np.ascontiguousarray(rgb), points)
+    turned = None if known is None else better_orientation([known])
+    if turned is None:
+        return []
+    way_out = "; give both as they are stored, or both turned"
+    if files.image_file is not None and orientation_in(files.image_file) != 1:
+        way_out = f": the EXIF orientation of {files.image_file} is applied, that of depth is not"
+    return [
+        f"warning: the image's edges meet the depth of {files.sparse or files.gt} better if it is"
+        f" {turned}{way_out}"
+    ]
 
 
 def _camera_of(
@@ -246,7 +319,7 @@ def _camera_of(
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
     """The points of another frame of the sequence, read or sampled as it does itself."""
     if files.sparse is not None:
-        return _read_sparse(files, options, size).points
+        return _read_sparse(replace(files, is_first=False), options, size).points
     rgb, truth, _ = _read_pixels(files, options)
     return _sample_sparse(files, options, rgb, truth, seed).points
 
@@ -269,6 +342,7 @@ def _hold_out(
 
 def _compare(
     files: FrameFiles,
+    options: ReadOptions,
     gt: NDArray[np.float32],
     reading: Reading,
     sparse: sparse_depth.SparseDepth,
@@ -298,5 +372,12 @@ def _compare(
             " are the sparse depth itself, so errors against it show nothing; give another --gt,"
             " or keep points out with --holdout"
         )
+    # Their order, and then their ratio.
+    both = f"the sparse depth and the ground truth {files.gt}"
+    if (reversed_order := check_order(both, depth, gt)) is not None:
+        if options.sparse_kind is files.kind_of_sparse is files.kind_of_gt is None:
+            raise InputError(reversed_order)
+        return [*notes, f"warning: {reversed_order}"]
     by_option = {"--depth-scale": sparse.reading, _gt_scale_option(files): reading}
-    return notes + check_same_scale(depth, gt, by_option)
+    warning = unit_warning("sparse points", compare_depths(depth, gt), by_option)
+    return notes if warning is None else [*notes, warning]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -10,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.dataset.plausible import scan_returns
+from pnpdepth_cli.dataset.plausible import cloud_points, has_scanner, scan_returns
+from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -28,13 +27,11 @@ from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.points import Size, in_frame
+from pnpdepth_cli.sensors.edge_fit import edge_map, jump_weights
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import (
     Points,
     describe_dropped,
-    edge_agreement,
-    edge_ranks,
-    near_jumps,
     points_in_image,
     project_velodyne,
 )
@@ -44,14 +41,10 @@ _NEXT_TO_NONE = 0.05  # of the points with them inverted; with fewer, extrinsics
 _THIN = 0.5  # largest variance of a scan's rays along its thin direction, of the next
 _AHEAD_DEG = 15.0  # angle to the camera's axis below which points are expected in the image
 _MOST_OUTSIDE = 1 / 3  # of the points ahead; more outside the image give a warning
-_CLEARLY_BETTER = 0.03  # in `edge_agreement`, of a camera that replaces the one that is named
+_FARTHEST_SCANNER_M = 20.0  # from its camera; farther apart are the origins of maps
+_CLEARLY_BETTER = 1.0  # in standard deviations by chance, of a camera that replaces the named one
+_CHANCE_PX = 80.0  # shifts by which the spread by chance is known
 _CAMERAS = 4  # of KITTI; more of a calibration are not tried
-_TURNS_DEG = (-4, -2, -1, 0, 1, 2, 4)
-# In edge agreement; mirrored and other cameras are better by 0.03 at most where the calibration is
-# right, and the best of the turns by 0.08 (18 frames of KITTI).
-_OTHER_READING, _OTHER_TURN = 0.06, 0.1
-_AGREES = 0.08  # edge agreement that is not by chance
-_MANY_POINTS = 1000  # fewer tell too little
 _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
 
 
@@ -62,6 +55,8 @@ def read_scan_points(
     image: Path | None = None,
     *,
     scale: float | None = None,
+    of_integers: str = "",
+    search: bool = True,
 ) -> SparseDepth:
     """Returns the points of a scan that are visible in an image.
 
@@ -71,7 +66,9 @@ def read_scan_points(
         size: (H, W) of the image; None for the calibration's.
         image: File of the image; its edges tell whether it is rectified, where the calibration
             leaves that open.
-        scale: Numbers of the scan per metre; used where metres are implausible.
+        scale: Numbers of the scan per metre that the user states.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        search: Whether it is searched how image and scan belong together.
 
     Raises:
         InputError: A file cannot be read, or calibration and image do not fit together.
@@ -85,7 +82,16 @@ def read_scan_points(
     warnings = check_size(named, calibration.camera, size, image)
     # The returns of the scan.
     stored, source = read_scan(path)
-    xyz, no_returns, mended = scan_returns(path, stored, scale)
+    of_scanner = _of_scanner(calibration, stored)
+    xyz: NDArray[np.floating] = stored
+    if of_scanner:
+        xyz, no_returns, mended = scan_returns(path, stored, scale, of_integers=of_integers)
+    else:
+        xyz, no_returns, mended = cloud_points(path, stored, None if of_integers else scale)
+        mended.append(
+            "sparse: a cloud that no scanner at its origin measured; points behind nearer ones are"
+            " taken for hidden"
+        )
     if calibration.rectified:
         frames = [] if image is None else [(read_rgb(image).values, xyz)]
         calibration, note = choose_camera(calibration, frames)
@@ -100,13 +106,28 @@ def read_scan_points(
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
         warnings += check_direction(xyz, camera, scanner, size)
     # They are projected, and what seems wrong is warned of.
-    points = project_velodyne(xyz, camera, scanner, size, keep_occluded=options.keep_occluded)
+    try:
+        points = project_velodyne(
+            xyz,
+            camera,
+            scanner,
+            size,
+            keep_occluded=options.keep_occluded,
+            has_scanner=of_scanner,
+        )
+    except NoPointsError as error:
+        inside = points_by_reading(xyz, calibration, size)
+        text, count = max(inside.items(), key=lambda item: item[1])
+        if not count:
+            raise
+        raise NoPointsError(f"{error}; {text}, {count:,} points would be in the image") from error
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
-    if image is not None and not calibration.rectified:
+    if search and image is not None and not calibration.rectified:
         visible = points  # an occluded point is no evidence about the edges of the image
         if options.keep_occluded:
-            visible = project_velodyne(xyz, camera, scanner, size)
-        warnings += _better_reading(visible, calibration, options, image)
+            visible = project_velodyne(xyz, camera, scanner, size, has_scanner=of_scanner)
+        others = _other_cameras(options, image)
+        warnings += fit_warning(visible, xyz, calibration, others, read_rgb(image).values)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
@@ -151,9 +172,16 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
     return calibration, named
 
 
+def _of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
+    """Whether the points were measured from their origin, by the pose and by their directions."""
+    assert calibration.scanner is not None
+    away_m = float(np.linalg.norm(calibration.scanner.translation))
+    return away_m <= _FARTHEST_SCANNER_M and has_scanner(stored)
+
+
 def choose_camera(
     raw: Calibration,
-    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.floating]]],
     topic: str = "",
 ) -> tuple[Calibration, str]:
     """Returns the camera of images that may be rectified, and a line that says which it is.
@@ -181,7 +209,8 @@ def choose_camera(
         assert own.scanner is not None
         with suppress(NoPointsError):
             points = project_velodyne(xyz, own.camera, own.scanner, rgb.shape[:2])
-            scores.append(_agreements(points, rgb, own, candidates))
+            if (each := _scores(points, rgb, own, candidates)) is not None:
+                scores.append(each)
     if scores:
         mean = {name: float(np.mean([each[name] for each in scores])) for name in candidates}
         best = max(mean, key=lambda name: mean[name])
@@ -193,23 +222,30 @@ def choose_camera(
     return candidates[choice], note
 
 
-def _agreements(
+def _scores(
     points: Points, rgb: NDArray[np.float32], own: Calibration, others: Mapping[str, Calibration]
-) -> dict[str, float]:
-    """The edge agreement by each calibration; −1 where it puts few of the points into the image."""
+) -> dict[str, float] | None:
+    """The score of each calibration; 0 of one that puts few of the points into the image.
+
+    None where the points tell nothing.
+    """
+    weight = jump_weights(points)
+    if weight is None:
+        return None
     # Points that are seen by their own calibration, with its jumps of depth, are projected anew.
     assert own.scanner is not None
-    ranks, jumps = edge_ranks(rgb), near_jumps(points)
+    edges = edge_map(rgb)
+    shifted = edges.shifted(points.xy.astype(np.float64), weight, (_CHANCE_PX, _CHANCE_PX))
+    chance, spread = float(shifted.mean()), float(shifted.std()) + 1e-9
     xyz = own.scanner.inverse().apply(unproject(own.camera, points.xy, points.depth))
-    result = dict.fromkeys(others, -1.0)
+    result = dict.fromkeys(others, 0.0)
     for name, each in others.items():
         assert each.scanner is not None
         moved = each.scanner.apply(xyz)
         ahead = moved[:, 2] > 0
         xy = pixels_of(each.camera, moved[ahead])
-        inside = in_frame(xy, points.size)
-        if np.count_nonzero(inside) >= _FEW_INSIDE * len(points):
-            result[name] = edge_agreement(ranks, xy[inside], jumps[ahead][inside])
+        if np.count_nonzero(in_frame(xy, points.size)) >= _FEW_INSIDE * len(points):
+            result[name] = (edges.score(xy, weight[ahead]) - chance) / spread
     return result
 
 
@@ -253,39 +289,14 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: Size) -> l
     ]
 
 
-def _better_reading(
-    points: Points, own: Calibration, options: ScanOptions, image: Path
-) -> list[str]:
-    """A warning if jumps of depth meet the image's edges clearly better by another calibration."""
-    rgb, scanner = read_rgb(image).values, own.scanner
-    assert scanner is not None
-    if len(points) < _MANY_POINTS or rgb.shape[:2] != points.size:
-        return []
-    # Other axes, cameras and turns, and how much better each must be.
-    readings, needed = {"": own}, {"": 0.0}
-    for name, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
-        text = f"with {name} of the scan negated, as of left-handed ones (CARLA, Unity)"
-        mirrored = scanner @ Extrinsics(np.diag(signs), np.zeros(3))
-        readings[text], needed[text] = replace(own, scanner=mirrored), _OTHER_READING
+def _other_cameras(options: ScanOptions, image: Path) -> dict[str, Calibration]:
+    """The other cameras of a calibration of several, by what gives them."""
+    found = dict[str, Calibration]()
     for number in range(_CAMERAS) if options.extrinsics is None else ():
         with suppress(UsageError):  # there is no such camera
             text = f"with --camera {number}"
-            readings[text], _ = _calibration_of(image, replace(options, camera=number))
-            needed[text] = _OTHER_READING
-    for down, right in itertools.product(_TURNS_DEG, _TURNS_DEG):
-        turn = Rotation.from_euler("xy", (down, right), degrees=True).as_matrix()
-        text = f"with the extrinsics turned by {down}° about the camera's x and {right}° about y"
-        turned = Extrinsics(turn, np.zeros(3)) @ scanner
-        readings[text], needed[text] = replace(own, scanner=turned), _OTHER_TURN
-    # The best must be better by more than chance.
-    found = _agreements(points, rgb, own, readings)
-    text = max(found, key=lambda text: found[text] - needed[text])
-    if not text or found[text] < _AGREES:
-        return []
-    return [
-        f"warning: the image's edges meet the scan's jumps of depth better {text}:"
-        f" {found[text]:+.2f} instead of {found['']:+.2f}, where 0 is chance; check the calibration"
-    ]
+            found[text], _ = _calibration_of(image, replace(options, camera=number))
+    return found
 
 
 def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bool:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.plausible import check_pixels, divisor_to_metres, far_values
+from pnpdepth_cli.dataset.plausible import (
+    check_pixels,
+    check_rows,
+    divisor_to_metres,
+    interpolation_warning,
+    named,
+)
+from pnpdepth_cli.dataset.range_ends import far_values
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (
@@ -23,13 +30,14 @@ from pnpdepth_cli.io.colmap_model import (
 )
 from pnpdepth_cli.io.depth import describe_range, read_sparse
 from pnpdepth_cli.io.file_bytes import fingerprint
-from pnpdepth_cli.io.formats import SATURATED_CODE, Reading
-from pnpdepth_cli.points import METRES, MODEL_UNITS, Size
+from pnpdepth_cli.io.formats import SATURATED_CODE, DepthFile, Reading
+from pnpdepth_cli.points import METRES, MODEL_UNITS, Size, in_frame
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
     DropCounter,
     Points,
+    as_depth_image,
     behind_foreground,
     describe_dropped,
     hidden_among,
@@ -39,6 +47,7 @@ from pnpdepth_cli.sensors.projection import (
 
 # A 16-bit file in model units holds depths up to at least so many times the model's extent.
 _SIZES_IN_RANGE = 8.0
+_FEW_TO_HIDE = 100  # points; so few are no surface that could hide others
 _LEAST_TRACK = 3  # images that observe a point: two rays meet anywhere along one of them
 _MOST_REPROJECTION_PX = 2.0  # mean error of a point; COLMAP itself keeps up to 4 pixels
 
@@ -101,7 +110,13 @@ class SparseDepth:
 
 
 def read_map_points(
-    path: Path, options: ReadOptions, size: Size | None, scale: float | None
+    path: Path,
+    options: ReadOptions,
+    size: Size | None,
+    scale: float | None,
+    *,
+    of_integers: str = "",
+    inverse: float | None = None,
 ) -> SparseDepth:
     """Returns the points of a depth map or a list that the camera sees.
 
@@ -109,21 +124,33 @@ def read_map_points(
         path: The file.
         options: Which occluded points go.
         size: (H, W) of the image; None for the map's own.
-        scale: Integers per metre. None: the file's own.
+        scale: Numbers per metre that the user states. None: the file's own.
+        of_integers: The other file of the frame whose integers that scale is of, if there is one.
+        inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
 
     Raises:
         InputError: The file cannot be read, or its numbers are no depth of this image.
     """
     # The points as they are stored, without far values.
     points, reading = read_sparse(path, size=size, scale=scale)
+    if inverse is not None:
+        stored = DepthFile(values=points.depth, reading=reading)
+        of_kind = arrays.depth_of_inverse(stored, inverse, scale)
+        # these are metres now, of which no scale is stated
+        scale, reading = None, of_kind.reading
+        points = replace(points, depth=of_kind.values).select(of_kind.values > 0)
     far, lines = far_values(points.depth)
     points = points.select(~far)
     depth, own = points.depth, points.size
+    is_map = bool((points.xy == np.floor(points.xy)).all() and in_frame(points.xy, own).all())
     size = size or own
     arrays.check_same_view(str(path), own, size)
     # What a person should know of them.
     lines = [describe_range(depth, reading), *lines]
     lines += [arrays.moved_note(own, size)] if own != size else []
+    if inverse is None and is_map:
+        blurred = interpolation_warning(as_depth_image(points))
+        lines += [] if blurred is None else [blurred]
     # Points that the camera does not see go.
     hidden, dropped = None, dict[str, int]()
     if options.foreground is not None:
@@ -141,13 +168,17 @@ def read_map_points(
     # The others must be pixels of the image, and plausible in metres.
     points = points.resized(*size)
     inside, of_pixels = check_pixels(path, points.xy, size)
-    divisor, warnings = divisor_to_metres(depth, reading, "sparse", "--depth-scale", scale)
+    divisor, warnings = divisor_to_metres(
+        depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
+    )
     points = points.select(inside)
+    if inverse is None:
+        warnings += check_rows(points)
     return SparseDepth(
         points=replace(points, depth=points.depth / np.float32(divisor)),
         reading=reading,
         record=replace(arrays.record_of(path, reading), dropped=dropped),
-        notes=(*(f"sparse: {line}" for line in lines), *of_pixels, *warnings),
+        notes=(*(named("sparse", line) for line in lines), *of_pixels, *warnings),
     )
 
 
@@ -219,7 +250,7 @@ def read_colmap_points(
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     if lost := describe_dropped(dropped):
         notes.append(f"sparse: dropped {lost}")
-    notes += [f"sparse: {line}" for line in lines]
+    notes += [named("sparse", line) for line in lines]
     if unit == MODEL_UNITS:
         notes.append("unit: depth is in model units; --unit-scale M gives metres per unit")
     return SparseDepth(
@@ -269,7 +300,12 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     seen, xy = drops.keep_seen(seen, camera, camera.size)
     # Without tracks, nothing else tells which points the camera sees.
     notes = list[str]()
-    if untracked:
+    if untracked and len(xy) < _FEW_TO_HIDE:
+        notes = [
+            f"sparse: {name} has no tracks; the {len(xy):,} points are too few to tell which are"
+            " hidden by others, so all are used"
+        ]
+    elif untracked:
         visible = drops.keep(~hidden_among(xy, seen[:, 2], camera.size), "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
         notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]

@@ -21,6 +21,7 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
+from scipy import ndimage
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points, pixels_of
@@ -35,6 +36,8 @@ CALIBRATION_RANGE = (0.01, 1000.0)
 """Bounds of the calibration factor, whatever a few points give."""
 VALID_SIGMA = 0.25
 """Depth with a larger standard deviation, as a fraction of it, is not valid."""
+BEYOND_RANGE_SIGMA = 0.5
+"""Standard deviation of depth beyond a sensor's range, as a fraction of it: it may be anywhere."""
 SENSOR_ERROR = 0.01
 """Standard deviation of the error that the points of a dense map share, as a fraction of the depth.
 
@@ -54,6 +57,14 @@ _FEWEST_POINTS, _MOST_POINTS = 20, 500  # fewer and more change nothing
 _TYPICAL_WEIGHT = 20  # validation points that the typical factor counts as
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are valid
 _BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
+_END, _SHARP, _LEAST_AT_END = 0.85, 0.5, 0.02
+"""Points end sharply if from 0.85 of the farthest on there are half as many as in the band before,
+and 2 % of all."""
+_GAP = 3.6  # median spacings to the nearest point; of random pixels 0.01 % are farther from one
+_GAP_LINES = 1.2  # spacings of scan lines
+_REACHED = 0.8  # of it, around the middle of a gap, belong to the gap
+_LEAST_GAP = 0.01  # of the image
+_AT_BORDER = 0.25  # of the points beside the gaps, that are at the end
 _SAMPLED = 4000  # pixels, for the typical distance
 
 _OF_MATCHES = (
@@ -83,9 +94,17 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
     is_map = is_dense(points) and scan_pattern(points.xy, points.size) is None
     of_points = calibration(residual, sigma, len(points)) * shape
     of_sensor = torch.tensor(SENSOR_ERROR * is_map)
-    sigma_m = of_points.hypot(of_sensor) * depth
+    beyond = beyond_range(points)
+    of_range = torch.where(beyond, BEYOND_RANGE_SIGMA, 0.0)
+    sigma_m = of_points.hypot(of_sensor).hypot(of_range) * depth
     valid = valid_depth(points, depth, sigma_m)
     notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches, *[_OF_MAP] * is_map]
+    if bool(beyond.any()):
+        notes.append(
+            f"note: the points end sharply at a depth of {float(points.depth.max()):.3g}, with none"
+            f" in {100 * float(beyond.double().mean()):.0f} % of the image, which is taken as"
+            " beyond the sensor's range: not valid"
+        )
     # What it does not cover.
     if not bool(valid.all()):
         beyond = int((~valid).sum())
@@ -190,10 +209,43 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     valid = supported & (sigma <= VALID_SIGMA * depth)
     inside = in_hull(points)
     outside = torch.nonzero(~inside).flip(1)
-    sample = torch.nonzero(inside).flip(1)
+    sample = torch.nonzero(inside & ~beyond_range(points)).flip(1)
     if len(outside) and len(sample):
         sample = sample[:: max(1, len(sample) // _SAMPLED)]
         typical = float(nearest_points(points, sample.double(), 1)[0].quantile(0.95))
         distance = nearest_points(points, outside.double(), 1)[0].flatten()
         inside[~inside] = distance <= _BEYOND_HULL * typical
     return valid & inside
+
+
+def beyond_range(points: SparsePoints) -> Tensor:
+    """Returns (H, W) true where a sensor of limited range had no return; nowhere for others.
+
+    That is in gaps among and beside the points, if the points end sharply at one depth and many
+    points beside the gaps are there.
+    """
+    nowhere = torch.zeros(points.size, dtype=torch.bool)
+    depth = points.depth.double()
+    farthest = float(depth.max())
+    # They must end sharply: a scene thins out towards the farthest point.
+    last = depth >= _END * farthest
+    before = (depth >= (2 * _END - 1) * farthest) & ~last
+    at_end = int(last.sum())
+    if at_end < max(_LEAST_AT_END * len(points), _SHARP * int(before.sum()), 10):
+        return nowhere
+    # The gaps: pixels too far from any point for their spacing.
+    spacing = float(nearest_points(points, points.xy.double(), 2)[0][:, 1].median())
+    reach_px = _GAP * spacing
+    if (pattern := scan_pattern(points.xy, points.size)) is not None:
+        reach_px = max(reach_px, _GAP_LINES * pattern[1])
+    pixels = pixels_of(points.size)
+    distance, nearest = nearest_points(points, pixels, 1)
+    core = (distance.flatten() > reach_px).reshape(points.size)
+    if float(core.double().mean()) < _LEAST_GAP:
+        return nowhere
+    beside = torch.unique(nearest.flatten()[core.flatten()])
+    if float(last[beside].double().mean()) < _AT_BORDER:
+        return nowhere
+    # Around their middle, up to near the points.
+    around = ndimage.distance_transform_edt(~core.numpy()) <= _REACHED * reach_px
+    return torch.from_numpy(around)

@@ -50,6 +50,17 @@ _FIELD = re.compile(r"^[ \t]*([A-Za-z_]\w*)(?:[ \t]*:|[ \t]+(?=[-+.\d]))", re.MU
 """A name at the beginning of a line; KITTI's tracking set has names without a colon."""
 _COMMENT = re.compile(r"#.*|^---[ \t]*$", re.MULTILINE)
 
+_KITTI_SIZES = {
+    (721.5377, 609.5593, 172.854): (375, 1242),
+    (707.0493, 604.0814, 180.5066): (370, 1224),
+    (718.3351, 600.3891, 181.5122): (374, 1238),
+    (707.0912, 601.8873, 183.1104): (370, 1226),
+    (718.856, 607.1928, 185.2157): (376, 1241),
+}
+"""(H, W) of KITTI's rectified images by fx, cx, cy, which its object, odometry and tracking files
+do not state (its raw data of five days, S_rect and P_rect)."""
+_KITTI_TOLERANCE = 2e-3  # pixels, of numbers that were rounded
+
 _LARGEST = 1e9  # largest number of a calibration, in pixels or metres; beyond it, products overflow
 
 Floats = NDArray[np.float64]
@@ -222,6 +233,7 @@ def _kitti(fields: _Fields, camera: int | None, kind: str, lidar: Extrinsics | N
     offset = np.asarray(np.linalg.solve(intrinsics, projection[:, 3]), np.float64)
     pose = check_pose(path, "rectification", turn, offset)
     size = _height_width(path, fields.numbers(f"S_rect_0{number}", count=2, optional=True))
+    size = size or _kitti_size(intrinsics)
     source = f"{kind} calibration, camera {number}"
     return Calibration(
         camera=Camera(intrinsics=intrinsics, size=size, source=source),
@@ -274,9 +286,18 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
     sides = fields.numbers("size", "resolution", count=2, optional=True)
     for side in () if sides else ("width", "height"):
         sides += fields.numbers(f"image_{side}", side, count=1, optional=True)
-    size = _height_width(path, sides)
+    size = _height_width(path, sides) or _kitti_size(matrix)
     seen = Camera(intrinsics=matrix, lens=lens, distortion=distortion, size=size, source=source)
     return Calibration(camera=seen, scanner=scanner)
+
+
+def _kitti_size(intrinsics: Floats) -> tuple[int, int] | None:
+    """(H, W) of the images of KITTI's that have these intrinsics; None for all others."""
+    own = intrinsics[[0, 0, 1], [0, 2, 2]]
+    for numbers, size in _KITTI_SIZES.items():
+        if np.abs(own - numbers).max() < _KITTI_TOLERANCE:
+            return size
+    return None
 
 
 def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +40,10 @@ SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 Points = SparsePoints[NDArray[np.float32]]
 
 _TEXT_SUFFIXES = (".csv", ".txt")
+_WIDE = 2.4  # widths over heights, of images that are cut for driving
+_MANY_CODES = 1000  # of a map; fewer tell nothing of their order
+_ROUGHER = 3.0  # times; of maps of four sets, exchanged bytes are 40 times rougher
+_NEAR_END, _LEAST_AT_END = 64_000, 0.001  # codes, and of the codes, that a sensor does not reach
 _MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
 _MANY_ROWS = 200  # of so few columns, which no depth map has
 _BELOW_ZERO = 0.1  # of the rows
@@ -50,9 +52,6 @@ _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
 _OTHER_SIZE_SCALE = 1000.0
 """Codes per metre of a map of another size than its image: of phones, ARKitScenes and ScanNet."""
-# Quotients of codes per metre in use, which a wrong one gives, within a tenth.
-_SCALE_QUOTIENTS = (1000.0, 256.0, 100.0, 10.0, 1000.0 / 256.0, 5.0, 5000.0 / 256.0, 5000.0)
-_QUOTIENT_TOLERANCE = math.log(1.1)
 
 
 def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
@@ -87,6 +86,16 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     return stored
 
 
+def holds_integers(path: Path) -> bool:
+    """Returns whether a file holds depth as integers, which need a scale.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    stored, _ = _load_list(path)
+    return stored.values.dtype.kind in "iu"
+
+
 def depth_from_stored(
     path: Path, stored: DepthFile, scale: float | None, size: tuple[int, int] | None = None
 ) -> DepthFile:
@@ -108,8 +117,11 @@ def depth_from_stored(
     lost = f", {below:,} pixels below 0 taken as unknown" if below else ""
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(source + lost))
+    _check_codes(path, values, is_stated=scale is not None)
     own = stored.reading.scale
     assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
+    if values.shape[1] > _WIDE * values.shape[0]:  # of no phone or depth camera
+        assumed = KITTI_SCALE
     divisor = scale or own or assumed
     source += f" ÷ {divisor:.12g}"
     if scale is None and own is not None:
@@ -124,6 +136,39 @@ def depth_from_stored(
     metres = values.astype(np.float64) / divisor
     reading = Reading(source + lost, divisor, assumed=scale is None and own is None)
     return DepthFile(values=known_metres(metres), reading=reading)
+
+
+def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) -> None:
+    """Raises InputError for 16-bit codes whose bytes are exchanged, or that are normalised.
+
+    Neighbours in a row are nearly alike, but not if their bytes are exchanged. Codes that reach the
+    largest one without a gap were stretched to 16 bits, and are no depth unless a scale is stated.
+    """
+    if values.dtype != np.uint16:
+        return
+    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
+    if np.count_nonzero(known) < _MANY_CODES:
+        return
+    codes = np.asarray(values[known], np.uint16)
+    if _roughness(codes) > _ROUGHER * _roughness(codes.byteswap()):
+        raise InputError(
+            f"{path}: its numbers are far smoother with their two bytes exchanged, so they were"
+            " stored in the wrong order; save array.byteswap()"
+        )
+    near_end = int(np.count_nonzero(codes > _NEAR_END))
+    at_end = int(np.count_nonzero(values == formats.SATURATED_CODE))
+    if not is_stated and at_end and near_end >= max(at_end, _LEAST_AT_END * len(codes)):
+        raise InputError(
+            f"{path}: its numbers reach {formats.SATURATED_CODE} without a gap, as those of a map"
+            " that was normalised to 16 bits; save metres × a scale, or give the scale with"
+            " --depth-scale"
+        )
+
+
+def _roughness(codes: NDArray[np.uint16]) -> float:
+    """Mean difference of neighbours in units of the standard deviation; 0 of equal codes."""
+    values = codes.astype(np.float64)
+    return float(np.abs(np.diff(values)).mean() / (values.std() + 1e-9))
 
 
 def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:
@@ -297,38 +342,6 @@ def describe_range(
     low, high = metres(float(known.min())), metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"
     return f"{count}, {extent} {unit} ({source}{hint})"
-
-
-def scale_warning(what: str, ratio: float, readings: Mapping[str, Reading | None]) -> str | None:
-    """Returns a warning if depths are a multiple of the ground truth that a wrong scale explains.
-
-    Args:
-        what: The depths, in the plural.
-        ratio: Median of depth / ground truth; NaN if nothing can be compared.
-        readings: How the depths were read, then the ground truth, by the option of the scale.
-
-    Raises:
-        InputError: There is such a multiple, and one of the scales was assumed.
-    """
-    quotients = (*_SCALE_QUOTIENTS, *(1 / factor for factor in _SCALE_QUOTIENTS))
-    near = (q for q in quotients if ratio > 0 and abs(math.log(ratio / q)) < _QUOTIENT_TOLERANCE)
-    if (factor := next(near, None)) is None:
-        return None
-    sides = zip(readings.items(), (factor, 1 / factor), strict=True)
-    integer = [(option, read, by) for (option, read), by in sides if read and read.scale]
-    unstated = [side for side in integer if "(from the file)" not in side[1].source]
-    advice = " or ".join(
-        f"{option} {(read.scale or 1) * by:.6g} (now {read.scale:g})"
-        for option, read, by in unstated or integer
-    )
-    about = f"{factor:.4g}" if factor >= 1 else f"1/{1 / factor:.4g}"
-    fact = (
-        f"{what} are {ratio:.4g} times the ground truth (median), about {about}: a scale is"
-        f" probably wrong; {f'{advice} would remove it' if advice else 'float files hold metres'}"
-    )
-    if assumed := [f"{option} {read.scale:g}" for option, read, _ in integer if read.assumed]:
-        raise InputError(f"{fact}, {' '.join(assumed)} keeps it")
-    return f"warning: {fact}"
 
 
 def metres(value: float) -> str:

@@ -54,11 +54,29 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
+def decode_text(data: bytes) -> str:
+    """Returns a text of UTF-8, of UTF-16 with its mark, or else of Windows' cp1252.
+
+    Raises:
+        UnicodeDecodeError: It is no text.
+    """
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if b"\0" in data:  # of no text
+            raise
+        return data.decode("cp1252")
+
+
 def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
     """Yields the lines of a text that hold more than a comment after #, with their numbers."""
-    for number, line in enumerate(data.decode("utf-8-sig", "replace").splitlines(), 1):
-        if text := line.partition("#")[0].strip():
-            yield number, text
+    is_wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    text = data.decode("utf-16" if is_wide else "utf-8-sig", "replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        if content := line.partition("#")[0].strip():
+            yield number, content
 
 
 def read_text(path: Path) -> str:
@@ -66,7 +84,7 @@ def read_text(path: Path) -> str:
     size = size_of_regular_file(path)
     check_claim(f"{path} has {size:,} bytes", size, _LONGEST_TEXT, way_out="give another file")
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return decode_text(read_bytes(path))
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file; give another") from error
 

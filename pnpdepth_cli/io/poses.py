@@ -22,7 +22,7 @@ from pnpdepth_cli.io import file_bytes
 
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
-_FARTHEST_M = 1e6
+_FARTHEST_M = 1e8  # of a place on the earth, such as in UTM
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _OXTS_COLUMNS = 30
 _EARTH_RADIUS_M = 6378137.0  # of WGS 84 at the equator

@@ -21,6 +21,9 @@ _VIDEO_BRANDS = (b"iso", b"mp4", b"qt ", b"M4V", b"avc", b"3gp")
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _PLAUSIBLE = (0.2, 50.0)
 """Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
+_WHITE = 65535  # of 16 bits
+_BITS = (8, 10, 12, 14)  # of sensors
+_PNG_HEAD = 512  # bytes, in which a PNG states its bits
 _FRAMES_IN_MEMORY = 8
 """Frames of a video that are kept, as threads ask for them slightly out of order."""
 _VIDEO_LOCK = threading.Lock()
@@ -67,8 +70,9 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         orientation = images.orientation_of(image)
         if wide:
             values, white = _decode_16_bit(path, data, kind)
-            if white == 255:
-                note = "16-bit numbers up to 255 are read as of 8 bits"
+            if white < _WHITE:
+                bits = int(white).bit_length()
+                note = f"16-bit numbers up to {white:.0f} are read as of {bits} bits"
             if kind == "TIFF":  # OpenCV applies the orientation of a TIFF, not that of a PNG
                 orientation = 1
         else:
@@ -113,6 +117,18 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
         return (height, width), (height, width)
 
 
+def orientation_in(path: Path) -> int:
+    """Returns the EXIF orientation 1…8 of an image's file; 1 where it has none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            orientation = images.orientation_of(image)
+    except (OSError, Image.DecompressionBombError):  # an EXR, say
+        return 1
+    return orientation if orientation in range(1, 9) else 1
+
+
 def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float32], float]:
     """(H, W, 3) in 0..1, by OpenCV as Pillow cuts colours to 8 bits; and the number of white."""
     import cv2
@@ -122,8 +138,23 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
     rgb = pixels[:, :, ::-1]
-    white = 255 if 1 < rgb.max() <= 255 else 65535  # else such images would be black
+    white = _white_of(data, kind, int(rgb.max()))
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
+
+
+def _white_of(data: bytes, kind: str, largest: int) -> float:
+    """The number of white in an image of 16 bits: of the bits that it states, else that it uses.
+
+    Cameras store 10, 12 or 14 bits in 16, and such images would be black.
+    """
+    at = data.find(b"sBIT", 0, _PNG_HEAD) if kind == "PNG" else -1
+    if at >= 0:  # the significant bits of a PNG; numbers beyond them were scaled to 16
+        bits = data[at + 4]
+        return float(2**bits - 1) if 1 < largest < 2**bits <= _WHITE else float(_WHITE)
+    for bits in _BITS:
+        if 1 < largest < 2**bits:
+            return float(2**bits - 1)
+    return float(_WHITE)
 
 
 def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:

@@ -23,8 +23,11 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of, parse_npy
 
-_FIELD_COUNTS = (3, 4, 5, 6, 7, 8)
+_FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)  # the last are of painted points
+_USUAL, _LEAST_ROWS = 8, 100  # fields a point; more need so many points to be recognised
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
+_EXACT_M, _EARTH_M = 1e4, 1e8
+"""Coordinates beyond which 32 bits are 1 mm and more apart; and beyond any place on the earth."""
 _SMALLEST = 1e-3  # numbers near 0 are alike
 _AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
 _LEAST_EXPLAINED = 0.03  # of the variance; numbers in any order have less
@@ -40,7 +43,7 @@ _LONGEST_HEADER = 1 << 16
 _MOST_COMPRESSED = 100
 """Times as many bytes as compressed ones; three bytes of LZF make at most 264."""
 
-Points = NDArray[np.float32]
+Points = NDArray[np.float32] | NDArray[np.float64]
 
 
 def read_scan(path: Path) -> tuple[Points, str]:
@@ -85,7 +88,8 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     # beams without return say nothing: more zeros in a row than a point has numbers
     zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
     masked = np.ma.array(features, mask=np.broadcast_to(zeros > max(_FIELD_COUNTS), features.shape))
-    explained = {count: _explained_variance(masked, count) for count in _FIELD_COUNTS}
+    counts = [n for n in _FIELD_COUNTS if n <= _USUAL or len(numbers) >= _LEAST_ROWS * n]
+    explained = {count: _explained_variance(masked, count) for count in counts}
     most = max(explained.values())  # which multiples of the true count reach, too
     if most < _LEAST_EXPLAINED:
         fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
@@ -234,8 +238,14 @@ def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
 
 
 def _first_columns(rows: NDArray[np.generic]) -> Points:
+    """x y z; of numbers of 64 bits beyond those of a scan, such as of UTM, in 64 bits."""
+    xyz = rows[:, :3]
+    if xyz.dtype == np.float64:
+        known = np.abs(xyz[np.isfinite(xyz)])
+        if known.size and _EXACT_M < float(np.median(known)) < _EARTH_M:
+            return np.ascontiguousarray(xyz)
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(rows[:, :3], np.float32)
+        return np.ascontiguousarray(xyz, np.float32)
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {

@@ -41,11 +41,6 @@ between scan lines, as foreground is measured only on them."""
 _STRETCH = 1.5  # multiple of half the parallax that is added to the margin
 _REACH_DEG = 0.8  # to each side, in which foreground is searched
 
-_RANKED = 7  # of so many pixels, one is sorted, which takes less time
-_JUMP = 1.3  # ratio of depths across an edge,
-_JUMP_NEIGHBOURS = 6  # looked for among so many nearest points,
-_BESIDE_PX = 3  # and compared with the image's gradient in a square of this side
-
 MIN_POINTS = 1000
 """Maps with fewer points are not filtered: each point matters."""
 
@@ -115,6 +110,7 @@ def project_velodyne(
     size: Size,
     *,
     keep_occluded: bool = False,
+    has_scanner: bool = True,
 ) -> Points:
     """Returns the scan as sparse depth in an image, in the scan's order.
 
@@ -124,6 +120,8 @@ def project_velodyne(
         scanner: The scanner's pose.
         size: (H, W) of the image.
         keep_occluded: Whether points behind the foreground stay.
+        has_scanner: Whether the points were measured from their origin. If not, only their own
+            positions tell which of them are hidden.
 
     Raises:
         NoPointsError: No point is visible in the image.
@@ -136,7 +134,10 @@ def project_velodyne(
     if not keep_occluded:
         focal_px = float(camera.intrinsics[0, 0])
         origin = np.asarray(camera.intrinsics @ scanner.translation)
-        hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
+        if has_scanner:
+            hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
+        else:
+            hidden = hidden_among(xy, seen[:, 2], size)
         visible = drops.keep(~hidden, "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
     if not len(xy):
@@ -157,38 +158,6 @@ def points_in_image(xyz: Floats, camera: Camera, size: Size) -> tuple[Floats, Fl
     xy = pixels_of(camera, xyz)
     inside = in_frame(xy, size)
     return xyz[inside], xy[inside]
-
-
-def edge_agreement(ranks: NDArray[np.float64], xy: NDArray[np.floating], jumps: Mask) -> float:
-    """Returns how much stronger the image's edges are at jumps of depth than elsewhere, −1 to 1.
-
-    That is the mean rank of the gradient beside the points at the near side of a jump, less that at
-    all points. It tells calibrations of the same scan apart.
-
-    Args:
-        ranks: (H, W) of `edge_ranks`.
-        xy: (N, 2) pixel coordinates inside the image.
-        jumps: (N,) of `near_jumps`.
-    """
-    rank = ranks.ravel()[pixel_index(xy, (ranks.shape[0], ranks.shape[1]))]
-    return float(rank[jumps].mean() - rank.mean()) if jumps.any() else 0.0
-
-
-def edge_ranks(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Returns (H, W) the rank, 0…1, of the gradient beside each pixel of rgb (H, W, 3) in 0..1."""
-    grey = cv2.GaussianBlur(rgb.mean(axis=2), (0, 0), 1.0)
-    gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
-    beside = cv2.dilate(gradient, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8))
-    some = np.sort(beside.ravel()[::_RANKED])
-    return np.searchsorted(some, beside) / some.size
-
-
-def near_jumps(points: Points) -> Mask:
-    """Returns (N,) true for points at the near side of a jump of depth; none of a few points."""
-    if len(points) <= _JUMP_NEIGHBOURS:
-        return np.zeros(len(points), bool)
-    _, near = cKDTree(points.xy).query(points.xy, k=_JUMP_NEIGHBOURS)
-    return np.asarray(points.depth[near].max(axis=1) > _JUMP * points.depth)
 
 
 def hidden_points(

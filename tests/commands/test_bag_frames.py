@@ -51,6 +51,54 @@ def points_of(frame: FrameFiles) -> Points:
     return read_scan_points(frame.sparse, ScanOptions(calib=frame.calib), (HEIGHT, WIDTH)).points
 
 
+SENSOR = "/device_0/sensor_0"
+
+
+@pytest.mark.parametrize("unit_m", [0.001, 0.00025, 0.0001])
+@pytest.mark.parametrize("kind", ["16UC1", "mono16", "16UC1; compressedDepth"])
+def test_depth_has_the_unit_that_the_bag_says(kind: str, unit_m: float, tmp_path: Path) -> None:
+    said = extracted(
+        tmp_path,
+        depth=kind,
+        depth_topic=f"{SENSOR}/Depth_0/image/data",
+        depth_frame="camera",
+        unit=(f"{SENSOR}/option/Depth_Units/value", unit_m),
+    )
+    (path,) = sorted((tmp_path / "frames" / "sparse").iterdir())[:1]
+    np.testing.assert_allclose(read_depth(path).values, depth_m(), atol=unit_m)
+    assert any("Depth_Units" in line for line in said)
+    # the user's own word goes before
+    frames = tmp_path / "stated"
+    said = written(tmp_path / "a.mcap", frames, depth_scale=2000.0)
+    (path,) = sorted((frames / "sparse").iterdir())[:1]
+    expected = np.rint(depth_m() / unit_m) / 2000
+    np.testing.assert_allclose(read_depth(path).values, expected, rtol=1e-6)
+    assert any("--depth-scale" in line for line in said)
+
+
+def test_another_sensors_unit_is_not_this_ones(tmp_path: Path) -> None:
+    other = "/device_0/sensor_1/option/Depth_Units/value"
+    extracted(tmp_path, depth="mono16", depth_topic=f"{SENSOR}/Depth_0/data", unit=(other, 0.001))
+    (path,) = sorted((tmp_path / "frames" / "sparse").iterdir())[:1]
+    np.testing.assert_allclose(read_depth(path).values, depth_m())
+
+
+@pytest.mark.parametrize("kind", ["mono16", "64FC1"])
+def test_grey_images_of_16_bits_beside_colours_are_depth(kind: str, tmp_path: Path) -> None:
+    said = extracted(tmp_path, depth=kind, depth_topic="/stereo/map")
+    (path,) = sorted((tmp_path / "frames" / "sparse").iterdir())[:1]
+    np.testing.assert_allclose(read_depth(path).values, depth_m())
+    assert any("/stereo/map" in line for line in said)
+
+
+@pytest.mark.parametrize("without", ["/depth/camera_info", "/front/camera_info"])
+def test_depth_of_another_frame_without_its_camera_is_warned_of(
+    without: str, tmp_path: Path
+) -> None:
+    said = extracted(tmp_path, depth="16UC1", depth_frame="depth", without=without)
+    assert any(line.startswith("warning") for line in said)
+
+
 FORWARD = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 """The camera in base: z is base's x."""
 

@@ -58,10 +58,14 @@ def seen(xyz: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def read(
-    sparse: Path, calib: Path | None = STREET / "calib.txt", gt: Path | None = None, **options: Any
+    sparse: Path,
+    calib: Path | None = STREET / "calib.txt",
+    gt: Path | None = None,
+    image: Path = STREET / "rgb.png",
+    **options: Any,
 ) -> Frame:
     scan = ScanOptions(calib=calib, keep_occluded=True)
-    files = FrameFiles(image=STREET / "rgb.png", sparse=sparse, gt=gt)
+    files = FrameFiles(image=image, sparse=sparse, gt=gt)
     return read_frame(files, ReadOptions(**({"scan": scan} | options)))
 
 
@@ -265,6 +269,52 @@ def test_distances_from_a_wide_camera_become_depth(tmp_path: Path) -> None:
         indoor(**asked)
     with pytest.raises(UsageError, match="no depth map or list"):
         read(STREET / "000000.bin", sparse_range=True)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.png", "list.npy"])
+@pytest.mark.parametrize(("kind", "factor"), [("inverse", 1.0), ("disparity:52.5", 52.5)])
+def test_disparity_and_inverse_depth_become_depth(
+    name: str, kind: str, factor: float, tmp_path: Path
+) -> None:
+    truth = codes_of(INDOOR / "sparse.png") / 1000
+    stored = np.divide(factor, truth, out=np.zeros(truth.shape), where=truth > 0)
+    options: dict[str, Any] = {"sparse_kind": kind}
+    row, column = np.nonzero(truth)
+    if name == "a.png":
+        cv2.imwrite(str(tmp_path / name), np.rint(400 * stored).astype(np.uint16))
+        options["depth_scale"] = 400.0
+    elif name == "a.npy":
+        np.save(tmp_path / name, stored.astype(np.float32))
+    else:
+        np.save(tmp_path / name, np.column_stack([column, row, stored[row, column]]))
+    frame = read(tmp_path / name, calib=None, image=INDOOR / "rgb.png", **options)
+    column, row = frame.points.xy.numpy().astype(int).T
+    np.testing.assert_allclose(frame.points.depth, truth[row, column], rtol=2e-2)
+    assert len(frame.points) == np.count_nonzero(truth)
+
+
+@pytest.mark.parametrize(("factor", "advice"), [(1.0, "inverse"), (386.0, "disparity:386")])
+def test_depth_of_the_opposite_order_is_refused_with_what_reads_it(
+    factor: float, advice: str, tmp_path: Path
+) -> None:
+    truth = codes_of(INDOOR / "gt.png") / 1000
+    np.save(tmp_path / "truth.npy", truth.astype(np.float32))
+    some = np.where(np.random.default_rng(0).uniform(size=truth.shape) < 0.01, truth, 0)
+    stored = np.divide(factor, some, out=np.zeros(some.shape), where=some > 0)
+    np.save(tmp_path / "a.npy", stored.astype(np.float32))
+    with pytest.raises(InputError, match=advice):
+        read(tmp_path / "a.npy", None, tmp_path / "truth.npy", image=INDOOR / "rgb.png")
+
+
+def test_what_a_kind_does_not_apply_to_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--sparse-kind"):
+        read(STREET / "000000.bin", sparse_kind="inverse")
+    for kind in ("disparity", "disparity:0", "z", "disparity:x"):
+        with pytest.raises(UsageError, match="--sparse-kind"):
+            ReadOptions(sparse_kind=kind)
+    both = {"sparse_kind": "inverse", "sparse_range": True}
+    with pytest.raises(UsageError, match="--sparse-kind"):
+        read(INDOOR / "sparse.png", image=INDOOR / "rgb.png", **both)
 
 
 def test_an_image_of_16_bits_that_holds_8_is_read_as_of_8(tmp_path: Path) -> None:

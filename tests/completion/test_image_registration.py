@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay
 from pnpdepth_cli.completion.gaussian_process import cielab
 from pnpdepth_cli.completion.image_registration import (
     ImageRegistration,
+    better_orientation,
     estimate_registration,
     evidence,
 )
@@ -169,3 +170,33 @@ def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_
     found = estimate_registration([known])
     assert found.zoom == round(mean[0], 4)
     assert (found.right, found.down) == (round(mean[1], 2), round(mean[2], 2))
+
+
+def turned(points: SparsePoints, across: bool, down: bool) -> SparsePoints:
+    """The points mirrored left to right, upside down, or both."""
+    height, width = points.size
+    x, y = points.xy.unbind(dim=1)
+    x, y = width - 1 - x if across else x, height - 1 - y if down else y
+    return replace(points, xy=torch.stack([x, y], dim=1))
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "said"),
+    [(True, False, "left to right"), (False, True, "upside down"), (True, True, "180°")],
+)
+def test_depth_that_is_mirrored_or_turned_is_told_and_moves_nothing(
+    across: bool, down: bool, said: str
+) -> None:
+    for seed in range(3):
+        rgb, points = frame(seed, None, 2000)
+        known = evidence(rgb, turned(points, across, down))
+        assert known is not None
+        assert said in str(better_orientation([known]))
+        assert estimate_registration([known]) is None
+
+
+@pytest.mark.parametrize("count", [100, 500, 2000])
+def test_no_other_orientation_is_better_than_a_right_one(count: int) -> None:
+    for seed in range(6):
+        known = evidence(*frame(seed, None, count))
+        assert known is None or better_orientation([known]) is None

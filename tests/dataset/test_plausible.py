@@ -11,10 +11,7 @@ import pytest
 from pnpdepth_cli.dataset.plausible import (
     SCANS,
     check_pixels,
-    check_same_scale,
     divisor_to_metres,
-    far_values,
-    plausible_map,
     scan_returns,
 )
 from pnpdepth_cli.errors import InputError, NoPointsError
@@ -84,54 +81,19 @@ def test_a_scan_in_millimetres_is_read_by_the_option() -> None:
     np.testing.assert_allclose(points, SCAN, rtol=1e-6)
     assert "÷ 1000" in notes[0]
     assert len(scan_returns("a.pcd", 1000 * SCAN, 1.0)[2]) == 1  # kept, with a warning
-    np.testing.assert_array_equal(scan_returns("a.pcd", SCAN, 256.0)[0], SCAN)  # of the other files
+    np.testing.assert_array_equal(scan_returns("a.pcd", SCAN, 256.0)[0], SCAN)  # of a data set
 
 
-def with_plane(far: float, mixed: int = 0) -> np.ndarray:
-    depth = MAP.copy()
-    depth[:4] = far
-    depth[4, :mixed] = 0.4 * far + 0.6 * 20  # edges that a renderer mixed
-    return depth
-
-
-@pytest.mark.parametrize(
-    ("depth", "unknown"),
-    [
-        *((with_plane(far), 200) for far in (1e10, 65504, 10000, 1000, 255)),
-        *((with_plane(far, mixed=10), 210) for far in (1e10, 65504, 10000)),
-        (np.minimum(MAP, 50), 0),  # a range that is cut where surfaces are
-        (np.where(np.arange(50) < 10, 4.0, 1.5) * np.ones((40, 1)), 0),  # a wall behind a box
-        (np.round(MAP / 10, 2), 0),  # a room in whole centimetres
-        (np.where(MAP > 59.9, 90, MAP), 0),  # few far points, all alike
-    ],
-)
-def test_a_far_plane_is_unknown_but_no_surface_is(depth: np.ndarray, unknown: int) -> None:
-    values, notes = plausible_map(depth.astype(np.float32), FLOAT, "gt", "--gt-scale", None)
-    expected = depth.astype(np.float32)
-    expected.ravel()[:unknown] = 0
-    np.testing.assert_array_equal(values, expected)
-    assert bool(notes) == bool(unknown)
-
-
-@pytest.mark.parametrize(
-    ("rest", "far", "unknown"),
-    [
-        (np.linspace(0, 20, 991)[1:], [40.1] * 10, 10),
-        (np.linspace(0, 20, 991)[1:], [39.9] * 10, 0),  # a hall
-        (np.linspace(0, 30, 991)[1:], [45.1] * 10, 10),
-        (np.linspace(0, 30, 991)[1:], [44.9] * 10, 0),  # less than 1.5 times the rest
-        (np.linspace(0, 30, 997)[1:], [45.1] * 4, 0),  # of 1,000, less than 0.5 %
-        (np.linspace(0, 20, 1000)[1:], [10_100.0], 1),
-        (np.linspace(0, 20, 1000)[1:], [9_900.0], 0),  # less than 1000 times the median
-        (np.full(50, 2.0), [1e30], 1),
-        (np.full(1, 2.0), [1e30], 0),
-    ],
-)
-def test_depths_are_unknown_from_a_limit(rest: np.ndarray, far: list[float], unknown: int) -> None:
-    depth = np.append(rest, far)
-    found, notes = far_values(depth)
-    assert np.flatnonzero(found).tolist() == list(range(len(depth) - unknown, len(depth)))
-    assert [f"{unknown} of {len(depth):,} " in note for note in notes] == [True] * bool(unknown)
+@pytest.mark.parametrize("scale", [3.28084, 10.0, 256.0])
+def test_a_stated_scale_is_obeyed_unless_it_is_of_the_other_files_integers(scale: float) -> None:
+    points, _, (note,) = scan_returns("a.pcd", SCAN, scale, of_integers="")
+    np.testing.assert_allclose(points, SCAN / scale, rtol=1e-5)
+    assert f"÷ {scale:g}" in note
+    points, _, (note,) = scan_returns("a.pcd", SCAN, scale, of_integers="gt.png")
+    np.testing.assert_array_equal(points, SCAN)
+    assert "gt.png" in note
+    points, _, _ = scan_returns("a.pcd", 1000 * SCAN, 1000.0, of_integers="gt.png")
+    np.testing.assert_allclose(points, SCAN, rtol=1e-6)  # implausible without it
 
 
 def divisor(depth: np.ndarray, reading: Reading, given: float | None = None, *more: Any) -> Any:
@@ -226,13 +188,3 @@ def test_pixels_are_in_the_image_or_said_to_be_outside(xy: np.ndarray, said: lis
     inside, notes = check_pixels(Path("a.csv"), xy, (480, 640))
     np.testing.assert_array_equal(inside, xy[:, 0] < 639.5)
     assert [text in note for text, note in zip(said, notes, strict=True)] == [True] * len(said)
-
-
-@pytest.mark.parametrize("factor", [0.3, 0.66, 0.67, 1.49, 1.51, 7])
-@pytest.mark.parametrize("known", [9, 10])
-def test_files_differ_by_a_factor_of_more_than_one_and_a_half(factor: float, known: int) -> None:
-    sparse = np.where(np.arange(2000).reshape(40, 50) < known, MAP, np.float32(0))
-    differs = known == 10 and not 1 / 1.5 <= factor <= 1.5
-    assert len(check_same_scale(sparse, np.float32(factor) * MAP, {})) == differs
-    wild = np.where(np.eye(40, 50) > 0, np.float32(1e5), MAP)  # single values
-    assert check_same_scale(MAP, wild, {}) == []

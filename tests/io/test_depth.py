@@ -21,7 +21,6 @@ from pnpdepth_cli.io.depth import (
     holds_scan,
     read_depth,
     read_sparse,
-    scale_warning,
     write_depth,
 )
 from pnpdepth_cli.io.formats import Reading
@@ -235,27 +234,7 @@ def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
 
 
 FLOAT = Reading("PFM", None, False)
-BY_256, BY_1000 = (Reading("PNG", scale, False) for scale in (256.0, 1000.0))
-
-
-@pytest.mark.parametrize(
-    ("ratio", "depth", "truth", "advice"),
-    [
-        *((r, BY_256, BY_256, "None") for r in (np.nan, 0, 1, 2, 3.906 * 1.11, 3.906 / 1.11)),
-        (4.2, BY_256, FLOAT, "--scale 1000 (now 256)"),
-        (0.256, FLOAT, BY_256, "--gt-scale 1000 (now 256)"),
-        (0.001, BY_1000, None, "--scale 1 (now 1000)"),
-        (3.9, FLOAT, FLOAT, "metres"),
-    ],
-)
-def test_a_ratio_that_a_wrong_scale_explains_names_the_scale_that_removes_it(
-    ratio: float, depth: Reading, truth: Reading | None, advice: str
-) -> None:
-    assert advice in str(scale_warning("depths", ratio, {"--scale": depth, "--gt-scale": truth}))
-    kinds = {"--scale": depth._replace(assumed=True), "--gt-scale": truth}
-    if depth.scale and advice != "None":
-        with pytest.raises(InputError):
-            scale_warning("depths", ratio, kinds)
+BY_256 = Reading("PNG", 256.0, False)
 
 
 def test_the_range_has_count_and_ends_and_says_how_to_change_an_assumed_scale() -> None:

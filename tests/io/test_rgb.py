@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.rgb import read_focal_length, read_rgb, sizes_of
+from pnpdepth_cli.io.rgb import orientation_in, read_focal_length, read_rgb, sizes_of
 
 COLOURS = np.random.default_rng(1).integers(0, 256, (7, 11, 3)).astype(np.uint8)
 COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.uint16)
@@ -109,3 +109,13 @@ def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Pat
     np.testing.assert_allclose(image.values[:, :, 0], [[0.7353569, 1], [0, 1]], atol=1e-6)
     assert "50 %" in str(image.note)
     assert sizes_of(path) == ((2, 2), (2, 2))
+
+
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+def test_the_exif_orientation_is_told(orientation: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
+    assert orientation_in(tmp_path / "a.jpg") == orientation
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.png")
+    assert orientation_in(tmp_path / "a.png") == 1

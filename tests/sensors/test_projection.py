@@ -21,11 +21,8 @@ from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.projection import (
     Points,
     as_depth_image,
-    edge_agreement,
-    edge_ranks,
     hidden_points,
     interleaved,
-    near_jumps,
     occluded_in_map,
     project_velodyne,
 )
@@ -88,19 +85,6 @@ def test_nearer_points_hide_others(origin: tuple[float, float, float], focal_px:
     hidden = hidden_points(xy, depth, (24, 32), focal_px=focal_px, scanner=scanner)
     assert hidden.tolist() == expected.tolist()
     assert 0.1 < expected.mean() < 0.9
-
-
-@pytest.mark.parametrize(("edge", "agreement"), [(50, 0.81), (20, -0.11), (None, 0.0)])
-def test_edges_agree_beside_jumps_of_depth(edge: int | None, agreement: float) -> None:
-    y, x = np.mgrid[2:60:4, 2:100:4]
-    xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
-    depth = np.where((xy[:, 0] < 50) & (edge is not None), 2, 5).astype(np.float32)
-    rgb = np.zeros((60, 100, 3), np.float32)
-    rgb[:, edge:] = 1
-    points = Points(xy=xy, depth=depth, size=(60, 100))
-    found = edge_agreement(edge_ranks(rgb), points.xy, near_jumps(points))
-    assert found == pytest.approx(agreement, abs=0.005)
-    assert not near_jumps(points.select(slice(9, 15))).any()  # too few to tell
 
 
 MAP_SIZE = (240, 640)

@@ -24,6 +24,7 @@ from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
+_SEARCHED = 3  # frames of a sequence, of which it is searched how image and points belong together
 ESTIMATED = "estimated from the images"
 """Where the motion of frames without poses is from."""
 
@@ -54,10 +55,18 @@ def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None
     between = None if whole else (0, request.every * (request.limit or 1) - 1)
-    frames = FramesRequest(bag=request.source, output=folder, between=between, overwrite=True)
+    # The points are metres in these files, so a scale that the user states is of the bag.
+    frames = FramesRequest(
+        bag=request.source,
+        output=folder,
+        between=between,
+        depth_scale=request.reading.depth_scale,
+        overwrite=True,
+    )
     if not has_frames(frames):
         say(f"bag: wrote {write_frames(frames, say):,} frames to {folder}")
-    return replace(request, source=folder)
+    refine = request.refine.with_fields(depth_scale=None)
+    return replace(request, source=folder, refine=refine)
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
@@ -94,6 +103,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     _check_names(frames, request.refine)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
+    for sequence in sequences_of(frames).values():
+        for index in sequence[_SEARCHED:]:
+            frames[index] = replace(frames[index], is_first=False)
     # The part of the frames that this run refines.
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]

@@ -40,9 +40,10 @@ _IMAGES = ("preview", "improvement")
 _NO_SETTINGS = (
     *("name", "group", "image", "sparse", "sparse_mask", "gt", "masks", "calib", "extrinsics"),
     *("pose", "neighbours", "model", "more_models", "checkpoint", "output", "overwrite"),
-    "view_3d",
+    *("view_3d", "is_first"),
 )
-"""Fields that say where something lies, whose content is compared instead, or that add a file."""
+"""Fields that say where something lies, whose content is compared instead, or that add a file or a
+line."""
 _MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
 _MAIN = tuple(measure.key for measure in MEASURES if measure.main)
 _RUN_STAGES = ("read", "refine", "write")

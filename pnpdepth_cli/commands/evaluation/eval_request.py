@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 from pnpdepth_cli import choices
+from pnpdepth_cli.dataset.frame_files import inverse_factor
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import (
     OF_SIGMA,
@@ -61,8 +62,14 @@ class EvalRequest:
     resize: bool = option(False, "Resize predictions to the size of the ground truth, bilinearly.")
     exclude_sparse: bool = option(False, "Leave out pixels with a sparse point.")
 
-    pred_scale: float | None = option(None, "Integer predictions hold metres × S.", metavar="S")
-    gt_scale: float | None = option(None, "Integer ground truth holds metres × S.", metavar="S")
+    pred_scale: float | None = option(None, "Predictions hold metres × S.", metavar="S")
+    gt_scale: float | None = option(None, "Ground truth holds metres × S.", metavar="S")
+    gt_kind: str | None = option(
+        None,
+        "What ground truth holds: inverse, 1/z; or disparity:B in pixels, with B = baseline in"
+        " metres × focal length in pixels.  [default: depth z]",
+        metavar="KIND",
+    )
     gt_range: bool = option(
         False, "Ground truth is the distance from the camera, not depth z; needs the camera."
     )
@@ -83,6 +90,7 @@ class EvalRequest:
         ):
             if value is not None and not (math.isfinite(value) and value > least):
                 raise UsageError(f"{flag} must be a finite number above {least:g}, got {value:g}")
+        inverse_factor("--gt-kind", self.gt_kind)
         near, far = self.depth_limits or (1.0, 2.0)
         if not (0 < near < far and math.isfinite(far)):
             raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")

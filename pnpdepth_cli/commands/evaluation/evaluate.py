@@ -19,11 +19,12 @@ from pnpdepth_cli.commands.pipeline import THREADS, in_order, versions
 from pnpdepth_cli.commands.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.tables import Table, count_of, some_names
+from pnpdepth_cli.dataset.agreement import Agreement, unit_warning
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_of, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, scale_warning
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, choose_measures, frame_means
@@ -285,10 +286,37 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         fact = f"{count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres"
         why = "errors against the ground truth show nothing; --scale-by median scales each image"
         yield f"warning: {fact}, so {why}"
-    ratios = _numbers(scored, "median_ratio") or [math.nan]
+    found = _agreement_of(scored)
+    in_disparity = request.scale_by == "affine-disparity"
+    if found.is_reversed and not in_disparity:
+        yield (
+            "warning: larger predictions are nearer in the ground truth (rank correlation"
+            f" {found.rank:.2f}, median of the images): disparity or 1/depth? --scale-by"
+            " affine-disparity fits disparity, --gt-kind reads it as ground truth"
+        )
+        return
+    if in_disparity and found.is_ordered:
+        yield (
+            "warning: larger predictions are farther in the ground truth (rank correlation"
+            f" {found.rank:.2f}, median of the images), as of depth; --scale-by affine fits depth"
+        )
     by_option = {option: _readings(scored, side)[0][0] for side, option in _OPTIONS.items()}
-    if warning := scale_warning("predictions", float(np.median(ratios)), by_option):
+    if warning := unit_warning("predictions", found, by_option, fitted=True):
         yield warning
+
+
+def _agreement_of(scored: Sequence[FrameRecord]) -> Agreement:
+    """How predictions and ground truth agree, over all images."""
+    ratios = _numbers(scored, "median_ratio")
+    if not ratios:
+        return Agreement(0, 0.0, math.nan, math.nan)
+    spread = float(np.median(_numbers(scored, "ratio_spread")))
+    return Agreement(
+        pairs=int(sum(_numbers(scored, "pixels"))),
+        rank=float(np.median(_numbers(scored, "rank_correlation"))),
+        ratio=float(np.median(ratios)),
+        spread=math.hypot(spread, float(np.std(np.log(ratios)))),
+    )
 
 
 def means_table(evaluation: Evaluation) -> Table:

@@ -17,10 +17,17 @@ from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.results import ResultFrame
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.dataset.arrays import apply_masks, camera_of_file, raw_depth, read_image
-from pnpdepth_cli.dataset.frame_files import FrameFiles
+from pnpdepth_cli.dataset.agreement import compare_depths
+from pnpdepth_cli.dataset.arrays import (
+    apply_masks,
+    camera_of_file,
+    depth_of_inverse,
+    raw_depth,
+    read_image,
+)
+from pnpdepth_cli.dataset.frame_files import FrameFiles, inverse_factor
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
-from pnpdepth_cli.dataset.plausible import plausible_map
+from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
@@ -53,13 +60,19 @@ _CROPS = {
 }
 
 
+_CUT, _WHOLE = (352, 1216), (375, 1242)
+"""(H, W) of KITTI's frames cut at the bottom, in the middle, and of most frames they are from."""
+
+
 def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequest) -> FrameRecord:
     """Returns the scores of a frame's files, or why it has none.
 
     Beside the measures, the scores have numbers of pixels: "pixels" are scored, "known" have ground
     truth, "predicted" have a prediction in the file as well, and "given" are scored pixels at which
     the network was given a point. "coverage" is predicted over known. "median_ratio" is that of
-    prediction over ground truth. A prediction that was scaled has "factor" and "shift".
+    prediction over ground truth, "ratio_spread" half of the range of the middle 68 % of its log.
+    "rank_correlation" is Spearman's, of the prediction as it is stored. One that was scaled has
+    "factor" and "shift".
     """
     paths = (result and result.depth, files.gt, files.sparse, files.image)
     named = zip(FILES, paths, strict=True)
@@ -95,8 +108,15 @@ def _score(
     truth = np.where(_where_scored(gt, given, rules), gt, np.float32(0))
     if not truth.any():
         raise InputError(f"{files.gt} has no known depth where protocol {request.protocol} scores")
-    values, of_prediction = _read_prediction(result.depth, truth.shape, request)
+    values, of_prediction, added = _read_prediction(result.depth, truth.shape, request)
     depth, fit = scale_prediction(values, truth, request.scale_by)
+    if fit is not None:
+        factor, shift = fit
+        fit = factor, shift + factor * added
+    if added:
+        notes.append(
+            f"{result.depth}: numbers of 0 and below are values, as --scale-by fits a shift"
+        )
     if rules.clip:
         depth = np.clip(depth, rules.min_depth, rules.max_depth).astype(np.float32)
     both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
@@ -107,6 +127,7 @@ def _score(
     if result.sigma is not None and fit is None:
         sigma = result.of_size(result.sigma, depth)
         scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
+    agreement = compare_depths(np.where(both, depth, 0), truth)
     predicted = int(((values > 0) & (truth > 0)).sum())
     scores |= {
         "pixels": int(both.sum()),
@@ -114,7 +135,9 @@ def _score(
         "predicted": predicted,
         "coverage": predicted / known,
         "given": None if given is None else int((given & both).sum()),
-        "median_ratio": float(np.median(depth[both] / truth[both])) if both.any() else None,
+        "median_ratio": agreement.ratio if both.any() else None,
+        "ratio_spread": agreement.spread if both.any() else None,
+        "rank_correlation": compare_depths(values, truth).rank,
     }
     scores["factor"], scores["shift"] = fit or (None, None)
     return scores, (of_prediction, of_gt), notes
@@ -141,8 +164,19 @@ def _read_truth(
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
     assert frame.gt is not None
     file = raw_depth(frame.gt, frame.image) or _read(frame.gt, scale, request)
+    kind = request.gt_kind or frame.kind_of_gt
+    if (factor := inverse_factor("--gt-kind", kind)) is not None:
+        file, scale = depth_of_inverse(file, factor, scale), None
     values, reading = apply_masks(file.values, frame.masks), file.reading
-    values, notes = plausible_map(values, reading, "gt", "--gt-scale", scale)
+    of_layout = request.gt_scale is None and not frame.scales_stated
+    values, notes = plausible_map(
+        values,
+        reading,
+        "gt",
+        "--gt-scale",
+        scale,
+        of_integers=OF_DATA_SET if of_layout else "",
+    )
     gt = np.ascontiguousarray(frame.part.apply(values))
     if request.gt_range:
         gt = _depth_of_distances(gt, frame, result, (values.shape[0], values.shape[1]))
@@ -176,10 +210,25 @@ def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
     return scored & ~given if given is not None and rules.exclude_sparse else scored
 
 
-def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Depth, Reading]:
-    """The prediction at the ground truth's size, and how it was read."""
+def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Depth, Reading, float]:
+    """The prediction at the ground truth's size, 0 where unknown, and how it was read.
+
+    Of a prediction that is known up to scale and shift, numbers below 0 are values. The last is
+    what was added to all numbers to make them positive, which the fit of a shift removes.
+    """
     file = _read(path, request.pred_scale, request)
-    values = file.values
+    values, added = file.values, 0.0
+    stored = load_stored(path).values
+    if request.scale_by.startswith("affine") and stored.shape == values.shape:
+        known = np.isfinite(stored)
+        least = float(stored[known].min(initial=0))
+        if least < 0:
+            added = 1 - least
+            values = np.where(known, stored + added, 0).astype(np.float32)
+    if file.reading.scale is None and request.pred_scale is not None:  # floats
+        values = values / np.float32(request.pred_scale)
+        source = f"{file.reading.source} ÷ {request.pred_scale:g}"
+        file = replace(file, reading=file.reading._replace(source=source))
     if values.shape != size and not request.resize:
         advice = "; --resize scales predictions if both show the same view"
         raise unequal_sizes(f"prediction {path}", values.shape, "the ground truth", size, advice)
@@ -188,7 +237,7 @@ def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Dept
         total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
         # a resized pixel is known where most of its interpolation weight is on known pixels
         values = np.where(weight > 0.5, total / np.maximum(weight, 0.5), np.float32(0))
-    return values, file.reading
+    return values, file.reading, added
 
 
 def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
@@ -238,8 +287,14 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
         fact = f"crop nyu is for frames of 640×480 but this one is {width}×{height}"
         raise InputError(f"{fact}; --protocol paper scores any size")
     top, bottom, left, right = _CROPS[crop]
-    rows, columns = (top * height, bottom * height), (left * width, right * width)
-    return slice(*map(int, rows)), slice(*map(int, columns))
+    # Frames that were cut to KITTI's usual part have the crop of the whole frame they are from.
+    cut_rows = cut_columns = 0
+    if size == _CUT and crop in ("garg", "eigen"):
+        height, width = _WHOLE
+        cut_rows, cut_columns = height - size[0], (width - size[1]) // 2
+    rows = [int(end * height) - cut_rows for end in (top, bottom)]
+    columns = [int(end * width) - cut_columns for end in (left, right)]
+    return slice(*np.clip(rows, 0, size[0])), slice(*np.clip(columns, 0, size[1]))
 
 
 def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fit | None]:

@@ -1,8 +1,9 @@
 """`manifest`: a CSV with a header line, of frames whose files lie anywhere.
 
-Columns: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, min_confidence,
-gt_scale, gt_size_ok, name, group, protocol; all may be left out or empty but one of image and
-sparse. Paths are relative to the manifest. Sparse depth is used where its sparse_mask is at least
+Columns: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, sparse_kind,
+min_confidence, gt_scale, gt_kind, gt_size_ok, name, group, protocol; all may be left out or empty
+but one of image and sparse. Paths are relative to the manifest. Sparse depth is used where its
+sparse_mask is at least
 min_confidence, else above 0. Where the mask is 0, the ground truth is unknown; with gt_size_ok, it
 may have another size than the image. A frame without a name is called by its image's stem; if stems
 come twice, by its path below the folder that all of the images are in. Frames of one group are of
@@ -18,14 +19,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched
+from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, inverse_factor
 from pnpdepth_cli.dataset.layouts.layout import Layout
 from pnpdepth_cli.errors import InputError, UsageError
-from pnpdepth_cli.io.file_bytes import one_line, read_bytes
+from pnpdepth_cli.io.file_bytes import decode_text, one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "sparse_mask", "gt", "calib", "mask")
-_OTHERS = ("camera", "sparse_scale", "min_confidence", "gt_scale", "gt_size_ok", "name", "group")
+_OTHERS = (
+    *("camera", "sparse_scale", "sparse_kind", "min_confidence", "gt_scale", "gt_kind"),
+    *("gt_size_ok", "name", "group"),
+)
 _COLUMNS = (*_PATHS, *_OTHERS, "protocol")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 
@@ -36,7 +40,7 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     frames: dict[int, FrameFiles] = {}
     broken = list[Unmatched]()
     for number, row in _rows(root):
-        paths = {column: root.parent / row[column] for column in _PATHS if column in row}
+        paths = {c: _path_of(root.parent, row[c]) for c in _PATHS if c in row}
         try:
             frames[number] = _frame(row, paths)
         except (ValueError, OverflowError, UsageError) as error:
@@ -57,12 +61,20 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     return [*broken, *named]
 
 
+def _path_of(folder: Path, text: str) -> Path:
+    """The file of a cell; backslashes part folders where no file has them in its name."""
+    path = folder / text
+    return path if path.exists() or "\\" not in text else folder / text.replace("\\", "/")
+
+
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """The number of each line, and its texts by column."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
+        text = decode_text(read_bytes(path))
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file; give CSV") from error
+    if "\n" not in text:  # of old spreadsheets
+        text = text.replace("\r", "\n")
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
@@ -85,6 +97,8 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
         raise ValueError("has neither image nor sparse; give one")
     if (flag := row.get("gt_size_ok", "no")).lower() not in _FLAGS:
         raise ValueError(f"gt_size_ok is {flag[:20]!r}, not true or false")
+    for column in ("sparse_kind", "gt_kind"):
+        inverse_factor(column, row.get(column))
     part = find_protocol(row["protocol"]).part if "protocol" in row else None
     return FrameFiles(
         name=PurePosixPath(row["name"]).as_posix() if "name" in row else "",
@@ -97,6 +111,9 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
         camera=int(row["camera"]) if "camera" in row else None,
         sparse_scale=_number(row, "sparse_scale"),
         gt_scale=_number(row, "gt_scale"),
+        scales_stated=True,
+        kind_of_sparse=row.get("sparse_kind"),
+        kind_of_gt=row.get("gt_kind"),
         part=part or WHOLE,
         masks=(paths["mask"],) if "mask" in row else (),
         gt_other_size=_FLAGS[flag.lower()],

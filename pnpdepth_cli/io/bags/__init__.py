@@ -36,6 +36,7 @@ CLOUDS = ("sensor_msgs/msg/PointCloud2",)
 CAMERAS = ("sensor_msgs/msg/CameraInfo",)
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage",)
 COMPRESSED = ("/compressed", "/compressedDepth")
 """Ends of the names of topics of compressed images."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -19,7 +20,16 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Extrinsics
 from pnpdepth_cli.errors import InputError
-from pnpdepth_cli.io.bags import CAMERAS, COMPRESSED, ODOMETRY, POSES, TRANSFORMS, Bag, Message
+from pnpdepth_cli.io.bags import (
+    CAMERAS,
+    COMPRESSED,
+    FLOATS,
+    ODOMETRY,
+    POSES,
+    TRANSFORMS,
+    Bag,
+    Message,
+)
 from pnpdepth_cli.io.calibration import Calibration, camera_in_yaml
 from pnpdepth_cli.io.depth import known_metres
 from pnpdepth_cli.io.file_bytes import one_line
@@ -34,7 +44,9 @@ _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f
 _MOST_WAITING = 64  # images or scans that wait for a partner; further ones push the oldest out
 
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
+_SENSOR = re.compile(r"/device_\d+/sensor_\d+")
+"""Beginning of the topics of a sensor that librealsense recorded."""
 _COMPRESSED_DEPTH, _DEPTH_HEADER, _MM_PER_M = "compressedDepth", 12, 1000.0
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
@@ -98,11 +110,42 @@ def is_depth(message: Message, topic: str) -> bool:
     return _COMPRESSED_DEPTH in str(message.format)
 
 
-def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
+def is_wide_grey(message: Message) -> bool:
+    """Returns whether an Image is grey of 16 bits, which may hold depth or, say, heat."""
+    return str(getattr(message, "encoding", "")) == "mono16"
+
+
+def depth_unit(bag: Bag, points_topic: str) -> tuple[str, float] | None:
+    """Returns the topic that states the unit of a depth sensor's codes, and the unit in metres.
+
+    librealsense records it as an option of the sensor whose stream the points are:
+    /device_0/sensor_0/option/Depth_Units/value. None without such a topic.
+
+    Raises:
+        InputError: The unit is no length.
+    """
+    sensor = _SENSOR.match(points_topic)
+    wanted = "" if sensor is None else f"{sensor[0]}/option/Depth_Units/value"
+    for topic, _, message in bag.messages([name for name in bag.topics(FLOATS) if name == wanted]):
+        unit_m = float(message.data)
+        if not (math.isfinite(unit_m) and unit_m > 0):
+            raise InputError(f"{bag.path}: {topic} is {unit_m:g} m; state the unit: --depth-scale")
+        # a float32 of 0.00025 is not quite that
+        return topic, float(f"{unit_m:.6g}")
+    return None
+
+
+def depth_image(message: Message, topic: str, scale: float | None = None) -> NDArray[np.float32]:
     """Returns the depth image (H, W) of a message in metres, 0 where unknown.
 
-    16UC1 holds millimetres, 32FC1 metres (REP 118). A compressed one is a PNG behind 12 bytes: a
-    number, and a and b of the code a / depth + b of 32FC1 (compressed_depth_image_transport).
+    16UC1 holds millimetres, 32FC1 metres (REP 118), unless a scale is stated. A compressed one is a
+    PNG behind 12 bytes: a number, and a and b of the code a / depth + b of 32FC1
+    (compressed_depth_image_transport).
+
+    Args:
+        message: An Image or a CompressedImage.
+        topic: Its topic.
+        scale: Numbers per metre. None: as ROS has them.
 
     Raises:
         InputError: It is damaged, or compressed otherwise.
@@ -111,17 +154,19 @@ def depth_image(message: Message, topic: str) -> NDArray[np.float32]:
         order = ">" if message.is_bigendian else "<"
         number = np.dtype(order + _DEPTH[str(message.encoding)])
         values = _grid(message, topic, number, int(message.step))
-        return known_metres(values if number.kind == "f" else values / _MM_PER_M)
+        of_ros = 1.0 if number.kind == "f" else _MM_PER_M
+        return known_metres(values / (scale or of_ros))
     data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or kind_of(data[_DEPTH_HEADER:]) != "PNG":
         kind = one_line(message.format)[:40]
         raise InputError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
     codes = read_png(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
-        return known_metres(codes / _MM_PER_M)
+        return known_metres(codes / (scale or _MM_PER_M))
     a, b = np.frombuffer(data, "<f4", 2, offset=4)
     with np.errstate(divide="ignore"):
-        return known_metres(np.where(codes > 0, a / (codes.astype(np.float64) - b), 0))
+        metres = a / (codes.astype(np.float64) - b) / (scale or 1.0)
+        return known_metres(np.where(codes > 0, metres, 0))
 
 
 def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:

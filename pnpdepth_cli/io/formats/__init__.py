@@ -197,6 +197,11 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
     name = member.filename.removesuffix(".npy")
+    if (other := _NO_DEPTH.search(name.lower())) is not None:
+        raise InputError(
+            f"{path} holds the array {name!r}, which is {other[0]} and no depth by its name; save"
+            " depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
+        )
     reading = Reading(f"{array.dtype} NPZ array {name}")
     return DepthFile(values=array, reading=reading, is_image=False)
 
@@ -206,6 +211,9 @@ def write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) 
     with file.open("wb") as stream:
         np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
 
+
+_NO_DEPTH = re.compile("disp|conf|mask|sigma|uncert|label|normal|flow")
+"""Words in names of arrays beside depth."""
 
 _NUMBER = rb"[-+]?\d{0,20}\.?\d{1,20}(?:[eE][-+]?\d{1,2})?"
 _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(" + _NUMBER + rb")[ \t]*\r?\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import struct
 import threading
@@ -125,6 +126,9 @@ def orientation_of(image: PIL.Image.Image) -> int:
         return 1
 
 
+_GDAL_METADATA, _GDAL_NODATA = 42112, 42113
+"""Tags of GDAL's GeoTIFF driver: XML with scale and offset of a band, and the number of no data."""
+_GDAL_ITEM = re.compile(r'<item\b[^>]*\brole="(scale|offset)"[^>]*>([^<]*)</item>')
 _COMPRESSION_LEVEL = 4  # of zlib: a third of the time of its default 6, files 4 per cent larger
 
 
@@ -157,12 +161,42 @@ def write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) ->
 def read_tiff(path: Path, data: bytes) -> DepthFile:
     """Returns the numbers of a TIFF of one channel, floats or 16-bit codes."""
     with open_image(path, data, "TIFF") as image:
+        scale, offset, nothing = _gdal_tags(path, image)
         if image.mode == "F":
-            return DepthFile(values=np.asarray(image), reading=Reading("32-bit float TIFF"))
+            values = np.asarray(image)
+            source = "32-bit float TIFF"
+            if nothing is not None:
+                values = np.where(values == np.float32(nothing), np.float32(0), values)
+            if (scale, offset) != (1.0, 0.0):
+                values = np.where(values != 0, values * np.float32(scale) + np.float32(offset), 0)
+                source += f" × {scale:g} + {offset:g} (from the file)"
+            return DepthFile(values=values.astype(np.float32), reading=Reading(source))
         if image.mode.startswith("I;16"):
             codes = np.asarray(image).astype(np.uint16)
-            return DepthFile(values=codes, reading=Reading("16-bit TIFF"))
+            if nothing is not None:
+                codes = np.where(codes == nothing, np.uint16(0), codes)
+            if offset:
+                metres = np.where(codes > 0, codes * scale + offset, 0).astype(np.float32)
+                source = f"16-bit TIFF × {scale:g} + {offset:g} (from the file)"
+                return DepthFile(values=metres, reading=Reading(source))
+            own = None if scale == 1 else float(f"{1 / scale:.9g}")
+            return DepthFile(values=codes, reading=Reading("16-bit TIFF", own))
         raise no_depth(path, f"a TIFF of mode {image.mode}, not F or I;16")
+
+
+def _gdal_tags(path: Path, image: PIL.Image.Image) -> tuple[float, float, float | None]:
+    """Scale and offset to metres, and the number without data, of GDAL's tags; 1, 0 and None."""
+    tags: Mapping[int, object] = getattr(image, "tag_v2", {})
+    found = dict(_GDAL_ITEM.findall(str(tags.get(_GDAL_METADATA, "")).lower()))
+    words = str(tags.get(_GDAL_NODATA, "")).strip("\0 \n")
+    try:
+        scale, offset = float(found.get("scale", 1)), float(found.get("offset", 0))
+        nothing = float(words) if words else None
+    except ValueError as error:
+        raise damaged(path, "TIFF", f"has tags of GDAL that are no numbers ({error})") from error
+    if not (0 < scale < math.inf and math.isfinite(offset)):
+        raise damaged(path, "TIFF", f"has a scale of {scale:g}")
+    return scale, offset, nothing
 
 
 def write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:

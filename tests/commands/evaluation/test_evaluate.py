@@ -358,3 +358,50 @@ def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
     asked = [*map(request, kinds), request("paper", exclude_sparse=True)]
     rules = [each.scoring for each in (*asked, request("paper", scale_by="median"))]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
+
+
+@pytest.mark.parametrize("least", [-3.0, -0.1])
+@pytest.mark.parametrize("scale_by", ["affine", "affine-disparity"])
+def test_predictions_up_to_scale_and_shift_may_be_below_0(
+    scale_by: str, least: float, tmp_path: Path
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 9, (30, 40)).astype(np.float32)
+    target = 1 / gt if scale_by == "affine-disparity" else gt
+    noise = np.random.default_rng(1).normal(0, 0.02 * np.ptp(target), gt.shape)
+    predicted = (target - target.min() + noise) / 2 + least
+    assert (predicted <= 0).mean() > 0.005
+    for folder, values in (("out", predicted), ("gt", gt)):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "a.npy", values.astype(np.float32))
+    result = scored(tmp_path, scale_by=scale_by)
+    assert result.counts["coverage"] == 1
+    factor, shift = (scores_of(result.frames[0])[key] for key in ("factor", "shift"))
+    # by numpy's own least squares over all pixels
+    expected = np.polyfit(predicted.ravel(), target.ravel(), 1)
+    assert (factor, shift) == pytest.approx(tuple(expected), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("stored", "scale_by", "said"),
+    [
+        ("disparity", "none", "disparity or 1/depth"),
+        ("disparity", "affine", "disparity or 1/depth"),
+        ("disparity", "affine-disparity", ""),
+        ("depth", "affine-disparity", "--scale-by affine"),
+        ("depth", "affine", ""),
+    ],
+)
+def test_predictions_of_the_opposite_order_are_warned_of(
+    stored: str, scale_by: str, said: str, tmp_path: Path
+) -> None:
+    gt = np.random.default_rng(0).uniform(1, 9, (30, 40)).astype(np.float32)
+    frame(tmp_path, 10 / gt if stored == "disparity" else gt / 2, gt)
+    found = [note for note in scored(tmp_path, scale_by=scale_by).notes if "rank" in note]
+    assert [said in note for note in found] == [True] * bool(said)
+
+
+def test_ground_truth_of_disparity_is_read_and_a_scale_of_floats_is_obeyed(tmp_path: Path) -> None:
+    gt = np.random.default_rng(0).uniform(1, 9, (30, 40)).astype(np.float32)
+    frame(tmp_path, gt * 39.3701, 386.1 / gt)
+    result = scored(tmp_path, gt_kind="disparity:386.1", pred_scale=39.3701)
+    assert result.mean["mae"] == pytest.approx(0, abs=1e-4)

@@ -41,3 +41,12 @@ def test_a_constant_prediction_too_few_pixels_and_too_small_a_frame_are_refused(
         scale_prediction(GT, np.zeros_like(GT), "median")
     with pytest.raises(InputError, match=r"640×480 but this one is 304×228"):
         crop_window("nyu", (228, 304))
+
+
+@pytest.mark.parametrize("crop", ["garg", "eigen"])
+def test_frames_that_were_cut_have_the_crop_of_the_whole_frame(crop: str) -> None:
+    whole = np.zeros((375, 1242), bool)
+    whole[crop_window(crop, whole.shape)] = True
+    cut = np.zeros((352, 1216), bool)
+    cut[crop_window(crop, cut.shape)] = True
+    np.testing.assert_array_equal(cut, whole[375 - 352 :, 13:-13])

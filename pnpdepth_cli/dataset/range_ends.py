@@ -1,0 +1,143 @@
+"""Both ends of the range of depths: what is one and the same extreme value is no surface.
+
+Unknown depth, beams without return, the sky and clips have one value for many, at the far end or at
+the near one. One rule holds for both: depths of the near end are those of the far end of 1/depth.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnpdepth_cli.io.depth import metres
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FEW = 10  # fewer numbers decide nothing
+_SAME, _LEAST_SAME = 0.005, 3  # of the numbers, and how many, that no surface shares
+_EQUAL = 1e-5  # relative difference of numbers that were computed from one
+_NOISY = 0.02  # relative difference of numbers that noise was added to
+_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the sky may exceed
+_BEYOND_MOST = 8.0  # times the 90th percentile of the rest, where all are exactly the same
+_ABOVE = 1.5  # times the largest of the rest
+_FAR_M, _NEAR_M = 40.0, 0.12  # beyond which surfaces are rare
+_SPIKE, _LEAST_SPIKE = 3.0, 10  # times as many as have any other value, and how many
+_VALUES = 20  # distinct ones; fewer are of a drawing
+_FAR = 1000.0  # times the median depth; no point of an image is farther
+
+
+class _End(NamedTuple):
+    """What lies at the end of a range; numbers are depths, or 1/depths."""
+
+    is_none: Mask  # (N,)
+    value: float  # the extreme one
+    rest: float  # 98th percentile of the others
+
+
+def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
+    """Returns which of the known depths (N,) are no depth, and lines for a person."""
+    values = np.asarray(depth, np.float64)
+    none, lines = np.zeros(len(values), bool), list[str]()
+    # One value for many, at either end.
+    far, near = far_end(values), near_end(values)
+    for found, what, most in (
+        (far, "of the sky or a far plane", f"at most {metres(far.rest)}"),
+        (near, "of no surface", f"at least {metres(near.rest)}"),
+    ):
+        if found.is_none.any():
+            none |= found.is_none
+            lines.append(
+                f"{np.count_nonzero(found.is_none):,} of {len(values):,} depths are {what}, at"
+                f" {metres(found.value)} {unit}, where 98 % of the others are {most} {unit}; taken"
+                " as unknown"
+            )
+    if none.any():
+        return none, lines
+    # Single values far beyond all others.
+    median = float(np.median(values)) if len(values) >= _FEW else math.inf
+    none = values > _FAR * median
+    if none.any():
+        return none, [
+            f"dropped {np.count_nonzero(none):,} of {len(values):,} points more than {_FAR:,.0f}"
+            f" times as far as the median of {metres(median)} {unit}; the farthest was at"
+            f" {metres(float(values.max(initial=0)))} {unit}"
+        ]
+    return none, _clip_lines(values, unit)
+
+
+def far_end(values: Floats) -> _End:
+    """Returns which of depths (N,) above 0 are of the sky or a far plane, and its depth."""
+    return _end(values, _FAR_M)
+
+
+def near_end(values: Floats) -> _End:
+    """Returns which of depths (N,) above 0 stand for an unknown one, and its value."""
+    if not len(values) or float(values.min()) > _NEAR_M or len(np.unique(values)) < _VALUES:
+        return _End(np.zeros(len(values), bool), 0.0, 0.0)
+    with np.errstate(divide="ignore"):
+        end = _end(1 / values, 1 / _NEAR_M)
+    if not end.is_none.any():
+        return end
+    return _End(end.is_none, 1 / end.value, 1 / end.rest)
+
+
+def _end(values: Floats, beyond: float) -> _End:
+    """What is at the upper end of numbers (N,).
+
+    Args:
+        values: The numbers.
+        beyond: Number beyond which one that many share is no surface's.
+    """
+    none = _End(np.zeros(len(values), bool), 0.0, 0.0)
+    if len(values) < _FEW:
+        return none
+    largest, enough = float(values.max()), max(_LEAST_SAME, _SAME * len(values))
+    alike = values >= largest * (1 - _NOISY)
+    if np.count_nonzero(alike) < enough:
+        return none
+    # The others, but for further values that many share.
+    distinct, place, counts = np.unique(
+        values.astype(np.float32), return_inverse=True, return_counts=True
+    )
+    others = values[~alike]
+    rest = others
+    if len(distinct) >= _VALUES and np.count_nonzero(counts >= enough) <= _FEW:
+        rest = values[~(alike | (counts[place] >= enough))]
+    if rest.size < len(others) / 2 or not rest.size:  # most are of few values, as of a drawing
+        rest = others
+    if not rest.size:
+        return none
+    most = float(np.quantile(rest, 0.98))
+    if largest >= _BEYOND * most:  # a renderer may mix the two at edges of the sky
+        return _End(values > math.sqrt(largest * most), largest, most)
+    same = values >= largest * (1 - _EQUAL)
+    rest = values[~same]
+    if np.count_nonzero(same) < enough or not rest.size or largest < beyond:
+        return none
+    if largest >= _ABOVE * float(rest.max()):
+        return _End(same, largest, most)
+    usual = float(np.quantile(rest, 0.9))
+    if largest >= _BEYOND_MOST * usual:
+        return _End(values > math.sqrt(largest * usual), largest, usual)
+    return none
+
+
+def _clip_lines(values: Floats, unit: str) -> list[str]:
+    """Lines on an end that may be a clip: far more depths have its value than any other."""
+    distinct, counts = np.unique(values.astype(np.float32), return_counts=True)
+    if len(distinct) < _VALUES:
+        return []
+    lines = list[str]()
+    for at, name in ((-1, "largest"), (0, "smallest")):
+        least = max(_LEAST_SPIKE, _SAME * len(values), _SPIKE * float(np.delete(counts, at).max()))
+        if counts[at] >= least:
+            lines.append(
+                f"warning: {counts[at] / len(values):.1%} of the depths have the {name} one,"
+                f" {float(distinct[at]):.6g} {unit} exactly, as of a clip, a sensor's range or a"
+                " far plane; they count as depth, unless a mask rules them out"
+            )
+    return lines

@@ -1,0 +1,91 @@
+"""Order, ratio and spread of two depths of one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.formats import Reading
+
+RNG = np.random.default_rng(0)
+DEPTH = RNG.uniform(1, 60, (40, 50)).astype(np.float32)
+NOISY = DEPTH * np.exp(RNG.normal(0, 0.05, DEPTH.shape)).astype(np.float32)
+FLOAT = Reading("PFM")
+BY_256, BY_1000 = (Reading("PNG", scale) for scale in (256.0, 1000.0))
+
+
+def test_the_ratio_and_its_spread_are_those_of_what_was_multiplied() -> None:
+    found = compare_depths(3 * NOISY, DEPTH)
+    assert found.pairs == DEPTH.size
+    assert found.ratio == pytest.approx(3, rel=0.01)
+    assert found.spread == pytest.approx(0.05, rel=0.1)
+    assert found.rank > 0.98
+    assert compare_depths(1 / NOISY, DEPTH).rank < -0.98
+    assert compare_depths(np.zeros(5), np.ones(5)).pairs == 0
+
+
+@pytest.mark.parametrize("factor", [0.0254, 0.3048, 1 / 3.906, 2.0, 3.906, 10.0, 1000.0])
+def test_a_tight_ratio_is_a_unit(factor: float) -> None:
+    assert compare_depths(factor * NOISY, DEPTH).is_unit
+
+
+@pytest.mark.parametrize(
+    ("first", "why"),
+    [
+        (NOISY, "nothing differs"),
+        (1.4 * NOISY, "noise may explain it"),
+        (386 / NOISY, "disparity"),
+        (5 * RNG.permuted(DEPTH), "another frame"),
+        (0.2 * NOISY + 8, "a scale and a shift"),
+        (np.where(np.arange(2000).reshape(40, 50) < 9, 5 * NOISY, 0), "too few"),
+    ],
+)
+def test_no_other_difference_is_a_unit(first: np.ndarray, why: str) -> None:
+    assert not compare_depths(first, DEPTH).is_unit
+
+
+@pytest.mark.parametrize(
+    ("product", "advice"), [(1.0, "inverse"), (386.1, "disparity:386"), (0.1, "disparity:0.1")]
+)
+def test_a_reversed_order_names_what_reads_it(product: float, advice: str) -> None:
+    text = check_order("a and b", product / NOISY, DEPTH)
+    assert text is not None
+    assert f"--sparse-kind {advice}" in text
+    assert check_order("a and b", NOISY, DEPTH) is None
+    assert check_order("a and b", RNG.permuted(DEPTH), DEPTH) is None
+
+
+@pytest.mark.parametrize(
+    ("factor", "depth", "truth", "advice"),
+    [
+        (3.906, BY_256, FLOAT, "--scale 1000 (now 256)"),
+        (0.256, FLOAT, BY_256, "--gt-scale 1000 (now 256)"),
+        (0.001, BY_1000, None, "--scale 1 (now 1000)"),
+        (39.37, FLOAT, FLOAT, "--scale 39.3701 (now 1)"),
+        (2.2, BY_256, FLOAT, "--scale 56"),
+    ],
+)
+def test_a_unit_names_the_scale_that_removes_it(
+    factor: float, depth: Reading, truth: Reading | None, advice: str
+) -> None:
+    found = compare_depths(factor * NOISY, DEPTH)
+    by_option = {"--scale": depth, "--gt-scale": truth}
+    assert advice in str(unit_warning("depths", found, by_option))
+    assumed = {
+        option: reading and reading._replace(assumed=True) for option, reading in by_option.items()
+    }
+    if depth.scale or (truth and truth.scale):
+        with pytest.raises(InputError, match="keeps it"):
+            unit_warning("depths", found, assumed)
+
+
+def test_no_quotient_is_advised_where_the_ratio_varies() -> None:
+    found = compare_depths(1000 * RNG.permuted(DEPTH), DEPTH)
+    text = str(unit_warning("depths", found, {"--scale": BY_256, "--gt-scale": FLOAT}))
+    assert text.startswith("warning")
+    assert "--scale" not in text
+    near = compare_depths(2 * RNG.permuted(DEPTH), DEPTH)  # as a network without a scale may be
+    assert unit_warning("predictions", near, {"--scale": FLOAT}, fitted=True) is None
+    assert unit_warning("depths", compare_depths(NOISY, DEPTH), {"--scale": FLOAT}) is None
