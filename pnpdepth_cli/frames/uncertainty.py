@@ -107,9 +107,9 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         )
     # What it does not cover.
     if not bool(valid.all()):
-        beyond = int((~valid).sum())
-        percent = round(100 * beyond / valid.numel())
-        what = f"{percent} % of the image" if percent else f"{beyond:,} of {valid.numel():,} pixels"
+        count = int((~valid).sum())
+        percent = round(100 * count / valid.numel())
+        what = f"{percent} % of the image" if percent else f"{count:,} of {valid.numel():,} pixels"
         notes.append(f"note: the depth of {what} is beyond what the points support, and not valid")
     of_depth, is_valid = (each.numpy() for each in (sigma_m, valid))
     return replace(frame, sigma=of_depth, valid=is_valid, notes=tuple(notes))
