@@ -157,19 +157,20 @@ def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path
 def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> None:
     for part in ("rgb", "sparse", "calib"):
         shutil.copytree(DRIVE / part, tmp_path / part)
+    for last in tmp_path.glob("*/drive_002.*"):
+        last.unlink()
     (tmp_path / "net").mkdir()
     frame_on_disk(tmp_path / "net")
     accumulating(tmp_path, poses=None, refine={"iterations": 0})
     notes = record_of(tmp_path, "drive_001")["notes"]
     (said,) = (note for note in notes if "estimated from the images" in note)
     assert "drive_000" in said
-    assert "drive_002" in said
     # Each frame's farthest point moves by the known 0.6 m a frame.
     output = tmp_path / "all.ply"
     _, of_cloud = write_depth_cloud(CloudRequest(depth=tmp_path / "out", output=output))
     assert any("estimated" in note for note in of_cloud)
     ends = []
-    for number in range(3):
+    for number in range(2):
         single = tmp_path / f"{number}.ply"
         depth = tmp_path / f"out/drive_{number:03}_depth.png"
         write_depth_cloud(CloudRequest(depth=depth, output=single))
