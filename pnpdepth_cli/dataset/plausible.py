@@ -54,7 +54,7 @@ _SQUARE = 0.97  # of the other side, up to which the points of a square reach
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
 _DOWN, _PART_OF_ROWS = 0.6, 0.3  # rank correlation; of the image's height, that points cover
 _MANY_BESIDE, _RUN_DOWN = 100, 0.15  # pixels beside unknown ones, and how many of them run down
-_UNIT, _WHOLE_UNIT, _NEAR_UNIT = 1.0, 0.99, 0.9  # ends and a median of maps within 0…1
+_UNIT, _WHOLE_UNIT, _NEAR_UNIT = 1.0001, 0.99, 0.9  # ends and a median of maps within 0…1
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
 
 OF_DATA_SET = "the data set"

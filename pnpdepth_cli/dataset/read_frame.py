@@ -155,9 +155,9 @@ def _read_ground_truth(
         notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
         truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
         return truth, scan.record, notes
-    # The option is the scale of the scan, if there is one, unless the map has none of its own.
+    # The option is of the scan or the floats beside it, unless the map has no scale of its own.
     file = arrays.raw_depth(source, files.image) or read_depth(source, scale=scale)
-    if options.depth_scale and files.sparse is not None and of_scan.describes(files.sparse):
+    if options.depth_scale and files.sparse is not None and _is_float(files.sparse, of_scan):
         own = arrays.raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
         file = file if own.reading.assumed else own
     if (factor := inverse_factor("gt_kind", files.kind_of_gt)) is not None:
@@ -190,9 +190,15 @@ def _scale_of(files: FrameFiles, options: ReadOptions, part: str) -> tuple[float
         return of_layout, "" if files.scales_stated else OF_DATA_SET
     if own is None or other is None or other.is_dir():
         return options.depth_scale, ""
-    if other.suffix.lower() in SCAN_ONLY_SUFFIXES or not holds_integers(other):
+    wanted = options.depth_scale if part == "sparse" else None
+    if other.suffix.lower() in SCAN_ONLY_SUFFIXES or not holds_integers(other, of_scale=wanted):
         return options.depth_scale, ""
     return options.depth_scale, str(other)
+
+
+def _is_float(sparse: Path, of_scan: ScanOptions) -> bool:
+    """Whether the sparse depth is a scan, or a map or list of floats."""
+    return not sparse.is_dir() and (of_scan.describes(sparse) or not holds_integers(sparse))
 
 
 def _gt_scale_option(files: FrameFiles) -> str:

@@ -86,14 +86,19 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     return stored
 
 
-def holds_integers(path: Path) -> bool:
+def holds_integers(path: Path, *, of_scale: float | None = None) -> bool:
     """Returns whether a file holds depth as integers, which need a scale.
+
+    Args:
+        path: The file.
+        of_scale: A scale that is stated. Integers of another one that their file states need none.
 
     Raises:
         InputError: The file cannot be read.
     """
     stored, _ = _load_list(path)
-    return stored.values.dtype.kind in "iu"
+    own = stored.reading.scale
+    return stored.values.dtype.kind in "iu" and (of_scale is None or own in (None, of_scale))
 
 
 def depth_from_stored(

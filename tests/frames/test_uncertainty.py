@@ -12,7 +12,12 @@ from scipy.interpolate import griddata
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from pnpdepth_cli.frames.frame import Refined, Validation
-from pnpdepth_cli.frames.uncertainty import calibration, valid_depth, with_uncertainty
+from pnpdepth_cli.frames.uncertainty import (
+    beyond_range,
+    calibration,
+    valid_depth,
+    with_uncertainty,
+)
 from pnpdepth_cli.points import SparsePoints
 
 
@@ -126,3 +131,27 @@ def test_depth_is_valid_near_the_hull_of_the_points_up_to_its_limits() -> None:
     supported = (depth > 0) & (depth <= np.float32(most)) & (sigma <= 0.25 * depth)
     assert 0.2 < near.mean() < 0.9
     np.testing.assert_array_equal(found, near & supported)
+
+
+def sampled(depth: np.ndarray, most: float, seed: int = 0) -> SparsePoints:
+    """400 random points of the pixels up to a depth."""
+    rows, columns = np.nonzero(depth <= most)
+    chosen = np.random.default_rng(seed).permutation(len(rows))[:400]
+    xy = np.column_stack([columns, rows])[chosen].astype(np.float32)
+    of_points = depth[rows, columns][chosen].astype(np.float32)
+    size = (depth.shape[0], depth.shape[1])
+    return SparsePoints(xy=torch.from_numpy(xy), depth=torch.from_numpy(of_points), size=size)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gaps_of_points_that_end_at_one_depth_are_beyond_the_sensors_range(seed: int) -> None:
+    y, x = np.mgrid[:120, :160]
+    room = 2.0 + 4.0 * np.hypot(x - 80, y - 60) / 100  # it is farther away from the middle
+    depth = np.where(x < 60, 8.0 - room, room)
+    found = beyond_range(sampled(depth, 4.0, seed)).numpy()
+    far = depth > 4.0
+    assert (found & far).sum() > 0.8 * far.sum()
+    assert (found & ~far).sum() < 0.2 * (~far).sum()
+    assert not beyond_range(sampled(depth, 99.0, seed)).any()  # all is within the range
+    wall = np.full(depth.shape, 4.0)
+    assert not beyond_range(sampled(wall, 99.0, seed)).any()  # the farthest is a surface
