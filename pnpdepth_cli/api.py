@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def refine(
     settings: Settings | None = None,
     *,
     unit: Unit | None = None,
+    depth: ArrayLike | Sequence[ArrayLike] = (),
     camera: ArrayLike | Camera | None = None,
     stages: bool = False,
     uncertainty: bool = False,
@@ -97,6 +99,8 @@ def refine(
         sparse: Depth map, rows of x, y and depth, or SparsePoints, as `Refiner.refine` takes them.
         settings: The method and values for its steps; what they leave open, the network decides.
         unit: Unit of the depth of an array, "m" or "mm".
+        depth: Depth map (H, W) of any other network for this image, or several in a list, as
+            `Refiner.refine` takes them; with the network `compact`, that one refines the map.
         camera: Intrinsics (3, 3) in pixels of the image, or a Camera.
         stages: Whether the depth after each step is returned too, as `Refined.stages`.
         uncertainty: Whether the standard deviation of the depth is estimated too.
@@ -108,7 +112,7 @@ def refine(
         DivergedError: The loss became non-finite; `last_good` is the Refined before that.
     """
     with Refiner(network, settings, uncertainty=uncertainty, registration=registration) as refiner:
-        return refiner.refine(image, sparse, unit=unit, camera=camera, stages=stages)
+        return refiner.refine(image, sparse, unit=unit, depth=depth, camera=camera, stages=stages)
 
 
 def score(

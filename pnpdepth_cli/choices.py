@@ -175,8 +175,8 @@ OutputKind = Literal[Space, "unknown"]
 OutputScale = Literal["metric", "scale", "affine", "unknown"]
 """Up to what a network's output is known: metres, a factor, or a factor and a shift."""
 
-InputKind = Literal["rgb", "sparse", "rgb+sparse"]
-"""What a network takes as input."""
+InputKind = Literal["rgb", "sparse", "rgb+sparse", "map"]
+"""What a network takes as input; "map" is a depth map of the frame, which it returns."""
 
 Fit = Literal["stretch", "crop"]
 """How an image is brought to a network's fixed input size."""

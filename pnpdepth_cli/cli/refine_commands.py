@@ -51,12 +51,21 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     short_help="Refine the depth of one image.",
     cls=options.GroupedCommand,
     common=(
-        *("--sparse", "--gt", "--calib", "--model", "--checkpoint", "--method", "--layer"),
+        *(
+            "--sparse",
+            "--depth",
+            "--gt",
+            "--calib",
+            "--model",
+            "--checkpoint",
+            "--method",
+            "--layer",
+        ),
         *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
     ),
     groups={
         "Input": (
-            *("--sparse", "--sparse-mask", "--min-confidence", "--gt"),
+            *("--sparse", "--sparse-mask", "--min-confidence", "--depth", "--gt"),
             *(ScanOptions, ReadOptions),
         ),
         "Network": _NETWORK,
@@ -78,6 +87,14 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
     help="Confidence of the sparse depth, or a mask: image or array of its size or the image's.",
 )
 @_min_confidence
+@click.option(
+    "--depth",
+    "depths",
+    type=options.FILE,
+    multiple=True,
+    help="Depth map that a network predicted (NPY, NPZ, EXR, 16-bit PNG, …; FILE.npz:KEY): depth or"
+    " disparity in any unit, which takes the place of a network's output. Several are fused.",
+)
 @click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
 @click.option(
     "-o",
@@ -93,6 +110,7 @@ def refine(as_json: bool, **values: Any) -> None:
     \b
     pnpdepth refine img.png --sparse s.png
     pnpdepth refine img.png --sparse s.exr --gt gt.png -o out/
+    pnpdepth refine img.png --sparse s.csv --depth predicted.npy
     pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
     pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
 

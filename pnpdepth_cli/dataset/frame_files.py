@@ -90,6 +90,8 @@ class FrameFiles:
     sparse_mask: Path | None = None
     """An image or array, how sure each pixel of `sparse` or of the image is; 0 is no depth."""
     min_confidence: float | None = None  # least value of `sparse_mask` whose depth is used
+    depths: tuple[Path, ...] = ()
+    """Depth maps that networks predicted for the image; FILE:KEY names a part of one."""
     gt: Path | None = None
     calib: Path | None = None  # the calibration, as `read_calibration` takes it
     camera: int | None = None  # which camera of the calibration
@@ -115,7 +117,8 @@ class FrameFiles:
     belong together."""
 
     def __post_init__(self) -> None:
-        for source in (self.image, self.sparse, self.sparse_mask, self.gt, self.calib, *self.masks):
+        sources = (self.image, self.sparse, self.sparse_mask, self.gt, self.calib)
+        for source in (*sources, *self.depths, *self.masks):
             if source is not None:
                 check_path(file_of(source))
 

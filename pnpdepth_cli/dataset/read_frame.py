@@ -22,6 +22,7 @@ from pnpdepth_cli.dataset.frame_files import (
 )
 from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
+from pnpdepth_cli.dataset.predicted_depth import read_predicted_depth
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
@@ -88,9 +89,18 @@ def read_frame(
     one_view = contradicted or stated
     if rgb is not None and not one_view and files.is_first:
         compared += _orientation_warning(files, files.part.apply(rgb), given)
+    # Depth maps of networks, in pixels of the whole image.
+    predicted = list[NDArray[np.float32]]()
+    for number, path in enumerate(files.depths, 1):
+        whole_size = size if rgb is None else (rgb.shape[0], rgb.shape[1])
+        read = read_predicted_depth(path, whole_size, rgb)
+        predicted.append(np.ascontiguousarray(files.part.apply(read.values)))
+        name = "depth" if len(files.depths) == 1 else f"depth {number}"
+        found[name] = read.source, [*read.notes]
     # What a record and a person should know.
     found["sparse"] = sparse.record, [*sparse.notes]
-    sources = {name: found[name] for name in ("image", "sparse", "gt") if name in found}
+    in_order = ["image", "sparse", *(name for name in found if name.startswith("depth")), "gt"]
+    sources = {name: found[name] for name in in_order if name in found}
     notes = [note for _, lines in sources.values() for note in lines]
     notes += (*compared, *of_camera, *lost)
     if files.masks and truth is None:
@@ -106,6 +116,7 @@ def read_frame(
         register=None if one_view else registration_to_make(options.registration, Settings()),
         one_view=one_view,
         gt=None if gt is None else np.ascontiguousarray(gt),
+        predicted=tuple(torch.from_numpy(values) for values in predicted),
         depth_scale=sparse.reading.scale,
         sources={name: record for name, (record, _) in sources.items()},
         neighbours=tuple(neighbours),

@@ -37,6 +37,10 @@ constant depth, up to which a network is strong. Networks of 2 to 9 % error have
 median, FastDepth 0.95, random weights 1.1."""
 WEAK = 0.8
 """The same quotient, from which on a network is not strong at all."""
+LEAST_UNEXPLAINED = 0.02
+"""Least such quotient. Several networks share the prior weights by its inverse square."""
+FITTED = 2
+"""Parameters of an alignment, which explain so many points by themselves."""
 WITH_PRIOR = 0.45
 """Prior weight of `compact` with that network's depth as a prior. Without one it has the rest."""
 WITHOUT_IMAGE = 0.05
@@ -83,8 +87,13 @@ class NetworkExpert(Expert):
     kept: Prediction  # from the others; the same as `whole` without validation
     frame: Frame | None = None  # what it is shown mirrored, too. None: it sees one frame
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
-    strength: float = 0.0  # 0…1, of a network that takes the image alone: see `strength`
+    unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
     not_updated: float = 0.0  # 0…1, the part that the aligned depth has beside the updated one
+
+    @property
+    def strength(self) -> float:
+        """0…1, how strong the network is."""
+        return strength_of(self.unexplained)
 
     @functools.cached_property
     def dense(self) -> Tensor:
@@ -144,7 +153,7 @@ def expert_of(
     prior: NetworkExpert | None = None,
     user: OpenNetwork | None = None,
     updates: bool = True,
-    strength: float = 0.0,
+    unexplained: float = 1.0,
 ) -> NetworkExpert:
     """Returns the predictions of one network, without a prior weight yet.
 
@@ -156,7 +165,7 @@ def expert_of(
         prior: Expert whose depth the network is given.
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z may be updated.
-        strength: 0…1, how strong the network is.
+        unexplained: What the network leaves unexplained, see `unexplained_by`.
     """
     whole = split.whole
     kept = split.kept
@@ -167,7 +176,7 @@ def expert_of(
     # The network predicts from all points, and the validation points from the others.
     of_whole = known or network.refine(whole, updates=updates)
     of_kept = of_whole
-    not_updated = 0.0 if network.always_updated else strength
+    not_updated = 0.0 if network.always_updated else strength_of(unexplained)
     at = updated = split.points.depth
     if len(split.points):
         again = network.always_updated or not network.takes_points
@@ -185,7 +194,7 @@ def expert_of(
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
-        strength=strength,
+        unexplained=unexplained,
         not_updated=not_updated,
     )
 
@@ -199,22 +208,27 @@ def expert_of_user(network: OpenNetwork, split: ValidatedFrame, judged: Judged) 
         judged: How its outliers were told.
     """
     whole = judged.by(network)
-    strong = 0.0
+    unexplained = 1.0
     if not network.takes_points:
         whole = whole or network.refine(split.whole, updates=network.always_updated)
-        strong = strength(whole.aligned, split, judged)
-        if strong < 1 and not whole.updates:
+        unexplained = unexplained_by(whole.aligned, split, judged)
+        is_strong = strength_of(unexplained) == 1
+        if not is_strong and not whole.updates and network.is_updated(split.whole):
             whole = network.refine(split.whole)
-    return expert_of(network, split, network.name, known=whole, user=network, strength=strong)
+    return expert_of(
+        network, split, network.name, known=whole, user=network, unexplained=unexplained
+    )
 
 
-def strength(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
-    """Returns 0…1, how strong a network is that takes the image alone, by all points.
+def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
+    """Returns what a network that takes the image alone leaves unexplained, by all points.
 
-    A network is strong if its aligned depth, its residual propagated, predicts each point from the
-    others far better than a constant depth does, whose residual follows position and colour alone.
-    On scan lines, where each point has a neighbour on its line, that says nothing, and no network
-    is strong.
+    It is the error with which its aligned depth, the residual propagated, predicts each point from
+    the others, over that of a constant depth, whose residual follows position and colour alone. It
+    is 1 on scan lines, where each point has a neighbour on its line, so that it says nothing.
+
+    The alignment was fitted to all points. So the error of N points is multiplied by
+    (N − 1) / (N − 1 − FITTED), as in the unbiased estimate of a variance.
 
     Args:
         aligned: (H, W) metres, 0 = unknown, the network's depth.
@@ -224,13 +238,18 @@ def strength(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
     points = split.whole.points
     known = int((points.sample(aligned) > 0).sum())
     if split.has_scan_lines or known < MIN_POINTS or judged.constant is None:
-        return 0.0
+        return 1.0
     field = judged.field
     if field is None or not field.is_of(aligned, points):
         field = ResidualField(aligned, points, split.whole.rgb)
     own = field.at_inliers.leave_one_out_error
     without = judged.constant.at_inliers.leave_one_out_error
-    return min(1.0, max(0.0, (WEAK - own / max(without, 1e-9)) / (WEAK - STRONG)))
+    return own / max(without, 1e-9) * (known - 1) / (known - 1 - FITTED)
+
+
+def strength_of(unexplained: float) -> float:
+    """Returns 0…1, how strong a network is that leaves so much unexplained."""
+    return min(1.0, max(0.0, (WEAK - unexplained) / (WEAK - STRONG)))
 
 
 def _less_updated(prediction: Prediction, not_updated: float) -> Tensor:
@@ -288,8 +307,9 @@ def fused_experts(
     alone = expert_of(fusing, split, fusing.name, known=judged.by(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
     with_prior = list[NetworkExpert]()
+    merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in own]
     for number, (user, expert) in enumerate(zip(users, own, strict=True)):
-        share = trust(user, expert, split, alone) / len(own)
+        share = trust(user, expert, split, alone) * merits[number] / sum(merits)
         weight = (OWN + (OWN_STRONG - OWN) * expert.strength) * share
         own[number] = replace(expert, weight=0.0 if expert.of_scanner else weight)
         if share > 0:

@@ -46,6 +46,8 @@ class Frame:
     """Whether image and points are stated to be of one view, so that this is not checked."""
     outliers: SparsePoints | None = None
     """Outliers, which are not in `points`; for networks that weigh their points."""
+    predicted: tuple[Tensor, ...] = ()
+    """Depth maps of networks, (H, W) float32 each, in the networks' own numbers; NaN = unknown."""
     prior: Tensor | None = None
     """(H, W) metres, 0 = unknown: another network's depth, aligned with the points, for networks
     that take one. None without."""
@@ -98,7 +100,14 @@ class Frame:
         how = self._registration_of_points if how == "auto" else how
         if how is None:
             return replace(self, register=None)
-        return replace(self, rgb=tensor_of(how.apply_to(image)), register=None, registration=how)
+        predicted = [torch.from_numpy(how.apply_to(each.numpy())) for each in self.predicted]
+        return replace(
+            self,
+            rgb=tensor_of(how.apply_to(image)),
+            predicted=tuple(predicted),
+            register=None,
+            registration=how,
+        )
 
     def mirrored(self) -> Frame:
         """Returns the frame with left and right of image, points and prior exchanged."""

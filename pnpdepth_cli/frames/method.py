@@ -20,6 +20,7 @@ from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.models.stored_map import stored_map
 from pnpdepth_cli.settings import PAPER, Settings
 
 COMPANION = "compact"
@@ -27,12 +28,21 @@ COMPANION = "compact"
 _TRIED = 3  # after so many frames that tell nothing of the registration, no more are read
 
 
-def check_combination(asked: Settings, networks: int) -> None:
-    """Checks that the paper's method, which refines one network, comes with one.
+def check_combination(asked: Settings, networks: int, maps: int = 0) -> None:
+    """Checks that settings of z come with a network, and the paper's method with one.
+
+    Args:
+        asked: Settings that the user gives.
+        networks: How many networks there are.
+        maps: How many depth maps there are besides.
 
     Raises:
-        UsageError: It comes with several.
+        UsageError: They do not.
     """
+    if asked.is_paper and maps:
+        raise UsageError("method 'paper' updates z of a network, and a depth map has none")
+    if asked.layer is not None and maps:
+        raise UsageError("a depth map has no layer to cut at; leave out `layer`, or the depth map")
     if asked.is_paper and networks > 1:
         raise UsageError(
             f"method 'paper' refines one network, not {networks}; 'fused' and 'alone' fuse several"
@@ -56,6 +66,17 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
         propagation=asked.propagate or PAPER.propagate,
         unused=unused,
     )
+
+
+def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
+    """The networks, joined by as many depth maps.
+
+    The included network refines a map; any other one is refined first, and a map is one more.
+    """
+    maps = [stored_map(number, count) for number in range(count)]
+    if count and networks[0].definition.takes_prior:
+        return [*maps, *networks]
+    return [*networks, *maps]
 
 
 class Method:
@@ -93,7 +114,9 @@ class Method:
         self.registrations: dict[tuple[int, int], Register] = {}
         """How images of a size are moved to their points, where several frames decided it."""
         self._stack = ExitStack()
-        check_combination(asked, len(networks))
+        self._maps = len(first.predicted)
+        check_combination(asked, len(networks), self._maps)
+        networks = _with_maps(networks, self._maps)
         # What the definitions leave open is decided.
         first = first.registered()
         resolved = [
@@ -101,6 +124,8 @@ class Method:
             for network in networks
         ]
         # The included network joins, unless it is there.
+        if self._maps and (asked.method == "alone" or first.rgb is None):
+            resolved = [each for each in resolved if not each.definition.takes_prior]
         named = {network.definition.name for network in resolved}
         if asked.method == "fused" and first.rgb is not None and COMPANION not in named:
             companion = load_network(COMPANION, None, str(resolved[0].device))
@@ -135,6 +160,10 @@ class Method:
         Raises:
             PnpDepthError: The frame cannot be refined.
         """
+        if len(frame.predicted) != self._maps:
+            raise UsageError(
+                f"a frame has {len(frame.predicted)} depth maps, but the first one has {self._maps}"
+            )
         seed = self.asked.seed
         torch.manual_seed(seed)
         if frame.register == "auto" and frame.size in self.registrations:

@@ -83,7 +83,7 @@ class OpenNetwork:
         self.takes_prior = definition.takes_prior
         self.always_updated = always_updated
         self._coarse = definition.coarse if coarse else None
-        self._of_image_only = definition.input_kind == "rgb"
+        self._of_image_only = definition.input_kind in ("rgb", "map")
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
@@ -217,6 +217,8 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
 
     def arguments_for(points: SparsePoints) -> tuple[Tensor, ...]:
+        if network.definition.input_kind == "map":
+            return (frame.predicted[network.definition.map_number][None, None],)
         return network.arguments_of(image, points, prior, intrinsics)
 
     points = given = to_network.points_to_network(frame.points)

@@ -9,8 +9,9 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
@@ -117,6 +118,7 @@ class Refiner:
         sparse: ArrayLike | SparsePoints,
         *,
         unit: Unit | None = None,
+        depth: ArrayLike | Sequence[ArrayLike] = (),
         camera: ArrayLike | Camera | None = None,
         stages: bool = False,
     ) -> Refined:
@@ -129,6 +131,9 @@ class Refiner:
                 (pixel centres at whole numbers), or SparsePoints.
             unit: Unit of the depth of an array, "m" or "mm"; needed for integers, and where half of
                 the depths are beyond 200.
+            depth: Depth map (H, W) that any network gave for the image, or several in a list: the
+                map takes the place of a network's output. It may hold depth, disparity or their
+                logarithm, up to scale and shift; not finite is unknown.
             camera: Intrinsics (3, 3) in pixels of the image, or a Camera; needed by a network that
                 takes them.
             stages: Whether the depth after each step is returned too, as `Refined.stages`.
@@ -139,7 +144,7 @@ class Refiner:
                 before that, whose `diverged` is this error's message.
             UsageError: The refiner is closed.
         """
-        frame = frame_of_arrays(image, sparse, self._register, unit, camera)
+        frame = frame_of_arrays(image, sparse, self._register, unit, camera, depth)
         with self._lock:
             method = self._method_for(frame)
             refined = method.refine(frame, with_stages=stages)
@@ -265,6 +270,7 @@ def frame_of_arrays(
     register: Register = None,
     unit: Unit | None = None,
     camera: ArrayLike | Camera | None = None,
+    depth: ArrayLike | Sequence[ArrayLike] = (),
 ) -> Frame:
     """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
 
@@ -283,10 +289,24 @@ def frame_of_arrays(
         rgb=None if rgb is None else tensor_of(rgb),
         points=inside,
         camera=None if camera is None else _camera(camera, inside.size),
+        predicted=tuple(_maps(depth, inside.size)),
         register=register,
         one_view=register is None,
         notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
     )
+
+
+def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iterator[Tensor]:
+    """The depth maps (H, W), NaN = unknown. Raises InputError if one has another size."""
+    several = isinstance(depth, list | tuple) and not (depth and np.ndim(depth[0]) < 2)
+    for given in depth if several else [depth]:
+        values = _numbers(given, "the depth map").astype(np.float32)
+        if values.shape != size:
+            raise InputError(f"the depth map is {values.shape}, but the image is {size}")
+        known = np.isfinite(values)
+        if not known.any():
+            raise InputError("the depth map has no finite value")
+        yield torch.from_numpy(np.where(known, values, np.float32(np.nan)))
 
 
 def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:

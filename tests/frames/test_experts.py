@@ -14,8 +14,9 @@ from pnpdepth_cli.frames.experts import (
     Experts,
     Judged,
     NetworkExpert,
-    strength,
+    strength_of,
     trust,
+    unexplained_by,
     weighted_mean,
     with_mirrored,
 )
@@ -128,14 +129,14 @@ def test_a_network_is_strong_as_far_as_its_depth_predicts_points_from_each_other
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(SIZE, generator=generator)
     found = [
-        strength(depth_of_scene() * (error * noise).exp(), split, judged)
+        unexplained_by(depth_of_scene() * (error * noise).exp(), split, judged)
         for error in (0.0, 0.002, 0.5)
     ]
-    assert found[0] == 1
-    assert found[0] >= found[1] > found[2] == 0
+    assert found == sorted(found)
+    assert [strength_of(found[0]), strength_of(found[-1])] == [1, 0]
     few = replace(split, whole=replace(frame, points=frame.points.select(slice(MIN_POINTS - 1))))
     lines = replace(split, has_scan_lines=True)
-    assert [strength(depth_of_scene(), each, judged) for each in (few, lines)] == [0, 0]
+    assert [unexplained_by(depth_of_scene(), each, judged) for each in (few, lines)] == [1, 1]
 
 
 @pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])
@@ -153,3 +154,15 @@ def test_z_of_a_strong_network_is_updated_only_if_the_user_says_so(
         result = refine_frame(networks, frame, Pipeline())
     assert len(result.losses) - 1 == updates
     assert result.weights["exact"] > 0.3
+
+
+def test_of_two_networks_the_one_that_explains_more_has_more_of_the_prior_weight() -> None:
+    class Exact(Brightness):
+        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+            return self.layer(depth_of_scene()[None, None] + 0 * rgb[:, :1])
+
+    settings = ClosedSettings(iterations=0, align="scale")
+    members = [member(Exact, settings=settings), member(Brightness, settings=settings)]
+    with opened(*members, compact()) as networks:
+        weights = refine_frame(networks, frame_in_memory(60), Pipeline()).weights
+    assert weights["exact"] > 3 * weights["brightness"]

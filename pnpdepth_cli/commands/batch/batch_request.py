@@ -72,6 +72,12 @@ class BatchRequest:
     output: Path
     refine: RefineRequest
     """How a frame is refined; its files, output and protocol are set for each frame."""
+    depth: Path | None = option(
+        None,
+        "Folder of depth maps that a network predicted, named as the frames or their images; they"
+        " take the place of its output.",
+        metavar="FOLDER",
+    )
     layout: str | None = option(
         None, "Layout of the folder.  [default: recognised]", choices=LAYOUTS
     )

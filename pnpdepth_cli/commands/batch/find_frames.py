@@ -19,8 +19,10 @@ from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
+from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
@@ -101,6 +103,8 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if request.refine.files.min_confidence is not None and not masked:
         raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")
     _check_names(frames, request.refine)
+    if request.depth is not None:
+        frames = _with_depths(request.depth, frames)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
     for sequence in sequences_of(frames).values():
@@ -119,6 +123,27 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         unmatched=[f"{path} {why}" for path, why in lost if not _is_inside(path, output)],
         poses=poses,
     )
+
+
+def _with_depths(folder: Path, frames: Sequence[FrameFiles]) -> list[FrameFiles]:
+    """The frames with their depth maps of a folder, by the name of the frame or of its image.
+
+    Raises:
+        InputError: A frame has none.
+    """
+    maps, _ = frame_files.find_files(folder, (*DEPTH_SUFFIXES, *frame_files.IMAGE_SUFFIXES, ".bin"))
+    found = list[FrameFiles]()
+    for frame in frames:
+        image = frame.image_file
+        names = [frame.name] if image is None else [frame.name, image.stem]
+        path = next((maps[name] for name in names if name in maps), None)
+        if path is None:
+            raise InputError(
+                f"--depth {folder} has no depth map named {' or '.join(dict.fromkeys(names))};"
+                " name each as its frame or its image"
+            )
+        found.append(replace(frame, depths=(path,)))
+    return found
 
 
 def _with_poses(
@@ -215,6 +240,8 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     """Yields the files that are read for a frame, with their part."""
     files, scan = request.files, request.reading.scan
     sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
+    for number, path in enumerate(files.depths, 1):
+        sources[f"depth {number}"] = file_and_part(path)[0]
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.

@@ -55,7 +55,7 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     """
     # Where results go without -o.
     files = request.files
-    sources = [files.image, files.sparse, files.gt, request.reading.scan.calib]
+    sources = [files.image, files.sparse, *files.depths, files.gt, request.reading.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
     output = request.output or Path(f"{inputs[0].stem}_refined")
     suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)

@@ -154,6 +154,7 @@ def _record_of(
     """The record of a refined frame, without its outputs and times."""
     # What the frame is called, and what the networks say.
     network, files = method.own.network, request.files
+    is_map = network.definition.input_kind == "map"
     weights = network.checkpoint
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
@@ -172,7 +173,7 @@ def _record_of(
         camera=frame_record.CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
         model=frame_record.ModelRecord(
             name=network.definition.name,
-            spec=request.model,
+            spec=str(files.depths[0]) if is_map else request.model,
             checkpoint=str(weights) if weights else None,
             checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
         ),

@@ -1,6 +1,6 @@
 """`manifest`: a CSV with a header line, of frames whose files lie anywhere.
 
-Columns: image, sparse, sparse_mask, gt, calib, mask, camera, sparse_scale, sparse_kind,
+Columns: image, sparse, sparse_mask, depth, gt, calib, mask, camera, sparse_scale, sparse_kind,
 min_confidence, gt_scale, gt_kind, gt_size_ok, name, group, protocol; all may be left out or empty
 but one of image and sparse. Paths are relative to the manifest. Sparse depth is used where its
 sparse_mask is at least
@@ -25,7 +25,7 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.file_bytes import decode_text, one_line, read_bytes
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
-_PATHS = ("image", "sparse", "sparse_mask", "gt", "calib", "mask")
+_PATHS = ("image", "sparse", "sparse_mask", "depth", "gt", "calib", "mask")
 _OTHERS = (
     *("camera", "sparse_scale", "sparse_kind", "min_confidence", "gt_scale", "gt_kind"),
     *("gt_size_ok", "name", "group"),
@@ -106,6 +106,7 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
         sparse=paths.get("sparse"),
         sparse_mask=paths.get("sparse_mask"),
         min_confidence=_number(row, "min_confidence"),
+        depths=(paths["depth"],) if "depth" in paths else (),
         gt=paths.get("gt"),
         calib=paths.get("calib"),
         camera=int(row["camera"]) if "camera" in row else None,
