@@ -23,6 +23,7 @@ from torch.autograd.graph import Node
 from pnpdepth_cli.core.influence import Field, influential_fields
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError, out_of_memory_is_a_device_error, wrap_user_errors
+from pnpdepth_cli.models.decisions import recalled_layers
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.shapes import by_shapes
 from pnpdepth_cli.spent import spent_on
@@ -67,7 +68,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
 
     question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
     with spent_on("layer"):
-        return network.recalled_layers(question, decide)[0]
+        return recalled_layers(network, question, decide)[0]
 
 
 def _first_usable(layers: Sequence[str], module: nn.Module, arguments: _Arguments) -> str | None:

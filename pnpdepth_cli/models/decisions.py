@@ -28,6 +28,8 @@ from pnpdepth_cli.models.shapes import is_of_transformers
 if TYPE_CHECKING:
     from torch import nn
 
+    from pnpdepth_cli.models.network import Network
+
 FOLDER = "PNPDEPTH_CACHE"
 """Environment variable that names another cache folder."""
 
@@ -72,6 +74,18 @@ def recalled(
     answer = decide()
     _write(path, {question: answer} | {q: a for q, a in _read(path).items() if q != question})
     return answer
+
+
+def recalled_layers(network: Network, question: str, decide: Callable[[], list[str]]) -> list[str]:
+    """Returns layers of a network that were decided before, else what is decided now."""
+    names = {name for name, _ in network.module.named_modules()}
+    return recalled(
+        network.module,
+        network.definition.checkpoint if network.definition.complete else None,
+        question,
+        decide,
+        lambda layers: bool(layers) and names.issuperset(layers),
+    )
 
 
 def kept() -> list[Path]:

@@ -140,8 +140,9 @@ class ModelDefinition:
     name: str
     """What the network is called in messages and records."""
     input_kind: InputKind
-    """What its forward takes: "rgb", "sparse" (depth with 0 = unknown), or both, "rgb+sparse"; "map"
-    is for depth maps on disk (`models.stored_map`)."""
+    """What its forward takes: "rgb", "sparse" (depth with 0 = unknown), or both, "rgb+sparse".
+
+    "map" is for depth maps on disk (`models.stored_map`)."""
     map_number: int = 0
     """Number of the frame's depth map, from 0, where `input_kind` is "map"."""
     size: Fixed | Multiple | Near

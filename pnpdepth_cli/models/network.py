@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.models.cut_layers import suggest_layers
-from pnpdepth_cli.models.decisions import recalled
+from pnpdepth_cli.models.decisions import recalled_layers
 from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
@@ -141,17 +140,6 @@ class Network:
             self.image_of(frame, synthetic if rgb is None else rgb),
             frame.points_to_network(points),
             intrinsics=frame.intrinsics_to_network(camera),
-        )
-
-    def recalled_layers(self, question: str, decide: Callable[[], list[str]]) -> list[str]:
-        """Returns layers that were decided before, else what is decided now; see `recalled`."""
-        names = {name for name, _ in self.module.named_modules()}
-        return recalled(
-            self.module,
-            self.definition.checkpoint if self.definition.complete else None,
-            question,
-            decide,
-            lambda layers: bool(layers) and names.issuperset(layers),
         )
 
     def verify(self, arguments: tuple[Tensor, ...]) -> tuple[str, ...]:
@@ -439,7 +427,7 @@ def _with_suggested_layers(network: Network) -> Network:
             return [*suggest_layers(network.module, arguments, network.map_of)]
 
     question = f"layers, of {frame.network}"
-    layers = tuple(network.recalled_layers(question, suggest))
+    layers = tuple(recalled_layers(network, question, suggest))
     if not layers:
         return network
     note = (

@@ -116,7 +116,7 @@ def test_a_mean_over_fewer_frames_says_so_and_is_not_compared() -> None:
     (table,) = tables.means_tables({"ground_truth": stages}, "m", titles, ("mae",))
     assert texts(table) == [
         ["net, aligned with the points (over 2 frames)", "2.0000 m", "–"],
-        ["fused (net 100%)", "1.0000 m", "-75.0%"],
+        ["net, residual propagated", "1.0000 m", "-75.0%"],
         ["linear interpolation of all points", "4.0000 m", ""],
     ]
 

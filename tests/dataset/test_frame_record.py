@@ -55,7 +55,7 @@ RECORD = FrameRecord(
     camera=CameraRecord.of(CAMERA, POSE),
     model=ModelRecord(name="net", spec="net.py", checkpoint=None, checkpoint_sha256=None),
     method=method_record("net", name="paper", propagation="none"),
-    settings={"layer": "middle", "iterations": 5, "lr": 0.01, "method": "fused"},
+    settings={"layer": "middle", "iterations": 5, "align": "affine", "propagate": "none"},
     alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
     loss=[1.0, None],
     errors={"used": {"before": {"mae": 1.0, "points": 9}, "after": {"mae": None, "points": 9}}},

@@ -240,8 +240,8 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     """Yields the files that are read for a frame, with their part."""
     files, scan = request.files, request.reading.scan
     sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
-    for number, path in enumerate(files.depths, 1):
-        sources[f"depth {number}"] = file_and_part(path)[0]
+    for number, depth in enumerate(files.depths, 1):
+        sources[f"depth {number}"] = file_and_part(depth)[0]
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.

@@ -127,6 +127,11 @@ class Split:
             self._replay = replay = Replay(self._cut, arguments)
             recorder, uncacheable = self._recorder(replay), len(self._uncacheable)
             self._run_front(replay, recorder)
+            # Once more, if the network set hooks in its first pass, as those of transformers do.
+            cut = CutPoint.find(self._network, self.layer)
+            if cut.hooked != self._cut.hooked:
+                self._cut = cut
+                continue
             if len(self._uncacheable) == uncacheable:  # else once more, to cache what is in those
                 recorder.finish(complete=False)
                 return replay

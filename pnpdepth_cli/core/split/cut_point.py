@@ -29,6 +29,7 @@ class CutPoint:
     modules: Mapping[str, nn.Module]
     """All submodules by name; one with several names comes several times."""
     containers: frozenset[nn.Module]  # the submodules that contain the layer, itself included
+    hooked: frozenset[str]  # names of the submodules with hooks
     around_hooks: frozenset[nn.Module]
     """The submodules with a hooked submodule, whose hooks would not run if they were cached."""
 
@@ -56,6 +57,7 @@ class CutPoint:
             module=module,
             modules=modules,
             containers=_around([n for n, m in modules.items() if m is module], modules) | {module},
+            hooked=frozenset(hooked),
             around_hooks=_around(hooked, modules),
         )
 

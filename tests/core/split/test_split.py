@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import weakref
 from collections.abc import Callable
@@ -269,3 +270,30 @@ def failing(inner: nn.Module, n: int, kind: type[BaseException]) -> nn.Module:
         return y
 
     return Net(run, counted=counted)
+
+
+class HooksItself(nn.Module):
+    """Sets a hook in its first pass, which takes features of its encoder, as transformers do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(conv(3, 4), conv(4, 4))
+        self.neck, self.head = conv(4, 4), conv(8, 1)
+        self.features: list[torch.Tensor] = []
+        self.has_hooks = False
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if not self.has_hooks:
+            self.has_hooks = True
+            self.encoder[0].register_forward_hook(lambda _part, _in, y: self.features.append(y))
+        self.features.clear()
+        x = self.neck(self.encoder(x))
+        return self.head(torch.cat([x, *self.features], dim=1))
+
+
+def test_hooks_that_a_network_sets_in_its_first_pass_run_in_every_pass() -> None:
+    torch.manual_seed(0)
+    network = HooksItself().eval()
+    expected = plain(copy.deepcopy(network), image(16, 16))
+    with Split(network, "neck") as split, torch.no_grad():
+        assert torch.equal(split.rear(split.front(image(16, 16))), expected)
