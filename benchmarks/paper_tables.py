@@ -88,9 +88,9 @@ def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, 
             score(torch.from_numpy(depth), kept, with_thresholds(limits))
             for limits in (DELTA_THRESHOLDS, FINE_THRESHOLDS)
         )
-        measured[state] = {name: getattr(standard, name) for name in MEASURES[:3]}
-        measured[state] |= {f"delta{k}": 100 * getattr(standard, f"delta{k}") for k in (1, 2, 3)}
-        measured[state] |= {f"fine{k}": 100 * getattr(fine, f"delta{k}") for k in (1, 2, 3)}
+        measured[state] = {name: standard[name] for name in MEASURES[:3]}
+        measured[state] |= {f"delta{k}": 100 * standard[f"delta{k}"] for k in (1, 2, 3)}
+        measured[state] |= {f"fine{k}": 100 * fine[f"delta{k}"] for k in (1, 2, 3)}
     return measured, float(scored.sum() / known.sum())
 
 

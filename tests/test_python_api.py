@@ -138,6 +138,24 @@ def test_a_network_that_takes_intrinsics_is_given_the_camera(frame: Frame) -> No
     assert refined.depth == pytest.approx(frame[0].mean(axis=2) + 1.5, abs=1e-5)
 
 
+def test_a_depth_map_of_another_network_is_given_as_an_array(
+    network: pnp.Network, frame: Frame
+) -> None:
+    truth = read_depth(SAMPLE / "gt.png").values[PART]
+    disparity = 0.5 + 2 / truth
+    one = pnp.refine(network, *frame, depth=disparity)
+    assert pnp.score(one.depth, truth)["mae"] < 0.01
+    several = pnp.refine(network, *frame, depth=[disparity, truth])
+    assert {"depth map 1", "depth map 2"} <= several.weights.keys()
+    for wrong in (disparity[:9], np.full(truth.shape, np.nan), "depth.npy"):
+        with pytest.raises(pnp.InputError, match="depth map"):
+            pnp.refine(network, *frame, depth=wrong)
+    with pnp.Refiner(network) as refiner:
+        refiner.refine(*frame)
+        with pytest.raises(pnp.UsageError, match="depth maps"):
+            refiner.refine(*frame, depth=disparity)
+
+
 def test_integers_are_scaled_by_their_type_or_unit(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     settings = pnp.Settings(iterations=0, align="scale")

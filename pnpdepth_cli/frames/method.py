@@ -56,7 +56,7 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
         asked: Settings that the user gives.
         validated: Whether the paper's method is validated, for which each frame is refined again.
     """
-    unused = tuple(name for name in asked.of_updates if name != "iterations")
+    unused = tuple(asked.of_updates) if asked.iterations != 0 else ()
     if not asked.is_paper:
         return Pipeline(propagation=asked.propagate, unused=unused)
     return Pipeline(

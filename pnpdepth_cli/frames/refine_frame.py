@@ -216,10 +216,7 @@ def _refined(
         )
     if pipeline.unused and not own.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
-        notes.append(
-            f"{names}: not used, as z of {experts.own.name} is not updated with these points;"
-            " `iterations` updates it"
-        )
+        notes.append(f"{names}: not used, as z of {experts.own.name} is not updated")
     return Refined(
         before=own.aligned.numpy(),
         depth=steps.depth.numpy(),

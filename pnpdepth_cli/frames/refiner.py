@@ -298,8 +298,10 @@ def frame_of_arrays(
 
 def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iterator[Tensor]:
     """The depth maps (H, W), NaN = unknown. Raises InputError if one has another size."""
-    several = isinstance(depth, list | tuple) and not (depth and np.ndim(depth[0]) < 2)
-    for given in depth if several else [depth]:
+    maps: list[Any] = [depth]
+    if isinstance(depth, list | tuple) and (not depth or np.ndim(depth[0]) > 1):
+        maps = [*depth]
+    for given in maps:
         values = _numbers(given, "the depth map").astype(np.float32)
         if values.shape != size:
             raise InputError(f"the depth map is {values.shape}, but the image is {size}")

@@ -150,6 +150,8 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
     if asked.is_paper:
         return OpenNetwork(network, layer, settings, always_updated=True)
     definition = network.definition
+    if definition.input_kind == "map":  # no network behind z spreads an update
+        return OpenNetwork(network, layer, replace(settings, iterations=0))
     takes_points = "sparse" in definition.input_kind
     if asked.iterations is None:
         is_updated = definition.takes_prior or not takes_points

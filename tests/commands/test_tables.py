@@ -144,9 +144,9 @@ def test_names_are_shortened_by_what_they_share_and_numbers_stay_whole() -> None
         assert tables.short_names(others) == others
 
 
-def test_updates_that_change_nothing_have_no_row() -> None:
-    at = at_points(12, before=4.0, updated=4.0, propagated=1.0, after=1.0, linear=2.0)
-    record = record_of("net", weights={"net": 1.0}, errors={"validation": at})
-    assert not any("z updated" in row[0] for row in texts(refinement_tables(record)[0]))
-    record = replace(record, errors={"validation": at | at_points(12, updated=3.0)})
-    assert any("z updated" in row[0] for row in texts(refinement_tables(record)[0]))
+def test_without_updates_there_is_no_row_of_updates() -> None:
+    at = at_points(12, before=4.0, updated=3.0, propagated=1.0, after=1.0, linear=2.0)
+    record = record_of("net", weights={"net": 1.0}, errors={"validation": at}, loss=[1.0])
+    assert not any("of z" in row[0] for row in texts(refinement_tables(record)[0]))
+    record = replace(record, loss=[1.0, 0.5])
+    assert any("1 update of z" in row[0] for row in texts(refinement_tables(record)[0]))

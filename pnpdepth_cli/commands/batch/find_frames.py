@@ -22,7 +22,6 @@ from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
-from pnpdepth_cli.models.definition import file_and_part
 from pnpdepth_cli.protocols import find_protocol
 
 CSV, JSON = "summary.csv", "summary.json"
@@ -241,7 +240,8 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     files, scan = request.files, request.reading.scan
     sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
     for number, depth in enumerate(files.depths, 1):
-        sources[f"depth {number}"] = file_and_part(depth)[0]
+        name, has_part, _ = depth.name.rpartition(":")  # as of FILE.npz:KEY
+        sources[f"depth {number}"] = depth.with_name(name) if has_part else depth
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.
