@@ -257,11 +257,12 @@ def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
 
 def _first_columns(rows: NDArray[np.generic]) -> Points:
     """x y z; in 64 bits where 32 would round them by more than a millimetre, as those of UTM."""
-    xyz = rows[:, :3]
+    stored = rows[:, :3]
     with np.errstate(over="ignore", invalid="ignore"):
-        single = np.ascontiguousarray(xyz, np.float32)
-        if xyz.dtype != np.float64:
+        single = np.ascontiguousarray(stored, np.float32)
+        if stored.dtype != np.float64:
             return single
+        xyz = np.asarray(stored, np.float64)
         known = np.isfinite(xyz) & (np.abs(xyz) < _EARTH_M)
         rounded = known & (np.abs(single - xyz) > _EXACT_M)
     return np.ascontiguousarray(xyz) if rounded.sum() > known.sum() / 4 else single
