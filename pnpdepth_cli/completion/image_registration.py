@@ -40,7 +40,7 @@ From `REGISTERED` on, an image is not moved. An unrelated image reaches `CHANCE`
 chance somewhere. So the best of all registrations must have it for one frame, and twice it for
 more."""
 
-_TURNED, _TURNED_MORE = 2.0, 4.0
+_TURNED, _TURNED_MORE = 4.0, 5.0
 """Evidence for another orientation, alone and above that for the image as it is."""
 
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49

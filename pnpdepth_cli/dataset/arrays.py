@@ -27,7 +27,9 @@ from pnpdepth_cli.io.rgb import (
 from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 
-_OFF_CENTRE = 0.15  # of the image's side: principal points nearer the centre give no warning
+_OFF_CENTRE = 0.15, 0.35
+"""Of the image's width and height: principal points nearer the centre give no warning. Rows are cut
+off above, where a LiDAR sees nothing, with the calibration adjusted."""
 _ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios of images of one view
 
 
@@ -187,7 +189,8 @@ def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None
             f"{name} is {size[1]}×{size[0]}, which does not contain the principal point"
             f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
         )
-    if max(abs(x / size[1] - 0.5), abs(y / size[0] - 0.5)) > _OFF_CENTRE:
+    across, down = _OFF_CENTRE
+    if abs(x / size[1] - 0.5) > across or abs(y / size[0] - 0.5) > down:
         return [
             f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
             f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"

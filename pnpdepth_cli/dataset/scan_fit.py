@@ -35,7 +35,7 @@ _RESIZED = 0.1  # log ratio of the image's size and twice the principal point
 _SAME_RATIO = 0.12  # of the two sides' such ratios, where an image was resized
 _ABOUT = np.linspace(0.88, 1.12, 49)  # times that ratio, as principal points are not in the middle
 
-_MANY_JUMPS, _SOME_JUMPS = 300, 100  # points at jumps of depth; fewer tell less, or nothing
+_MANY_JUMPS, _SOME_JUMPS = 280, 100  # points at jumps of depth; fewer tell less, or nothing
 _BY_CHANCE = 1.7  # a scan of many jumps that belongs to its image has more
 
 

@@ -21,11 +21,11 @@ from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.depth import describe_range
-from pnpdepth_cli.io.file_bytes import fingerprint
+from pnpdepth_cli.io.file_bytes import fingerprint, read_bytes
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.io.scans import read_scan
+from pnpdepth_cli.io.scans import check_no_colmap_map, read_scan
 from pnpdepth_cli.points import Size, in_frame
 from pnpdepth_cli.sensors.edge_fit import edge_map, jump_weights
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
@@ -157,6 +157,8 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
     if named is None and path in model_files(path.parent):
         raise UsageError(f"{path} is of a COLMAP model; name its folder, {path.parent}")
     if named is None:
+        if path.suffix.lower() == ".bin":
+            check_no_colmap_map(path, read_bytes(path)[:32])
         raise UsageError(
             f"{path} is a scan, which needs --calib: a calibration file, or KITTI's raw folder"
         )

@@ -142,12 +142,12 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
             size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
             fields = _Fields(path, {"K": fields.matrix("K").T, "size": size})
-    elif re.search(r"\b[A-Za-z_]\w*\s*:", text):
+    elif _FIELD.search(plain := _COMMENT.sub("", text)):
         fields = _named_values(path, text)
     else:
-        numbers = numbers_in(text) or []
+        numbers = numbers_in(plain) or []
         sized = {"K": numbers[:4], "size": numbers[4:]}
-        fields = _Fields(path, sized if len(numbers) == 6 else {"K": text})
+        fields = _Fields(path, sized if len(numbers) == 6 else {"K": plain})
     if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
         numbers = fields.numbers("Tr", "Tr_velo_cam", "Tr_velo_to_cam")
         return _kitti(fields, camera, "KITTI", pose_of_matrix(path, "Tr", numbers))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 import shutil
 import struct
 from collections.abc import Callable, Iterable
@@ -26,8 +27,8 @@ from pnpdepth_cli.io.formats import kind_of, parse_npy
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)  # the last are of painted points
 _USUAL, _LEAST_ROWS = 8, 100  # fields a point; more need so many points to be recognised
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
-_EXACT_M, _EARTH_M = 1e4, 1e8
-"""Coordinates beyond which 32 bits are 1 mm and more apart; and beyond any place on the earth."""
+_EXACT_M, _EARTH_M = 1e-3, 1e8  # error of coordinates that counts; the largest of a place on earth
+_COLMAP_MAP = re.compile(rb"\d{1,6}&\d{1,6}&\d&")  # width, height, channels
 _SMALLEST = 1e-3  # numbers near 0 are alike
 _AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
 _LEAST_EXPLAINED = 0.03  # of the variance; numbers in any order have less
@@ -69,7 +70,17 @@ def read_scan(path: Path) -> tuple[Points, str]:
     return read(path, data)
 
 
+def check_no_colmap_map(path: Path, data: bytes) -> None:
+    """Raises InputError for a depth map of COLMAP's dense reconstruction, which is .bin, too."""
+    if _COLMAP_MAP.match(data) is not None:
+        raise InputError(
+            f"{path} is a map of COLMAP's dense reconstruction; save its depth as NPY (H, W), by"
+            " read_array of COLMAP's scripts"
+        )
+
+
 def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
+    check_no_colmap_map(path, data)
     fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
         fact = f"{len(data):,} bytes are no multiple of {fields} float32 numbers a point"
@@ -142,7 +153,14 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
             body = _decompress_rows(columns, number, body)
         return _xyz(columns, number, body, order), f"{stored} PCD"
     except (LookupError, ValueError) as error:
-        raise damaged(path, "PCD", f"cannot be read ({error})") from error
+        raise damaged(path, "PCD", f"cannot be read ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a file, for a person."""
+    if isinstance(error, KeyError):
+        return f"its header lacks, or has an unknown, {error}"
+    return "its header is incomplete" if isinstance(error, LookupError) else str(error)
 
 
 def _decompress_rows(columns: list[Column], number: int, body: bytes) -> bytes:
@@ -193,7 +211,7 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
         columns = [(name, _PLY_KINDS[kind], 1) for _, kind, name in properties]
         points = _xyz(columns, int(number), body, _PLY_ORDERS[stored])
     except (LookupError, ValueError) as error:
-        raise damaged(path, "PLY", f"cannot be read ({error})") from error
+        raise damaged(path, "PLY", f"cannot be read ({_reason(error)})") from error
     return points, "ascii PLY" if stored == "ascii" else "binary PLY"
 
 
@@ -238,14 +256,16 @@ def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
 
 
 def _first_columns(rows: NDArray[np.generic]) -> Points:
-    """x y z; of numbers of 64 bits beyond those of a scan, such as of UTM, in 64 bits."""
-    xyz = rows[:, :3]
-    if xyz.dtype == np.float64:
-        known = np.abs(xyz[np.isfinite(xyz)])
-        if known.size and _EXACT_M < float(np.median(known)) < _EARTH_M:
-            return np.ascontiguousarray(xyz)
-    with np.errstate(over="ignore"):
-        return np.ascontiguousarray(xyz, np.float32)
+    """x y z; in 64 bits where 32 would round them by more than a millimetre, as those of UTM."""
+    stored = rows[:, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = np.ascontiguousarray(stored, np.float32)
+        if stored.dtype != np.float64:
+            return single
+        xyz = np.asarray(stored, np.float64)
+        known = np.isfinite(xyz) & (np.abs(xyz) < _EARTH_M)
+        rounded = known & (np.abs(single - xyz) > _EXACT_M)
+    return np.ascontiguousarray(xyz) if rounded.sum() > known.sum() / 4 else single
 
 
 _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {

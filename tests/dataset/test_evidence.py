@@ -21,6 +21,7 @@ from pnpdepth_cli.dataset.layouts import list_frames
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
@@ -364,3 +365,39 @@ def test_a_cloud_of_a_world_has_the_points_of_its_scan(away: Depth, tmp_path: Pa
     )
     assert 0.5 * len(right.points) < len(frame.points) < len(right.points)
     assert warnings_of(frame) == []
+
+
+def test_a_depth_map_of_colmap_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(b"640&480&1&" + TRUTH.astype("<f4").tobytes())
+    for calib in (None, STREET / "calib.txt"):
+        with pytest.raises(InputError, match="COLMAP"):
+            read(tmp_path / "a.bin", scan=ScanOptions(calib=calib))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# camera: 1\n525 0 319.5\n0 525 239.5\n0 0 1\n",
+        "K 525 0 319.5 0 525 239.5 0 0 1\nsize 640 480  # pixels\n",
+        "525 525 319.5 239.5\n",
+    ],
+)
+def test_a_calibration_may_have_comments_and_no_colons(text: str, tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text(text)
+    camera = read_calibration(tmp_path / "calib.txt").camera
+    np.testing.assert_array_equal(camera.intrinsics, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
+
+
+def test_rows_that_were_cut_off_above_are_no_false_alarm(tmp_path: Path) -> None:
+    image = cv2.imread(str(STREET / "rgb.png"))
+    rows = (STREET / "calib.txt").read_text().split("\n")
+    k = np.array(next(row for row in rows if row.startswith("P2")).split()[1:], float)
+    k = k.reshape(3, 4)
+    k[1] -= 119 * k[2]
+    text = "\n".join(
+        f"P2: {' '.join(map(str, k.ravel()))}" if row.startswith("P2") else row for row in rows
+    )
+    (tmp_path / "calib.txt").write_text(text)
+    cv2.imwrite(str(tmp_path / "cut.png"), image[119:])
+    scan = ScanOptions(calib=tmp_path / "calib.txt")
+    assert warnings_of(read(STREET / "000000.bin", tmp_path / "cut.png", scan=scan)) == []
