@@ -17,7 +17,8 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 
 LARGEST_SEED = 2**32 - 1
-_OF_UPDATES = ("layer", "iterations", "lr", "loss", "update", "schedule", "blur")
+OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
+"""The settings that have no effect without updates of z."""
 
 
 def option(default: Any, help: str, **details: object) -> Any:
@@ -122,8 +123,8 @@ class Settings:
 
     @property
     def of_updates(self) -> list[str]:
-        """The names of the settings that are given and only updates of z use."""
-        return [name for name in self.given() if name in _OF_UPDATES]
+        """The names of the settings that are given and have no effect without updates of z."""
+        return [name for name in self.given() if name in ("iterations", *OF_UPDATES)]
 
     @property
     def is_paper(self) -> bool:

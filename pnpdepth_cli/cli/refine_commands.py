@@ -23,7 +23,7 @@ from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import OF_UPDATES, Settings
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.batch.records import BatchSummary
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 DEFAULT = "default"
 """A value that leaves the option out."""
 _NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
-_OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
-"""Options that have no effect without updates of z."""
 _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
@@ -302,7 +300,7 @@ def _combinations(
         without_updates = dict(zip(names, words, strict=True)).get("iterations") == "0"
         for name, option, word in zip(names, varying, words, strict=True):
             # Without updates of z, runs that differ in these are one.
-            if without_updates and name in _OF_UPDATES:
+            if without_updates and name in OF_UPDATES:
                 continue
             texts[name] = word
             if word != DEFAULT:
