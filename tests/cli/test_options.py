@@ -14,9 +14,9 @@ from pnpdepth_cli.cli.options import GroupedCommand
 from pnpdepth_cli.commands.refinement.refine_request import GROUPS, RefineRequest
 from pnpdepth_cli.settings import flag_of, options_of
 
-MOST_OPTIONS = {"refine": 30, "batch": 45}
-MOST_IN_ALL = 150
-MOST_COMMON = 12
+MOST_OPTIONS = {"refine": 32, "batch": 47}
+MOST_IN_ALL = 156
+MOST_COMMON = 13
 
 
 def commands_of(group: click.Group) -> Iterator[click.Command]:

@@ -58,7 +58,7 @@ def refine(project: Path, output: str = "out", **changes: Any) -> FrameRecord:
 def test_depth_is_in_units_or_in_metres(unit_scale: float | None, unit: str, project: Path) -> None:
     record = refine(project, unit_scale=unit_scale, method="alone", iterations=0)
     metric = unit_scale is not None
-    assert (record.unit, record.settings["align"]) == (unit, "none" if metric else "scale")
+    assert (record.unit, record.settings["align"]) == (unit, "auto" if metric else "scale")
     factor = unit_scale or 1.0
     assert 3.4 < record.points.nearest / factor < record.points.farthest / factor < 4.6
     scale = read_depth(project / "out/a_depth.png").reading.scale

@@ -47,7 +47,7 @@ def test_a_manifest_has_all_that_a_frame_can_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("image,depth\ni.png,s.png\n", "line 1: column 'depth' is not one of"),
+        ("image,deep\ni.png,s.png\n", "line 1: column 'deep' is not one of"),
         ("image,gt,gt\ni.png,s.png,s.png\n", "line 1: column 'gt'"),
         ("image,camera\ni.png,left\n", "line 2"),
         ("image\ni.png\ni.png\n", "line 3: a second frame 'i'; "),
