@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.dataset.arrays import same_aspect_ratio
 from pnpdepth_cli.dataset.plausible import named
 from pnpdepth_cli.dataset.range_ends import far_end, near_end, repeated_ends
@@ -27,7 +28,7 @@ from pnpdepth_cli.io.depth import check_byte_order, load_stored, without_single_
 from pnpdepth_cli.io.file_bytes import check_pixel_count, fingerprint, one_line, read_bytes
 from pnpdepth_cli.io.formats import ArrayKind, DepthFile, Reading, images
 from pnpdepth_cli.io.rgb import VIDEO_BRANDS, read_rgb
-from pnpdepth_cli.points import Size
+from pnpdepth_cli.points import Size, SparsePoints
 
 Map = NDArray[np.float32]
 
@@ -40,7 +41,11 @@ _OTHER_WORDS = re.compile(
 """Words in names of arrays that are depth, and that are maps beside it."""
 _GREY = 2  # levels of 255 between the channels of a grey picture; compression makes some
 _STEPS = 256  # of 8 bits
-_MANY = 1000  # pixels, of which so few different values tell of steps
+_FEW = 20  # different numbers; fewer are of labels
+_MANY = 1000  # pixels, of which so few different numbers tell something
+_FILLED = 0.005  # of the pixels; so many zeros in the middle of a range stand for unknown
+_MORE = 3  # times as many as any other number
+_SAMPLED = 2000  # pixels, whose neighbours are compared with the image's edges
 _KNOWN = 0.5 - 1e-6  # weight of known pixels, from which an interpolated one is known
 
 
@@ -79,11 +84,13 @@ def read_predicted_depth(
     codes = _one_channel(path, stored, size)
     # Those that are unknown.
     values, notes = _without_unknown(codes, stored.reading.scale)
-    _check_variety(path, codes, values)
+    notes += _check_variety(path, values)
     # The size of the image.
     if size is not None and values.shape != size:
         notes.append(_check_view(path, values.shape, size))
         values = resize_known(values, size)
+    if image is not None and image.shape[:2] == values.shape:
+        notes += _orientation_warning(values, image)
     source = FileRecord(
         path=str(path),
         sha256=fingerprint(file).sha256,
@@ -189,8 +196,11 @@ def _load_picture(path: Path, kind: str) -> DepthFile:
             f" number; {_RAW}"
         )
     grey = np.median(levels, axis=2)
+    source = f"{bits}-bit grey {kind}"
+    if picture.note is not None:
+        source += f", {picture.note}"
     dtype = np.uint8 if bits == 8 else np.uint16
-    return DepthFile(values=grey.astype(dtype), reading=Reading(f"{bits}-bit grey {kind}"))
+    return DepthFile(values=grey.astype(dtype), reading=Reading(source))
 
 
 def _one_channel(path: Path, stored: DepthFile, size: Size | None) -> NDArray[np.generic]:
@@ -226,6 +236,29 @@ def _equal_channels(path: Path, values: NDArray[np.generic]) -> NDArray[np.gener
     )
 
 
+class _Unknown:
+    """Which pixels of a map are unknown, and a line on each reason."""
+
+    def __init__(self, values: Map) -> None:
+        self._values = values
+        self.mask = np.zeros(values.shape, bool)
+        self.notes = list[str]()
+
+    @property
+    def others(self) -> Map:
+        """The numbers (N,) of all other pixels."""
+        return self._values[~self.mask]
+
+    def add(self, found: NDArray[np.bool_], what: str) -> None:
+        """Adds pixels (H, W), and a line on those that are new."""
+        found = found & ~self.mask
+        count = int(np.count_nonzero(found))
+        if count:
+            verb = "is" if count == 1 else "are"
+            self.notes.append(f"{count:,} of {found.size:,} pixels {verb} {what}; taken as unknown")
+            self.mask |= found
+
+
 def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, list[str]]:
     """The numbers (H, W) as float32, NaN where unknown; and lines that count those.
 
@@ -233,62 +266,78 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
         codes: (H, W) numbers as stored.
         scale: Codes per unit that the file states; None for none.
     """
-    notes, total = list[str](), codes.size
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         values = np.array(codes if scale is None else codes / scale, dtype=np.float32)
-    unknown = ~np.isfinite(values)
-    if unknown.any():
-        notes.append(_counted(unknown, total, "NaN or infinite"))
-
-    def drop(found: NDArray[np.bool_], what: str) -> None:
-        found = found & ~unknown
-        if found.any():
-            notes.append(_counted(found, total, what))
-            unknown[found] = True
-
-    # Codes at the ends of what an integer holds.
+    unknown = _Unknown(values)
+    unknown.add(~np.isfinite(values), "NaN or infinite")
     if _is_8_bit(codes):
-        ends = int(np.count_nonzero(codes == 0)), int(np.count_nonzero(codes == _STEPS - 1))
-        levels = len(np.unique(codes[np.isfinite(codes)]))
-        notes.append(
-            f"warning: 8 bits: {levels} of 256 steps, and {ends[0]:,} of {total:,} pixels are 0 and"
-            f" {ends[1]:,} are 255, where it is clipped; these are unknown. Better save floats"
-        )
-        unknown |= (codes == 0) | (codes == _STEPS - 1)
-    elif codes.dtype.kind in "iu":
-        limits = np.iinfo(codes.dtype)
-        drop(codes == limits.max, f"{limits.max}, the largest code")
-        drop((codes == limits.min) & (limits.min < 0), f"{limits.min}, the smallest code")
-    # Zero, unless it is in the middle of a range.
-    least = float(values[~unknown].min(initial=np.inf))
-    is_many = np.count_nonzero(values == 0) > _most_of_one(values[~unknown & (values != 0)])
-    if least >= 0 or is_many:
-        drop(values == 0, "0")
-    # One negative number where all others are above 0.
-    below = np.unique(values[~unknown & (values < 0)])
-    if len(below) == 1 and (values[~unknown] > 0).any():
-        drop(values == below[0], f"{below[0]:g}, the only number below 0")
-    # One extreme value for many pixels, at either end.
-    if not _is_8_bit(codes):
-        for value, _ in repeated_ends(values[~unknown]):
-            end = "smallest" if value <= float(values[~unknown].min()) else "largest"
-            drop(values == np.float32(value), f"exactly {value:.6g}, the {end} value")
-    # Nearly one value, far beyond all others: mixed with others at its edges.
-    known = values[~unknown].astype(np.float64)
-    if known.size and known.min() > 0:
-        far, near = far_end(known), near_end(known)
-        for end_of, rest in ((far, "others reach"), (near, "others begin at")):
-            beyond = np.zeros(values.shape, bool)
-            beyond[~unknown] = end_of.is_none
-            drop(beyond, f"about {end_of.value:.4g} where the {rest} {end_of.rest:.4g}")
-    values[unknown] = np.nan
-    return values, notes
+        _add_8_bit_ends(unknown, codes)
+    else:
+        _add_ends_of_codes(unknown, codes)
+        _add_marks(unknown, values)
+        _add_ends(unknown, values)
+    values[unknown.mask] = np.nan
+    return values, unknown.notes
 
 
-def _counted(found: NDArray[np.bool_], total: int, what: str) -> str:
-    count = int(np.count_nonzero(found))
-    verb = "pixel is" if count == 1 else f"of {total:,} pixels are"
-    return f"{count:,} {verb} {what}; taken as unknown"
+def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
+    """0 and 255, beyond which a picture of depth is clipped, and a warning that it has steps."""
+    lowest, highest = codes == 0, codes == _STEPS - 1
+    levels = len(np.unique(codes[np.isfinite(codes)]))
+    unknown.notes.append(
+        f"warning: 8 bits have 256 steps, of which {levels} are used;"
+        f" {np.count_nonzero(lowest):,} of {codes.size:,} pixels are 0 and"
+        f" {np.count_nonzero(highest):,} are 255, where it is clipped, and taken as unknown;"
+        f" better {_RAW}"
+    )
+    unknown.mask |= lowest | highest
+
+
+def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
+    """The largest code of an integer type, and the smallest below 0: what no sensor measures."""
+    if codes.dtype.kind not in "iu":
+        return
+    limits = np.iinfo(codes.dtype)
+    unknown.add(codes == limits.max, f"{limits.max}, the largest code")
+    if limits.min < 0:
+        unknown.add(codes == limits.min, f"{limits.min}, the smallest code")
+
+
+def _add_marks(unknown: _Unknown, values: Map) -> None:
+    """0, unless it is one of many numbers of both signs; and the only number below 0."""
+    others = unknown.others
+    zeros = int(np.count_nonzero(others == 0))
+    has_both_signs = bool(others.min(initial=0) < 0 < others.max(initial=0))
+    if zeros and has_both_signs:
+        counts = np.unique(others[others != 0], return_counts=True)[1]
+        is_mark = zeros >= max(_FILLED * values.size, _MORE * int(counts.max()))
+    else:
+        is_mark = zeros > 0
+    if is_mark:
+        unknown.add(values == 0, "0")
+    below = np.unique(unknown.others[unknown.others < 0])
+    if len(below) == 1 and has_both_signs:
+        unknown.add(values == below[0], f"{below[0]:.6g}, the only number below 0")
+
+
+def _add_ends(unknown: _Unknown, values: Map) -> None:
+    """Extreme values that many pixels have: the sky, a far plane, a clip, also of 1/disparity."""
+    # Exactly one value.
+    for value, _ in repeated_ends(unknown.others):
+        end = "smallest" if value <= float(unknown.others.min()) else "largest"
+        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {end} value")
+    # About one value, far from all others and mixed with them at its edges.
+    known = unknown.others.astype(np.float64)
+    if not known.size or known.min() <= 0:
+        return
+    place = ~unknown.mask
+    for end_of, reach in (
+        (far_end(known), "98 % of the others are at most"),
+        (near_end(known), "98 % of the others are at least"),
+    ):
+        found = np.zeros(values.shape, bool)
+        found[place] = end_of.is_none
+        unknown.add(found, f"about {end_of.value:.4g}, where {reach} {end_of.rest:.4g}")
 
 
 def _is_8_bit(codes: NDArray[Any]) -> bool:
@@ -301,21 +350,53 @@ def _is_8_bit(codes: NDArray[Any]) -> bool:
     return bool((np.rint(finite) == finite).all())
 
 
-def _most_of_one(values: Map) -> int:
-    """How many of the numbers (N,) have the most frequent value."""
-    return int(np.unique(values, return_counts=True)[1].max(initial=0))
-
-
-def _check_variety(path: Path, codes: NDArray[np.generic], values: Map) -> None:
-    """Raises InputError for a map without known numbers, or of one number."""
+def _check_variety(path: Path, values: Map) -> list[str]:
+    """Lines on a map of few different numbers. InputError for one of none, or of one number."""
     known = values[np.isfinite(values)]
     if not known.size:
         raise InputError(f"{path} has no known depth, only 0, NaN, infinite or clipped; {_RAW}")
-    if known.min() == known.max():
+    different = len(np.unique(known))
+    if different == 1:
         raise InputError(
             f"{path} is {known[0]:g} at all of its {known.size:,} known pixels, as a mask is; give"
             " the depth map"
         )
+    if known.size < _MANY or different > _STEPS:
+        return []
+    if different < _FEW:
+        return [f"warning: {different} different numbers only, as of labels or a drawing"]
+    return [f"{different} different numbers only, as of 8 bits or a coarse type"]
+
+
+def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:
+    """A warning if the image's edges meet the jumps of a map better mirrored or turned.
+
+    Of 34 stored predictions none gets it as it is, and 85 get the right one of 102 that are
+    mirrored, upside down, or turned by 180°.
+    """
+    rows, columns = np.nonzero(np.isfinite(values))
+    chosen = np.random.default_rng(0).choice(
+        len(rows), min(_SAMPLED, len(rows)), replace=False, shuffle=False
+    )
+    rows, columns = rows[chosen], columns[chosen]
+    numbers = values[rows, columns].astype(np.float64)
+    # Changes of the logarithm are compared, which are those of depth or of disparity alike.
+    if numbers.min() <= 0:
+        low, high = np.quantile(numbers, (0.02, 0.98))
+        numbers = np.exp(2 * (numbers - low) / max(float(high - low), 1e-9))
+    points = SparsePoints(
+        xy=np.column_stack([columns, rows]).astype(np.float32),
+        depth=numbers.astype(np.float32),
+        size=(values.shape[0], values.shape[1]),
+    )
+    found = evidence(np.ascontiguousarray(image), points.tensors())
+    turned = None if found is None else better_orientation([found])
+    if turned is None:
+        return []
+    return [
+        f"warning: the image's edges meet it better if it is {turned}; give both as they are"
+        " stored, or both turned"
+    ]
 
 
 def _check_view(path: Path, own: tuple[int, ...], size: Size) -> str:
