@@ -84,7 +84,7 @@ def read_predicted_depth(
     codes = _one_channel(path, stored, size)
     # Those that are unknown.
     values, notes = _without_unknown(codes, stored.reading.scale)
-    notes += _check_variety(path, values)
+    notes += _check_variety(path, values, is_float=codes.dtype.kind == "f")
     # The size of the image.
     if size is not None and values.shape != size:
         notes.append(_check_view(path, values.shape, size))
@@ -350,7 +350,7 @@ def _is_8_bit(codes: NDArray[Any]) -> bool:
     return bool((np.rint(finite) == finite).all())
 
 
-def _check_variety(path: Path, values: Map) -> list[str]:
+def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
     """Lines on a map of few different numbers. InputError for one of none, or of one number."""
     known = values[np.isfinite(values)]
     if not known.size:
@@ -365,7 +365,9 @@ def _check_variety(path: Path, values: Map) -> list[str]:
         return []
     if different < _FEW:
         return [f"warning: {different} different numbers only, as of labels or a drawing"]
-    return [f"{different} different numbers only, as of 8 bits or a coarse type"]
+    if not is_float:  # steps of a sensor, or those of 8 bits, which are said already
+        return []
+    return [f"{different} different numbers only, as of a map that had 8 bits, or a coarse type"]
 
 
 def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -143,7 +143,7 @@ class _Header(NamedTuple):
     dtype: np.dtype[Any]
 
 
-def _parse_header(path: Path, stream: IO[bytes], kind: str) -> _Header:
+def _parse_header(path: Path, stream: io.BytesIO, kind: str) -> _Header:
     """The header at the stream's position. InputError if it is damaged."""
     try:
         with _LOCK:
@@ -191,6 +191,8 @@ def write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) 
 
 
 _OF_ARRAY = ".npy"  # suffix of an archive's members
+_MOST_ARRAYS = 1000  # of an archive; a network's has ten
+_LONGEST_HEADER = 1 << 16  # bytes of an array's header, which mostly has 128
 
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
@@ -245,13 +247,15 @@ def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
     arrays = dict[str, ArrayKind]()
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for member in archive.infolist():
-                if not member.filename.endswith(_OF_ARRAY):
-                    continue
+            members = [m for m in archive.infolist() if m.filename.endswith(_OF_ARRAY)]
+            claim = f"{path} holds {len(members):,} arrays"
+            check_claim(claim, len(members), _MOST_ARRAYS, way_out="save those of this image")
+            for member in members:
                 if member.compress_type not in COMPRESSIONS:
                     raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
                 with archive.open(member) as stream:
-                    shape, _, dtype = _parse_header(path, stream, "NPZ")
+                    begin = io.BytesIO(stream.read(_LONGEST_HEADER))
+                shape, _, dtype = _parse_header(path, begin, "NPZ")
                 arrays[member.filename.removesuffix(_OF_ARRAY)] = ArrayKind(shape, dtype)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
