@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from pnpdepth_cli.errors import UsageError
 
 PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.simulation`."""
+
+
+def file_and_part(path: Path) -> tuple[Path, str]:
+    """Returns the file of FILE:PART, as networks and arrays of archives are named, and the part.
+
+    The part is empty if there is none, or if a file has that whole name.
+    """
+    name, _, part = path.name.rpartition(":")
+    return (path.with_name(name), part) if name and not path.exists() else (path, "")
 
 
 def what_applies(entries: Iterable[tuple[str, object]]) -> dict[str, object]:

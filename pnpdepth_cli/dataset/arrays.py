@@ -98,10 +98,15 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
     return depth
 
 
+def same_aspect_ratio(own: tuple[int, ...], size: tuple[int, ...]) -> bool:
+    """Returns whether images of these sizes (H, W) can show one view."""
+    return abs(own[1] * size[0] / (own[0] * size[1]) - 1) <= _ASPECT_TOLERANCE
+
+
 def check_same_view(what: str, own: tuple[int, ...], size: Size) -> None:
     """Raises InputError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
-    if abs(own[1] * size[0] / (own[0] * size[1]) - 1) > _ASPECT_TOLERANCE:
-        turned = abs(own[0] * size[0] / (own[1] * size[1]) - 1) <= _ASPECT_TOLERANCE
+    if not same_aspect_ratio(own, size):
+        turned = same_aspect_ratio(own[::-1], size)
         raise InputError(
             f"{what} is {own[1]}×{own[0]} and the image {size[1]}×{size[0]}: they do not show the"
             " same view" + ("; one is turned by 90°, turn it back" if turned else "")

@@ -112,9 +112,7 @@ def depth_from_stored(
     Raises:
         InputError: The numbers are no image of one channel, or exceed the budget.
     """
-    values: NDArray[np.generic] = stored.values
-    while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):  # as networks give it
-        values = values[0] if len(values) == 1 else values[..., 0]
+    values = without_single_axes(stored.values)
     if values.ndim != 2:
         raise InputError(f"{path} has the shape {stored.values.shape}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
@@ -143,23 +141,23 @@ def depth_from_stored(
     return DepthFile(values=known_metres(metres), reading=reading)
 
 
+def without_single_axes(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Returns an array of (1, H, W), (H, W, 1), (1, 1, H, W), as networks give it, as (H, W)."""
+    while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):
+        values = values[0] if len(values) == 1 else values[..., 0]
+    return values
+
+
 def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) -> None:
     """Raises InputError for 16-bit codes whose bytes are exchanged, or that are normalised.
 
-    Neighbours in a row are nearly alike, but not if their bytes are exchanged. Codes that reach the
-    largest one without a gap were stretched to 16 bits, and are no depth unless a scale is stated.
+    Codes that reach the largest one without a gap were stretched to 16 bits, and are no depth
+    unless a scale is stated.
     """
-    if values.dtype != np.uint16:
+    check_byte_order(path, values)
+    codes = _known_codes(values)
+    if codes is None:
         return
-    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
-    if np.count_nonzero(known) < _MANY_CODES:
-        return
-    codes = np.asarray(values[known], np.uint16)
-    if _roughness(codes) > _ROUGHER * _roughness(codes.byteswap()):
-        raise InputError(
-            f"{path}: its numbers are far smoother with their two bytes exchanged, so they were"
-            " stored in the wrong order; save array.byteswap()"
-        )
     near_end = int(np.count_nonzero(codes > _NEAR_END))
     at_end = int(np.count_nonzero(values == formats.SATURATED_CODE))
     if not is_stated and at_end and near_end >= max(at_end, _LEAST_AT_END * len(codes)):
@@ -168,6 +166,29 @@ def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) ->
             " that was normalised to 16 bits; save metres × a scale, or give the scale with"
             " --depth-scale"
         )
+
+
+def check_byte_order(path: Path, values: NDArray[np.generic]) -> None:
+    """Raises InputError for 16-bit codes whose bytes are exchanged.
+
+    Neighbours in a row are nearly alike, but not if their bytes are exchanged.
+    """
+    codes = _known_codes(values)
+    if codes is not None and _roughness(codes) > _ROUGHER * _roughness(codes.byteswap()):
+        raise InputError(
+            f"{path}: its numbers are far smoother with their two bytes exchanged, so they were"
+            " stored in the wrong order; save array.byteswap()"
+        )
+
+
+def _known_codes(values: NDArray[np.generic]) -> NDArray[np.uint16] | None:
+    """The 16-bit codes of known depth, in their order; None of other numbers, and of few."""
+    if values.dtype != np.uint16:
+        return None
+    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
+    if np.count_nonzero(known) < _MANY_CODES:
+        return None
+    return np.asarray(values[known], np.uint16)
 
 
 def _roughness(codes: NDArray[np.uint16]) -> float:

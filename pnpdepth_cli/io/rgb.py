@@ -17,7 +17,7 @@ from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import check_pixel_count, damaged, read_bytes, size_of_regular_file
 from pnpdepth_cli.io.formats import images, kind_of
 
-_VIDEO_BRANDS = (b"iso", b"mp4", b"qt ", b"M4V", b"avc", b"3gp")
+VIDEO_BRANDS = (b"iso", b"mp4", b"qt ", b"M4V", b"avc", b"3gp")
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _PLAUSIBLE = (0.2, 50.0)
 """Focal length as a multiple of the image's longer side: fields of view of 136° to 1°."""
@@ -53,7 +53,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     if kind == "EXR":
         return _from_linear_light(path, data)
     if data[4:8] == b"ftyp":
-        if data[8:11] in _VIDEO_BRANDS:
+        if data[8:11] in VIDEO_BRANDS:
             raise InputError(f"{path} is a video; `batch` takes videos, with depth of their frames")
         if data[8:12] in (b"avif", b"avis") or not _reads_heic():
             hint = "pip install 'pnpdepth[heic]' reads HEIC, or save it as JPEG"

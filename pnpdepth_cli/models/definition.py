@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from pnpdepth_cli.choices import Fit, OutputKind, OutputScale
 from pnpdepth_cli.choices import InputKind as InputKind  # for definition files
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.file_record import file_and_part as file_and_part
 from pnpdepth_cli.settings import Settings as Settings  # for definition files
 
 if TYPE_CHECKING:
@@ -256,12 +257,6 @@ class ModelDefinition:
         by_name = {"rgb": rgb, "sparse": sparse}
         inputs = (*(by_name[name] for name in self.input_kind.split("+")), intrinsics)
         return tuple(tensor for tensor in inputs if tensor is not None)
-
-
-def file_and_part(path: Path) -> tuple[Path, str]:
-    """Returns the file of FILE:PART, as networks are named, and the part; empty without one."""
-    name, _, part = path.name.rpartition(":")
-    return (path.with_name(name), part) if name and not path.exists() else (path, "")
 
 
 def assume_definition(**known: object) -> ModelDefinition:

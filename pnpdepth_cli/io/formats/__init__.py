@@ -135,13 +135,16 @@ def check_scale(scale: float | None) -> None:
         raise UsageError(f"--depth-scale must be a finite number above 0, not {scale:g}")
 
 
-def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]:
-    """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
+class _Header(NamedTuple):
+    """What an NPY file says of its array."""
 
-    Messages name `path` and `kind`. Raises InputError if it is damaged or holds no numbers.
-    """
-    # The header.
-    stream = io.BytesIO(data)
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype[Any]
+
+
+def _parse_header(path: Path, stream: io.BytesIO, kind: str) -> _Header:
+    """The header at the stream's position. InputError if it is damaged."""
     try:
         with _LOCK:
             shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
@@ -150,6 +153,17 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
             raise ValueError(f"a shape of {shape}")
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
+    return _Header(shape, is_fortran, dtype)
+
+
+def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]:
+    """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
+
+    Messages name `path` and `kind`. Raises InputError if it is damaged or holds no numbers.
+    """
+    # The header.
+    stream = io.BytesIO(data)
+    shape, is_fortran, dtype = _parse_header(path, stream, kind)
     if dtype.hasobject:
         raise InputError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
     if dtype.kind not in "fiub":
@@ -176,6 +190,10 @@ def write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) 
         np.save(stream, metres)
 
 
+_OF_ARRAY = ".npy"  # suffix of an archive's members
+_MOST_ARRAYS = 1000  # of an archive; a network's has ten
+_LONGEST_HEADER = 1 << 16  # bytes of an array's header, which mostly has 128
+
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes. Python decompresses bz2 and LZMA without a bound on memory."""
 
@@ -189,11 +207,7 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
                 listing = one_line(", ".join(each.filename for each in members)) or "none"
                 raise InputError(f"{path} holds several arrays or none ({listing}); save one")
             (member,) = members
-            if member.compress_type not in COMPRESSIONS:
-                raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
-            claim, most = f"{path} holds {member.file_size:,} bytes", max_image_bytes()
-            check_claim(claim, member.file_size, most, way_out="create it again")
-            array = parse_npy(path, archive.read(member), "NPZ")
+            array = _parse_member(path, archive, member)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
     name = member.filename.removesuffix(".npy")
@@ -202,6 +216,61 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
             f"{path} holds the array {name!r}, which is {other[0]} and no depth by its name; save"
             " depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
         )
+    reading = Reading(f"{array.dtype} NPZ array {name}")
+    return DepthFile(values=array, reading=reading, is_image=False)
+
+
+def _parse_member(
+    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
+) -> NDArray[np.generic]:
+    """The array of one member. InputError if it is compressed otherwise, or beyond the budget."""
+    if member.compress_type not in COMPRESSIONS:
+        raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
+    claim, most = f"{path} holds {member.file_size:,} bytes", max_image_bytes()
+    check_claim(claim, member.file_size, most, way_out="create it again")
+    return parse_npy(path, archive.read(member), "NPZ")
+
+
+class ArrayKind(NamedTuple):
+    """What an archive says of one of its arrays, none of which is decoded."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
+    """Returns what the archive says of its arrays, by their names.
+
+    Raises:
+        InputError: The archive is damaged, or has no arrays, as a ZIP of other files.
+    """
+    arrays = dict[str, ArrayKind]()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = [m for m in archive.infolist() if m.filename.endswith(_OF_ARRAY)]
+            claim = f"{path} holds {len(members):,} arrays"
+            check_claim(claim, len(members), _MOST_ARRAYS, way_out="save those of this image")
+            for member in members:
+                if member.compress_type not in COMPRESSIONS:
+                    raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
+                with archive.open(member) as stream:
+                    begin = io.BytesIO(stream.read(_LONGEST_HEADER))
+                shape, _, dtype = _parse_header(path, begin, "NPZ")
+                arrays[member.filename.removesuffix(_OF_ARRAY)] = ArrayKind(shape, dtype)
+    except _ARCHIVE_ERRORS as error:
+        raise damaged(path, "NPZ", f"cannot be read ({error})") from error
+    if not arrays:
+        raise InputError(f"{path} is an archive without arrays; save one with numpy.savez")
+    return arrays
+
+
+def read_npz_array(path: Path, data: bytes, name: str) -> DepthFile:
+    """Returns one of the arrays that `list_npz` has. Raises InputError if it is damaged."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            array = _parse_member(path, archive, archive.getinfo(name + _OF_ARRAY))
+    except _ARCHIVE_ERRORS as error:
+        raise damaged(path, "NPZ", f"cannot be read ({error})") from error
     reading = Reading(f"{array.dtype} NPZ array {name}")
     return DepthFile(values=array, reading=reading, is_image=False)
 
