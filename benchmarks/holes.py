@@ -3,7 +3,9 @@
 Ellipses of 5 to 80 pixels are cut out of the depth of Kinect frames, all other pixels are the
 points, and the depth in the ellipses is the truth. For each method, the MAE in metres over the
 holes of each size and over all, the fraction of the measured pixels that it changes by more than
-2 mm, and seconds and peak memory of a frame. Each method has a process of its own.
+2 mm, and seconds and peak memory of a frame. Of a network also the fractions of the pixels in holes
+whose truth is within one and two of `--uncertainty`'s standard deviations, and that it calls valid.
+Each method has a process of its own.
 
 - linear: linear interpolation of the points
 - telea, ns: OpenCV's inpainting (Telea 2004; Bertalmio et al. 2001) of depth in 16 bits
@@ -31,7 +33,9 @@ from numpy.typing import NDArray
 from benchmarks.default import frames_of
 from benchmarks.frames import Depth, EvalFrame, drawn_inputs, opened, print_row
 from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.settings import Settings
 
 SIZES = (5, 10, 20, 40, 80)
@@ -60,6 +64,8 @@ class Scores:
     """Of one method on some frames: |error| in metres by size of the hole, and what it costs."""
 
     errors: dict[int, NDArray[np.float32]]
+    within: dict[int, NDArray[np.float32]]  # |error| in standard deviations; empty without any
+    valid: NDArray[np.bool_]  # of all holes
     changed: float  # fraction of the measured pixels
     seconds: float  # CPU, a frame
     wall: float  # seconds a frame
@@ -88,8 +94,8 @@ def cut_holes(gt: Depth, seed: int) -> NDArray[np.uint8]:
     return size_of
 
 
-def filled(method: str, frame: EvalFrame, data: Path) -> Depth:
-    """The depth (H, W) that a method gives for a frame with holes, metres."""
+def filled(method: str, frame: EvalFrame, data: Path) -> Depth | Refined:
+    """The depth (H, W) that a method gives for a frame with holes, metres; all of a network."""
     if method in INPAINTING:
         scaled = (frame.gt * FULL_SCALE).round().clip(0, 65535).astype(np.uint16)
         unknown = (scaled == 0).astype(np.uint8)
@@ -101,32 +107,59 @@ def filled(method: str, frame: EvalFrame, data: Path) -> Depth:
     name, *alone = method.split()
     settings = Settings(method="alone") if alone else Settings()
     with Method([opened(name, data)], settings, inputs) as chosen:
-        return chosen.refine(replace(inputs, gt=None)).after
+        return chosen.refine(replace(inputs, gt=None))
 
 
 def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores:
     """The scores of a method on frames of a set."""
     torch.set_num_threads(1)
     errors: dict[int, list[Depth]] = {size: [] for size in SIZES}
+    within: dict[int, list[Depth]] = {size: [] for size in SIZES}
+    valid = list[NDArray[np.bool_]]()
     changed, cpu, wall = list[float](), 0.0, 0.0
     frames = frames_of(name, data, half, count)
     for number, frame in enumerate(frames):
         size_of = cut_holes(frame.gt, number)
         holed = replace(frame, gt=np.where(size_of > 0, 0, frame.gt))
         start, start_wall = time.process_time(), time.perf_counter()
-        depth = filled(method, holed, data)
+        result = filled(method, holed, data)
         cpu += time.process_time() - start
         wall += time.perf_counter() - start_wall
+        depth = result.depth if isinstance(result, Refined) else result
+        error = np.abs(depth - frame.gt)
         for size in SIZES:
-            known = (size_of == size) & (frame.gt > 0)
-            errors[size].append(np.abs(depth - frame.gt)[known])
+            errors[size].append(error[(size_of == size) & (frame.gt > 0)])
+        if isinstance(result, Refined):
+            certain = with_uncertainty(result)
+            for size in SIZES:
+                known = (size_of == size) & (frame.gt > 0)
+                within[size].append(error[known] / certain.sigma[known])
+                valid.append(certain.valid[known])
         difference = np.abs(depth - holed.gt)[holed.gt > 0]
         changed.append(float((difference > CHANGED).mean()))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
         1e9 if sys.platform == "darwin" else 1e6
     )
-    joined = {size: np.concatenate(each) for size, each in errors.items()}
-    return Scores(joined, float(np.mean(changed)), cpu / len(frames), wall / len(frames), peak)
+    return Scores(
+        errors={size: np.concatenate(of_frames) for size, of_frames in errors.items()},
+        within={size: np.concatenate(of_frames) for size, of_frames in within.items() if of_frames},
+        valid=np.concatenate(valid) if valid else np.empty(0, np.bool_),
+        changed=float(np.mean(changed)),
+        seconds=cpu / len(frames),
+        wall=wall / len(frames),
+        peak=peak,
+    )
+
+
+def coverage(of: Scores) -> list[str]:
+    """Per cent within one and two standard deviations by size and in all, and of valid pixels."""
+    if not of.within:
+        return ["—"] * (len(SIZES) + 2)
+    every = np.concatenate(list(of.within.values()))
+    return [
+        f"{(part <= 1).mean():.0%}, {(part <= 2).mean():.0%}"
+        for part in (*of.within.values(), every)
+    ] + [f"{of.valid.mean():.1%}"]
 
 
 def main() -> None:
@@ -139,7 +172,9 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     args = parser.parse_args()
     sizes = [f"{size} px" for size in SIZES]
-    print_row("set, frames", "method", *sizes, "all", "changed", "CPU s", "s", "GB", head=True)
+    costs = "changed", "CPU s", "s", "GB"
+    within = *(f"±1σ, ±2σ {size}" for size in sizes), "±1σ, ±2σ", "valid"
+    print_row("set, frames", "method", *sizes, "all", *costs, *within, head=True)
     for name in args.sets:
         for method in args.methods:
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
@@ -147,9 +182,9 @@ def main() -> None:
                 of = task.result()
             means = [f"{of.errors[size].mean():.4f}" for size in SIZES]
             every = np.concatenate(list(of.errors.values())).mean()
-            costs = f"{of.seconds:.1f}", f"{of.wall:.1f}", f"{of.peak:.2f}"
+            costs = f"{of.changed:.1%}", f"{of.seconds:.1f}", f"{of.wall:.1f}", f"{of.peak:.2f}"
             case = f"{name}, {args.frames}"
-            print_row(case, method, *means, f"**{every:.4f}**", f"{of.changed:.1%}", *costs)
+            print_row(case, method, *means, f"**{every:.4f}**", *costs, *coverage(of))
 
 
 if __name__ == "__main__":

@@ -90,6 +90,13 @@ class SparsePoints(Generic[A]):
         x, y = self.xy.unbind(dim=1)
         return replace(self, xy=torch.stack([self.size[1] - 1 - x, y], dim=1))
 
+    def where(self, mask: A) -> SparsePoints[A]:
+        """Returns the points where mask, (N,) bool, is true; this very object if it is everywhere.
+
+        What is remembered of the object, such as its tree, stays known.
+        """
+        return self if bool(mask.all()) else self.select(mask)
+
     def select(self, mask: Tensor | NDArray[np.bool_] | slice) -> SparsePoints[A]:
         """Returns the points where mask, (N,) bool of the same library, is true; or a slice."""
         return replace(self, xy=self.xy[mask], depth=self.depth[mask])

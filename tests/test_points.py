@@ -103,3 +103,10 @@ def test_a_frame_reaches_half_a_pixel_beyond_its_outermost_pixel_centres() -> No
         assert in_frame(array, (2, 3)).tolist() == [True, True, False, False, False, False]
         closed = in_frame(array, (2, 3), closed=True)
         assert closed.tolist() == [True, True, True, True, False, False]
+
+
+def test_points_that_are_all_wanted_stay_the_same_object_and_others_are_left_out() -> None:
+    xy = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
+    points = SparsePoints(xy=xy, depth=torch.tensor([1.0, 2.0]), size=(4, 4))
+    assert points.where(points.depth > 0) is points
+    assert points.where(points.depth > 1).xy.tolist() == [[2.0, 3.0]]

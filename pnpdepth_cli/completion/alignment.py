@@ -253,7 +253,7 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
         NoPointsError: There is no such point.
     """
     known = prediction.isfinite() & (prediction > 0)
-    seen = points.select(points.sample(torch.where(known, prediction, torch.nan)).isfinite())
+    seen = points.where(points.sample(torch.where(known, prediction, torch.nan)).isfinite())
     if not len(seen):
         raise NoPointsError(
             f"none of the {len(points)} sparse points lies where the network has a prediction"

@@ -6,13 +6,20 @@ themselves. LiDAR points lie close together along a scan line and far apart acro
 predicted from its neighbour on the line, so a fold has whole scan lines. Of other clustered points
 it has whole cells of a grid (blocked cross-validation, Roberts et al. 2017). The cells are as large
 as makes the distances agree.
+
+Of a depth map, depth is asked for in its holes. A pixel beside known ones is not as far from them,
+so `under_holes` lays copies of the holes over the known pixels.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import nearest_points
@@ -23,6 +30,10 @@ _GROWTH = 1.5  # of a cell's side from trial to trial
 _MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
 _SAMPLED = 2000  # pixels and points whose distances are measured
 _SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
+_CELLS = 2.0  # a point, at most, of a depth map: of its pixels at least half are known
+_SURROUNDED = 0.5  # of its points, at least, whose four neighbours are known
+_COPIES = 8  # of the holes, at most
+_AROUND = np.ones((3, 3), np.bool_)  # a pixel and its eight neighbours: one hole
 
 
 def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
@@ -44,6 +55,77 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
             break
         best = _folds_of_cells(points, side, folds, generator)
     return best
+
+
+def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | None:
+    """Returns (N,) bool: points of a depth map under copies of its holes, one of `folds` of all.
+
+    The map of what is unknown is moved over the known pixels, as a whole and around the image's
+    edges, so that the distances to what stays known are those in the holes. Of the last copy only
+    some holes are taken.
+
+    Returns None for points that are no depth map with holes: those of a scanner, at random pixels,
+    or of a map without a hole.
+    """
+    grid = _PixelGrid.of(points)
+    if grid is None:
+        return None
+    known = np.zeros(grid.shape, np.bool_)
+    known[grid.row, grid.column] = True
+    surrounded = ndimage.binary_erosion(known)
+    if known.all() or surrounded.sum() < _SURROUNDED * known.sum():
+        return None
+    # Copies of the holes, until so many points are under them.
+    rng = np.random.default_rng(seed)
+    hidden = np.zeros_like(known)
+    room = int(known.sum()) // folds
+    for _ in range(_COPIES):
+        copy = np.roll(~known, rng.integers(grid.shape), axis=(0, 1)) & known & ~hidden
+        copy = _some_holes(copy, room, rng)
+        hidden |= copy
+        room -= int(copy.sum())
+    return torch.from_numpy(hidden[grid.row, grid.column]) if hidden.any() else None
+
+
+class _PixelGrid(NamedTuple):
+    """The pixels of the depth map that points are of, whose size can differ from the image's."""
+
+    shape: tuple[int, int]
+    row: NDArray[np.intp]
+    """(N,) of each point."""
+    column: NDArray[np.intp]
+    """(N,) of each point."""
+
+    @classmethod
+    def of(cls, points: SparsePoints) -> _PixelGrid | None:
+        """Returns the grid of points; None if they are no depth map, or most of it is unknown."""
+        shape = list[int]()
+        index = list[NDArray[np.intp]]()
+        for at, length in zip(points.xy.cpu().double().numpy().T[::-1], points.size, strict=True):
+            steps = np.diff(np.unique(at))
+            if not len(steps):
+                return None
+            # Areas of pixels scale with the image, as `SparsePoints.resized` moves them.
+            spacing = float(np.median(steps))
+            shape.append(max(1, round(length / spacing)))
+            index.append(((at + 0.5) / spacing).astype(np.intp).clip(0, shape[-1] - 1))
+        if shape[0] * shape[1] > _CELLS * len(points):
+            return None
+        return cls((shape[0], shape[1]), *index)
+
+
+def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """The holes (R, C), or so many whole ones in random order that they have room, in pixels."""
+    if holes.sum() <= room:
+        return holes
+    label, count = ndimage.label(holes, _AROUND)
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    taken = np.zeros(count + 1, np.bool_)
+    for number in 1 + rng.permutation(count):
+        if sizes[number] <= room:
+            taken[number] = True
+            room -= sizes[number]
+    return taken[label]
 
 
 def _folds_of_cells(

@@ -124,7 +124,7 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
     """
     prediction, points = prediction.detach().cpu(), points.tensors()
     inside = in_frame(points.xy, points.size, closed=True)
-    known, points = where_predicted(prediction, points.select(inside))
+    known, points = where_predicted(prediction, points.where(inside))
     points = distinct(points)
     features = features_of(
         torch.where(known, prediction, torch.nan).log(), None if rgb is None else rgb.cpu()

@@ -38,6 +38,8 @@ _FEW = 50  # points a position, at least, where only the triangles at the positi
 _CHUNK = 1 << 18  # positions that are interpolated at once: bounds the memory
 _OUTSIDE, _IN_SQUARE = -1, -2  # instead of a triangle's number
 _TRIANGULATIONS = WeakKeyDictionary[SparsePoints, "Triangulation"]()
+_DISTINCT = WeakKeyDictionary[SparsePoints, SparsePoints]()
+_NEIGHBOURS = WeakKeyDictionary[SparsePoints, Tensor]()
 
 
 def nearest(points: SparsePoints) -> Tensor:
@@ -88,6 +90,7 @@ class Triangulation:
         self._xy = self._points.xy.cpu().double().numpy()
         self._grid = _Grid.of(self._xy)
         self._dense: dict[str, Tensor] = {}
+        self._asked: tuple[Tensor, _Located] | None = None  # the last coordinates
 
     def dense(self, space: str = "depth") -> Tensor:
         """Returns depth (H, W) float32 metres at every pixel, computed once."""
@@ -98,12 +101,18 @@ class Triangulation:
         return self._dense[space]
 
     def at(self, xy: Tensor, space: str = "depth") -> Tensor:
-        """Returns depth (M,) float32 metres at pixel coordinates (M, 2)."""
+        """Returns depth (M,) float32 metres at pixel coordinates (M, 2).
+
+        Where the last coordinates lie is remembered: an expert, the baseline and the standard
+        deviation ask for the same validation points.
+        """
         here = xy.cpu().double().numpy()
-        positions, number = Positions.of(here)
-        few = len(self._rim) > _FEW * len(here)
-        triangles = self._triangles_at(here) if few else self._triangles
-        return self._depth(here, self._located(here, triangles, positions, number), space)
+        if self._asked is None or self._asked[0] is not xy:
+            positions, number = Positions.of(here)
+            few = len(self._rim) > _FEW * len(here)
+            triangles = self._triangles_at(here) if few else self._triangles
+            self._asked = xy, self._located(here, triangles, positions, number)
+        return self._depth(here, self._asked[1], space)
 
     @functools.cached_property
     def _rim(self) -> Numbers:
@@ -247,9 +256,32 @@ def in_hull(points: SparsePoints) -> Tensor:
 def distinct(points: SparsePoints) -> SparsePoints:
     """Returns the points ordered by coordinates; of several at the same coordinates the nearest.
 
+    They are the same object as long as these points are in use, so that all that is found of them,
+    such as neighbours, is found once.
+
     Raises:
         NoPointsError: There is no point.
     """
+    known = _DISTINCT.get(points)
+    if known is None:
+        known = _DISTINCT[points] = _ordered(points)
+    return known
+
+
+def neighbours_of(points: SparsePoints, count: int) -> Tensor:
+    """Returns the numbers (N, count) of the points nearest to each point, itself left out.
+
+    The largest count is remembered as long as the points are in use.
+    """
+    known = _NEIGHBOURS.get(points)
+    if known is None or known.shape[1] < count:
+        _, near = nearest_points(points, points.xy.double(), count + 1)
+        known = _NEIGHBOURS[points] = near[:, 1:]
+    return known[:, :count]
+
+
+def _ordered(points: SparsePoints) -> SparsePoints:
+    """The points ordered by coordinates, the nearest of several at the same ones."""
     if not len(points):
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
     xy, depth = points.xy.cpu().numpy(), points.depth.cpu().numpy()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.completion.gaussian_process import Residuals, leave_one_out, neighbourhoods
-from pnpdepth_cli.completion.interpolation import nearest_points
+from pnpdepth_cli.completion.interpolation import nearest_points, neighbours_of
 from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.points import SparsePoints
 
@@ -73,9 +73,8 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
     """
     if len(points) <= _AGREEING:
         return torch.ones_like(residual)
-    xy = points.xy.double()
-    _, near = nearest_points(points, xy, min(_COMPARED + 1, len(points)))
-    apart = (residual[near[:, 1:]] - residual[:, None]).abs().sort(dim=1).values[:, _AGREEING - 1]
+    near = neighbours_of(points, min(_COMPARED, len(points) - 1))
+    apart = (residual[near] - residual[:, None]).abs().sort(dim=1).values[:, _AGREEING - 1]
     typical = max(MAD_TO_STD * float(apart.median()), _MIN_DISAGREEMENT)
     return (1 - (apart / (ALONE * typical)).square()).clamp_min(0).square()
 
@@ -109,13 +108,16 @@ def inlier_mask(field: Residuals) -> Tensor:
 
 def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:
     """(N,) bool: suspected points most of whose neighbours are suspected, and those beside them."""
+    together = torch.zeros_like(suspected)
     if len(points) <= _AROUND or not bool(suspected.any()):
-        return torch.zeros_like(suspected)
-    _, near = nearest_points(points, points.xy.double(), _AROUND + 1)
+        return together
+    # Only suspected points can be among them, so only their neighbours are sought.
+    (numbers,) = suspected.nonzero(as_tuple=True)
+    _, near = nearest_points(points, points.xy[numbers].double(), _AROUND + 1)
     near = near[:, 1:]
-    together = suspected & (suspected[near].sum(dim=1) >= _MOST_SUSPECTED)
+    together[numbers] = suspected[near].sum(dim=1) >= _MOST_SUSPECTED
     while True:
-        more = together | (suspected & (together[near].sum(dim=1) >= _HALF_SUSPECTED))
-        if torch.equal(more, together):
+        more = together[numbers] | (together[near].sum(dim=1) >= _HALF_SUSPECTED)
+        if torch.equal(more, together[numbers]):
             return together
-        together = more
+        together[numbers] = more

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion.folds import spatial_folds
+from pnpdepth_cli.completion.folds import spatial_folds, under_holes
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.frames.frame import Frame, ValidationPoints
 from pnpdepth_cli.frames.open_network import OpenNetwork
@@ -87,7 +87,11 @@ def split_frame(
     points = whole.whole.points
     if len(points) < MIN_POINTS:
         return whole
-    chosen = spatial_folds(points, FOLDS, seed=seed) == 0
+    chosen = None
+    if not whole.has_scan_lines:
+        chosen = under_holes(points, FOLDS, seed=seed)
+    if chosen is None:
+        chosen = spatial_folds(points, FOLDS, seed=seed) == 0
     kept = replace(whole.whole, points=points.select(~chosen))
     if not bool(chosen.any()) or not all(network.sees(kept) for network in networks):
         return whole

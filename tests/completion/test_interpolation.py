@@ -18,9 +18,11 @@ from pnpdepth_cli.completion import interpolation
 from pnpdepth_cli.completion.alignment import from_space
 from pnpdepth_cli.completion.interpolation import (
     Triangulation,
+    distinct,
     in_hull,
     linear,
     nearest,
+    neighbours_of,
     pixels_of,
 )
 from pnpdepth_cli.errors import NoPointsError
@@ -186,3 +188,33 @@ def test_the_hull_holds_the_pixels_between_three_points_and_none_of_fewer_or_of_
 ) -> None:
     expected = torch.tensor([[(x, y) in inside for x in range(4)] for y in range(3)])
     assert torch.equal(in_hull(points_at(xy, [1.0] * len(xy), (3, 4))), expected)
+
+
+def random_points(count: int, seed: int = 0) -> SparsePoints:
+    generator = torch.Generator().manual_seed(seed)
+    xy = torch.rand(count, 2, generator=generator) * 59
+    return points_at(xy, 1 + torch.rand(count, generator=generator), (60, 60))
+
+
+def test_neighbours_of_points_are_the_nearest_others_however_many_were_asked_for_before() -> None:
+    points = random_points(80)
+    apart = torch.cdist(points.xy.double(), points.xy.double()).fill_diagonal_(torch.inf)
+    for count in (3, 8, 5):
+        assert torch.equal(neighbours_of(points, count), apart.argsort(dim=1)[:, :count])
+
+
+def test_the_same_points_have_one_ordered_set_as_long_as_they_are_in_use() -> None:
+    points = random_points(20)
+    other = random_points(20)
+    assert distinct(points) is distinct(points)
+    assert distinct(other) is not distinct(points)
+
+
+def test_depth_asked_for_at_other_coordinates_is_not_that_of_the_last_ones() -> None:
+    triangulation = Triangulation(random_points(40))
+    here = random_points(9, 1).xy
+    there = random_points(9, 2).xy
+    first = triangulation.at(here)
+    assert torch.equal(triangulation.at(there), Triangulation(random_points(40)).at(there))
+    assert torch.equal(triangulation.at(here), first)
+    assert torch.equal(triangulation.at(here), first)
