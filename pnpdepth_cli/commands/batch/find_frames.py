@@ -17,6 +17,7 @@ from pnpdepth_cli.dataset import frame_files
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, as_pose, groups_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
+from pnpdepth_cli.file_record import file_and_part
 from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
@@ -240,8 +241,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     files, scan = request.files, request.reading.scan
     sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
     for number, depth in enumerate(files.depths, 1):
-        name, has_part, _ = depth.name.rpartition(":")  # as of FILE.npz:KEY
-        sources[f"depth {number}"] = depth.with_name(name) if has_part else depth
+        sources[f"depth {number}"], _ = file_and_part(depth)
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.
