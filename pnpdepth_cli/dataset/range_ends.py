@@ -77,12 +77,13 @@ def far_end(values: Floats) -> _End:
 
 def near_end(values: Floats) -> _End:
     """Returns which of depths (N,) above 0 stand for an unknown one, and its value."""
-    if not len(values) or float(values.min()) > _NEAR_M or len(np.unique(values)) < _VALUES:
-        return _End(np.zeros(len(values), bool), 0.0, 0.0)
+    none = _End(np.zeros(len(values), bool), 0.0, 0.0)
+    if not len(values) or float(values.min()) > _NEAR_M:
+        return none
     with np.errstate(divide="ignore"):
         end = _end(1 / values, 1 / _NEAR_M)
-    if not end.is_none.any():
-        return end
+    if not end.is_none.any() or len(np.unique(values)) < _VALUES:
+        return none
     return _End(end.is_none, 1 / end.value, 1 / end.rest)
 
 
@@ -93,9 +94,13 @@ def repeated_ends(values: NDArray[np.float32]) -> list[tuple[float, int]]:
     value, and if it is stored in steps, a step at the end holds no more than those before it. So
     one value for many at either end is the sky, a clip, a far plane, or stands for unknown.
     """
-    distinct, counts = np.unique(values, return_counts=True)
-    enough = max(_LEAST_SPIKE, _SAME * len(values))
     found = list[tuple[float, int]]()
+    enough = max(_LEAST_SPIKE, _SAME * len(values))
+    if not len(values) or enough > max(
+        np.count_nonzero(values == values.min()), np.count_nonzero(values == values.max())
+    ):
+        return found
+    distinct, counts = np.unique(values, return_counts=True)
     for step in (1, -1):  # from the smallest up, from the largest down
         inwards, of_each = distinct[::step], counts[::step]
         at = 0
