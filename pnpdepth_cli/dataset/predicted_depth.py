@@ -197,6 +197,8 @@ def _load_picture(path: Path, kind: str) -> DepthFile:
         )
     grey = np.median(levels, axis=2)
     source = f"{bits}-bit grey {kind}"
+    if kind in ("JPEG", "WEBP"):
+        source += ", whose compression changes numbers"
     if picture.note is not None:
         source += f", {picture.note}"
     dtype = np.uint8 if bits == 8 else np.uint16
@@ -320,22 +322,21 @@ def _add_marks(unknown: _Unknown, values: Map) -> None:
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
     """Extreme values that many pixels have: the sky, a far plane, a clip, also of 1/disparity."""
-    # Exactly one value.
-    for value, _ in repeated_ends(unknown.others):
-        end = "smallest" if value <= float(unknown.others.min()) else "largest"
-        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {end} value")
     # About one value, far from all others and mixed with them at its edges.
     known = unknown.others.astype(np.float64)
-    if not known.size or known.min() <= 0:
-        return
-    place = ~unknown.mask
-    for end_of, reach in (
-        (far_end(known), "98 % of the others are at most"),
-        (near_end(known), "98 % of the others are at least"),
-    ):
-        found = np.zeros(values.shape, bool)
-        found[place] = end_of.is_none
-        unknown.add(found, f"about {end_of.value:.4g}, where {reach} {end_of.rest:.4g}")
+    if known.min(initial=np.inf) > 0:
+        place = ~unknown.mask
+        for end, reach in (
+            (far_end(known), "98 % of the others are at most"),
+            (near_end(known), "98 % of the others are at least"),
+        ):
+            found = np.zeros(values.shape, bool)
+            found[place] = end.is_none
+            unknown.add(found, f"about {end.value:.6g}, where {reach} {end.rest:.4g}")
+    # Exactly one value.
+    for value, _ in repeated_ends(unknown.others):
+        name = "smallest" if value <= float(unknown.others.min()) else "largest"
+        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")
 
 
 def _is_8_bit(codes: NDArray[Any]) -> bool:

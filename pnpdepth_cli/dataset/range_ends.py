@@ -26,7 +26,7 @@ _BEYOND_MOST = 8.0  # times the 90th percentile of the rest, where all are exact
 _ABOVE = 1.5  # times the largest of the rest
 _FAR_M, _NEAR_M = 40.0, 0.12  # beyond which surfaces are rare
 _SPIKE, _LEAST_SPIKE = 3.0, 10  # times as many as have any other value, and how many
-_NEXT = 10  # distinct values beside an extreme one, none of which may have so many
+_NEXT = 10  # distinct values beside an extreme one, of which one may have as many
 _VALUES = 20  # distinct ones; fewer are of a drawing
 _FAR = 1000.0  # times the median depth; no point of an image is farther
 
@@ -106,7 +106,8 @@ def repeated_ends(values: NDArray[np.float32]) -> list[tuple[float, int]]:
         at = 0
         # Behind one such value there may be another: unknown as -1, and a clip.
         while len(distinct) - at > _VALUES and of_each[at] >= enough:
-            if of_each[at] < _SPIKE * of_each[at + 1 : at + 1 + _NEXT].max():
+            usual = np.sort(of_each[at + 1 : at + 1 + _NEXT])[-2]
+            if of_each[at] < _SPIKE * usual:
                 break
             found.append((float(inwards[at]), int(of_each[at])))
             at += 1
