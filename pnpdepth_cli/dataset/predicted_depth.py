@@ -197,6 +197,8 @@ def _load_picture(path: Path, kind: str) -> DepthFile:
         )
     grey = np.median(levels, axis=2)
     source = f"{bits}-bit grey {kind}"
+    if kind in ("JPEG", "WEBP"):
+        source += ", whose compression changes numbers"
     if picture.note is not None:
         source += f", {picture.note}"
     dtype = np.uint8 if bits == 8 else np.uint16
@@ -304,40 +306,37 @@ def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
 
 
 def _add_marks(unknown: _Unknown, values: Map) -> None:
-    """0, unless it is one of many numbers of both signs; and the only number below 0."""
+    """The only number below 0; and 0, unless it is one of many numbers of both signs."""
+    others = unknown.others
+    below = np.unique(others[others < 0])
+    if len(below) == 1 and others.max(initial=0) > 0:
+        unknown.add(values == below[0], f"{below[0]:.6g}, the only number below 0")
     others = unknown.others
     zeros = int(np.count_nonzero(others == 0))
-    has_both_signs = bool(others.min(initial=0) < 0 < others.max(initial=0))
-    if zeros and has_both_signs:
+    if zeros and others.min() < 0 < others.max():
         counts = np.unique(others[others != 0], return_counts=True)[1]
-        is_mark = zeros >= max(_FILLED * values.size, _MORE * int(counts.max()))
-    else:
-        is_mark = zeros > 0
-    if is_mark:
-        unknown.add(values == 0, "0")
-    below = np.unique(unknown.others[unknown.others < 0])
-    if len(below) == 1 and has_both_signs:
-        unknown.add(values == below[0], f"{below[0]:.6g}, the only number below 0")
+        if zeros < max(_FILLED * values.size, _MORE * int(counts.max())):
+            return
+    unknown.add(values == 0, "0")
 
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
     """Extreme values that many pixels have: the sky, a far plane, a clip, also of 1/disparity."""
-    # Exactly one value.
-    for value, _ in repeated_ends(unknown.others):
-        end = "smallest" if value <= float(unknown.others.min()) else "largest"
-        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {end} value")
     # About one value, far from all others and mixed with them at its edges.
     known = unknown.others.astype(np.float64)
-    if not known.size or known.min() <= 0:
-        return
-    place = ~unknown.mask
-    for end_of, reach in (
-        (far_end(known), "98 % of the others are at most"),
-        (near_end(known), "98 % of the others are at least"),
-    ):
-        found = np.zeros(values.shape, bool)
-        found[place] = end_of.is_none
-        unknown.add(found, f"about {end_of.value:.4g}, where {reach} {end_of.rest:.4g}")
+    if known.min(initial=np.inf) > 0:
+        place = ~unknown.mask
+        for end, reach in (
+            (far_end(known), "98 % of the others are at most"),
+            (near_end(known), "98 % of the others are at least"),
+        ):
+            found = np.zeros(values.shape, bool)
+            found[place] = end.is_none
+            unknown.add(found, f"about {end.value:.6g}, where {reach} {end.rest:.4g}")
+    # Exactly one value.
+    for value, _ in repeated_ends(unknown.others):
+        name = "smallest" if value <= float(unknown.others.min()) else "largest"
+        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")
 
 
 def _is_8_bit(codes: NDArray[Any]) -> bool:
@@ -354,14 +353,21 @@ def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
     """Lines on a map of few different numbers. InputError for one of none, or of one number."""
     known = values[np.isfinite(values)]
     if not known.size:
-        raise InputError(f"{path} has no known depth, only 0, NaN, infinite or clipped; {_RAW}")
-    different = len(np.unique(known))
-    if different == 1:
+        raise InputError(
+            f"{path} has no known depth: every number is 0, NaN, infinite or clipped; give another"
+            " map"
+        )
+    if known.min() == known.max():
         raise InputError(
             f"{path} is {known[0]:g} at all of its {known.size:,} known pixels, as a mask is; give"
             " the depth map"
         )
-    if known.size < _MANY or different > _STEPS:
+    # Most maps show by a part that they have more.
+    part = known[:: max(1, known.size // _SAMPLED)]
+    if known.size < _MANY or len(np.unique(part)) > _STEPS:
+        return []
+    different = len(np.unique(known))
+    if different > _STEPS:
         return []
     if different < _FEW:
         return [f"warning: {different} different numbers only, as of labels or a drawing"]
@@ -414,8 +420,8 @@ def _check_view(path: Path, own: tuple[int, ...], size: Size) -> str:
                 " give the image as it was given to the network"
             )
         raise InputError(
-            f"{path} is {sizes}, another aspect ratio, so it was cropped or padded; save depth of"
-            " the whole image"
+            f"{path} is {sizes}, another aspect ratio: cropped, padded or stretched; save it as it"
+            " covers the image, at the image's size"
         )
     note = f"{sizes}; it is resized by linear interpolation"
     if min(columns, rows) > 1:

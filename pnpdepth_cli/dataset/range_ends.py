@@ -26,7 +26,7 @@ _BEYOND_MOST = 8.0  # times the 90th percentile of the rest, where all are exact
 _ABOVE = 1.5  # times the largest of the rest
 _FAR_M, _NEAR_M = 40.0, 0.12  # beyond which surfaces are rare
 _SPIKE, _LEAST_SPIKE = 3.0, 10  # times as many as have any other value, and how many
-_NEXT = 10  # distinct values beside an extreme one, none of which may have so many
+_NEXT = 10  # distinct values beside an extreme one, of which one may have as many
 _VALUES = 20  # distinct ones; fewer are of a drawing
 _FAR = 1000.0  # times the median depth; no point of an image is farther
 
@@ -77,12 +77,13 @@ def far_end(values: Floats) -> _End:
 
 def near_end(values: Floats) -> _End:
     """Returns which of depths (N,) above 0 stand for an unknown one, and its value."""
-    if not len(values) or float(values.min()) > _NEAR_M or len(np.unique(values)) < _VALUES:
-        return _End(np.zeros(len(values), bool), 0.0, 0.0)
+    none = _End(np.zeros(len(values), bool), 0.0, 0.0)
+    if not len(values) or float(values.min()) > _NEAR_M:
+        return none
     with np.errstate(divide="ignore"):
         end = _end(1 / values, 1 / _NEAR_M)
-    if not end.is_none.any():
-        return end
+    if not end.is_none.any() or len(np.unique(values)) < _VALUES:
+        return none
     return _End(end.is_none, 1 / end.value, 1 / end.rest)
 
 
@@ -93,15 +94,20 @@ def repeated_ends(values: NDArray[np.float32]) -> list[tuple[float, int]]:
     value, and if it is stored in steps, a step at the end holds no more than those before it. So
     one value for many at either end is the sky, a clip, a far plane, or stands for unknown.
     """
-    distinct, counts = np.unique(values, return_counts=True)
-    enough = max(_LEAST_SPIKE, _SAME * len(values))
     found = list[tuple[float, int]]()
+    enough = max(_LEAST_SPIKE, _SAME * len(values))
+    if not len(values) or enough > max(
+        np.count_nonzero(values == values.min()), np.count_nonzero(values == values.max())
+    ):
+        return found
+    distinct, counts = np.unique(values, return_counts=True)
     for step in (1, -1):  # from the smallest up, from the largest down
         inwards, of_each = distinct[::step], counts[::step]
         at = 0
         # Behind one such value there may be another: unknown as -1, and a clip.
         while len(distinct) - at > _VALUES and of_each[at] >= enough:
-            if of_each[at] < _SPIKE * of_each[at + 1 : at + 1 + _NEXT].max():
+            usual = np.sort(of_each[at + 1 : at + 1 + _NEXT])[-2]
+            if of_each[at] < _SPIKE * usual:
                 break
             found.append((float(inwards[at]), int(of_each[at])))
             at += 1

@@ -307,6 +307,22 @@ def test_unknown_and_the_sky_are_found_behind_each_other(tmp_path: Path) -> None
     assert len(depth.notes) == 3
 
 
+def test_few_zeros_are_unknown_also_beside_minus_1(tmp_path: Path) -> None:
+    values = np.where(FAR, -1, KNOWN).astype(np.float32)
+    values[40, :3] = 0
+    unknown = FAR.copy()
+    unknown[40, :3] = True
+    depth = read(save(tmp_path / "a.npy", values))
+    np.testing.assert_array_equal(depth.values, unknown_where(values, unknown))
+
+
+def test_few_zeros_of_logarithms_are_a_number_as_others(tmp_path: Path) -> None:
+    values = np.log(RNG.uniform(0.1, 5, SIZE)).astype(np.float32)
+    values[40, :3] = 0
+    depth = read(save(tmp_path / "a.npy", values))
+    np.testing.assert_array_equal(depth.values, values)
+
+
 @pytest.mark.parametrize(
     "values",
     [
@@ -499,6 +515,11 @@ def test_a_file_of_one_map_has_no_part(name: str, tmp_path: Path) -> None:
     path = save(tmp_path / name, CODES)
     with pytest.raises(InputError, match="depth"):
         read(Path(f"{path}:depth"))
+
+
+def test_a_file_may_have_a_colon_in_its_name(tmp_path: Path) -> None:
+    path = save(tmp_path / "12:30.npy", DISPARITY)
+    assert read(path).source.path == str(path)
 
 
 def test_few_numbers_are_said_as_labels_have_them(tmp_path: Path) -> None:

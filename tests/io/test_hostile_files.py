@@ -22,6 +22,7 @@ from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
 from pnpdepth_cli.io.file_bytes import read_json, sha256_of
+from pnpdepth_cli.io.formats import list_npz
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from tests.models.weights.files import little
@@ -173,3 +174,32 @@ def test_more_pixels_than_the_budget_are_refused_unread(tmp_path: Path, suffix: 
         assert read_depth(path).values.shape == (300, 400)
     finally:
         set_max_pixels(None)
+
+
+def archive_of(members: dict[str, list[bytes]]) -> bytes:
+    """A compressed archive of these members, each in pieces."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, pieces in members.items():
+            with archive.open(name, "w") as member:
+                for piece in pieces:
+                    member.write(piece)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"a.npy": [b"\x93NUMPY\x02\x00" + struct.pack("<I", 1 << 30), *[b" " * (1 << 20)] * 200]},
+        {f"{number}.npy": [b""] for number in range(2000)},
+        {"a.npy": [b"no array"]},
+        {"data.pkl": [b"a checkpoint"]},
+    ],
+    ids=["a long header", "many arrays", "no header", "no arrays"],
+)
+def test_the_arrays_of_an_archive_are_listed_in_little_memory(
+    members: dict[str, list[bytes]],
+) -> None:
+    data = archive_of(members)
+    with little(), pytest.raises(InputError, match=r"a\.npz"):
+        list_npz(Path("a.npz"), data)
