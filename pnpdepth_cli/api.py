@@ -89,6 +89,7 @@ def refine(
     camera: ArrayLike | Camera | None = None,
     stages: bool = False,
     uncertainty: bool = False,
+    keep_measured: bool = False,
     registration: Registration = "auto",
 ) -> Refined:
     """Returns the refined depth of one frame.
@@ -104,6 +105,7 @@ def refine(
         camera: Intrinsics (3, 3) in pixels of the image, or a Camera.
         stages: Whether the depth after each step is returned too, as `Refined.stages`.
         uncertainty: Whether the standard deviation of the depth is estimated too.
+        keep_measured: Whether the depth of points at whole pixels is kept there exactly.
         registration: Whether the image is moved to the points: "auto", "off", or (zoom, right,
             down).
 
@@ -111,7 +113,13 @@ def refine(
         InputError: Image, points or camera cannot be used.
         DivergedError: The loss became non-finite; `last_good` is the Refined before that.
     """
-    with Refiner(network, settings, uncertainty=uncertainty, registration=registration) as refiner:
+    with Refiner(
+        network,
+        settings,
+        uncertainty=uncertainty,
+        keep_measured=keep_measured,
+        registration=registration,
+    ) as refiner:
         return refiner.refine(image, sparse, unit=unit, depth=depth, camera=camera, stages=stages)
 
 

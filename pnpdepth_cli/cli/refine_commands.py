@@ -67,7 +67,7 @@ _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\
             *(ScanOptions, ReadOptions),
         ),
         "Network": _NETWORK,
-        "Method": (Settings, "--uncertainty", "--holdout"),
+        "Method": (Settings, "--uncertainty", "--keep-measured", "--holdout"),
         "Output": ("--output", RefineRequest, "--json"),
     },
 )
@@ -143,7 +143,7 @@ def refine(as_json: bool, **values: Any) -> None:
         "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
         "Input": ("--min-confidence", ScanOptions, ReadOptions),
         "Network": _NETWORK,
-        "Method": (Settings, "--baselines", "--uncertainty", "--holdout"),
+        "Method": (Settings, "--baselines", "--uncertainty", "--keep-measured", "--holdout"),
         "Study": ("--vary",),
         "Output": ("--output", RefineRequest, BatchRequest),
         "Cluster": ("--ray",),

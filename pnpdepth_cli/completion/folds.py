@@ -31,6 +31,7 @@ _MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
 _SAMPLED = 2000  # pixels and points whose distances are measured
 _SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
 _CELLS = 2.0  # a point, at most, of a depth map: of its pixels at least half are known
+_SQUARE = 1.5  # height of a map's pixel over its width, at most; lines are farther apart
 _SURROUNDED = 0.5  # of its points, at least, whose four neighbours are known
 _COPIES = 8  # of the holes, at most
 _AROUND = np.ones((3, 3), np.bool_)  # a pixel and its eight neighbours: one hole
@@ -100,6 +101,7 @@ class _PixelGrid(NamedTuple):
     def of(cls, points: SparsePoints) -> _PixelGrid | None:
         """Returns the grid of points; None if they are no depth map, or most of it is unknown."""
         shape = list[int]()
+        spacings = list[float]()
         index = list[NDArray[np.intp]]()
         for at, length in zip(points.xy.cpu().double().numpy().T[::-1], points.size, strict=True):
             steps = np.diff(np.unique(at))
@@ -107,9 +109,10 @@ class _PixelGrid(NamedTuple):
                 return None
             # Areas of pixels scale with the image, as `SparsePoints.resized` moves them.
             spacing = float(np.median(steps))
+            spacings.append(spacing)
             shape.append(max(1, round(length / spacing)))
             index.append(((at + 0.5) / spacing).astype(np.intp).clip(0, shape[-1] - 1))
-        if shape[0] * shape[1] > _CELLS * len(points):
+        if max(spacings) > _SQUARE * min(spacings) or shape[0] * shape[1] > _CELLS * len(points):
             return None
         return cls((shape[0], shape[1]), *index)
 

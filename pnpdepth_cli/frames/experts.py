@@ -41,6 +41,9 @@ LEAST_UNEXPLAINED = 0.02
 """Least such quotient. Several networks share the prior weights by its inverse square."""
 FITTED = 2
 """Parameters of an alignment, which explain so many points by themselves."""
+HARMFUL = 1.05
+"""Error at the validation points with updates of z, over that without, from which on updates that
+the user states are not used."""
 WITH_PRIOR = 0.45
 """Prior weight of `compact` with that network's depth as a prior. Without one it has the rest."""
 WITHOUT_IMAGE = 0.05
@@ -89,6 +92,9 @@ class NetworkExpert(Expert):
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
     unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
     not_updated: float = 0.0  # 0…1, the part that the aligned depth has beside the updated one
+    harm: tuple[float, float] | None = None
+    """Errors in metres at the validation points without and with updates of z, if these are not
+    used because of them."""
 
     @property
     def strength(self) -> float:
@@ -178,12 +184,22 @@ def expert_of(
     of_kept = of_whole
     not_updated = 0.0 if network.always_updated else strength_of(unexplained)
     at = updated = split.points.depth
+    harm = None
     if len(split.points):
-        again = network.always_updated or not network.takes_points
+        again = network.tuned or network.always_updated or not network.takes_points
         of_kept = network.refine(kept, updates=updates and again and not_updated < 1)
         field = ResidualField(_less_updated(of_kept, not_updated), kept.points, kept.rgb)
         at = field.depth(split.points.xy, kind=split.propagation)
         updated = split.points.sample(of_kept.updated)
+        # Updates that the user states may do harm, such as at a layer near to the depth.
+        if network.tuned and of_kept.updates and not_updated < 1:
+            plain = ResidualField(of_kept.aligned, kept.points, kept.rgb)
+            without = plain.depth(split.points.xy, kind=split.propagation)
+            errors = split.error(without), split.error(at)
+            if errors[1] > HARMFUL * errors[0]:
+                harm = errors
+                at = without
+                not_updated = 1.0
     return NetworkExpert(
         name=name,
         at=at,
@@ -196,6 +212,7 @@ def expert_of(
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
         unexplained=unexplained,
         not_updated=not_updated,
+        harm=harm,
     )
 
 

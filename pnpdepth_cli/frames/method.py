@@ -15,6 +15,7 @@ import torch
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Frame, Refined, Register
+from pnpdepth_cli.frames.measured import with_measured, with_note_on_measured
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
 from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
@@ -92,6 +93,7 @@ class Method:
         more: Function of further frames, which decide as well; called only if a network needs it.
         validated: Whether the paper's method is validated, for which each frame is refined again.
         uncertainty: Whether the standard deviation of the depth is estimated too.
+        keep_measured: Whether the result has the points' own depth at their pixels.
 
     Raises:
         UsageError: The settings contradict each other.
@@ -107,10 +109,12 @@ class Method:
         *,
         validated: bool = False,
         uncertainty: bool = False,
+        keep_measured: bool = False,
     ) -> None:
         self.asked = asked
         self.pipeline = pipeline_of(asked, validated=validated or uncertainty)
         self._uncertainty = uncertainty
+        self._keep_measured = keep_measured
         self.registrations: dict[tuple[int, int], Register] = {}
         """How images of a size are moved to their points, where several frames decided it."""
         self._stack = ExitStack()
@@ -172,6 +176,8 @@ class Method:
         refined = refine_frame(
             self.members, frame, self.pipeline, seed=seed, with_stages=with_stages
         )
+        follow = with_measured if self._keep_measured else with_note_on_measured
+        refined = follow(refined)
         if not self._uncertainty:
             return refined
         source = frame.sources.get("sparse")  # only a COLMAP model names an image

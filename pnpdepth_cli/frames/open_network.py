@@ -65,6 +65,8 @@ class OpenNetwork:
         coarse: Whether z is updated by a smaller depth, which is faster, if the definition gives
             one.
         always_updated: Whether z is updated in every frame, also where that gains nothing.
+        tuned: Whether the user states how z is updated, so that validation points tell whether that
+            gains anything.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class OpenNetwork:
         *,
         coarse: bool = False,
         always_updated: bool = False,
+        tuned: bool = False,
     ) -> None:
         definition = network.definition
         self.network, self.layer, self.settings = network, layer, settings
@@ -82,6 +85,7 @@ class OpenNetwork:
         self.takes_points = "sparse" in definition.input_kind
         self.takes_prior = definition.takes_prior
         self.always_updated = always_updated
+        self.tuned = tuned
         self._coarse = definition.coarse if coarse else None
         self._of_image_only = definition.input_kind in ("rgb", "map")
         self._open = ExitStack()

@@ -209,7 +209,13 @@ def _refined(
         )
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
     not_updated = experts.own.not_updated
-    if not_updated > 0:
+    if experts.own.harm is not None:
+        without, with_updates = experts.own.harm
+        notes.append(
+            f"{experts.own.name}: these updates of z are not used, as they raise its error at"
+            f" {len(split.points):,} validation points from {without:.4f} to {with_updates:.4f}"
+        )
+    elif not_updated > 0:
         notes.append(
             f"{experts.own.name} is strong: its depth makes points predict each other far better;"
             f" {not_updated:.0%} of it is without updates of z"
@@ -246,7 +252,7 @@ def _stages(
 
     own = experts.own
     stages = {BEFORE: own.whole.aligned}
-    if own.whole.updates and own.not_updated < 1:
+    if own.whole.updates and (own.not_updated < 1 or own.harm is not None):
         stages[UPDATED] = own.whole.updated
     if own.of_scanner:
         stages[PROPAGATED] = own.whole.updated

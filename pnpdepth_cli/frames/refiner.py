@@ -60,6 +60,7 @@ class Refiner:
         settings: The method and values for its steps; what they leave open, the network decides.
             The values are for the first network, if there are several.
         uncertainty: Whether the standard deviation of the depth is estimated too.
+        keep_measured: Whether the depth of points at whole pixels is kept there exactly.
         registration: Whether images are moved to their points: "auto", if their depth edges show
             that they are not registered; "off"; or by (zoom, right, down), pixels.
         adapt: Frames of the same sequence, (image, sparse) each. Before the first frame is refined,
@@ -78,6 +79,7 @@ class Refiner:
         settings: Settings | None = None,
         *,
         uncertainty: bool = False,
+        keep_measured: bool = False,
         registration: Registration = "auto",
         adapt: Sequence[Pair] = (),
     ) -> None:
@@ -88,6 +90,7 @@ class Refiner:
             raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
         self._asked = settings or Settings()
         self._uncertainty = uncertainty
+        self._keep_measured = keep_measured
         self._register = registration_to_make(registration, self._asked)
         self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
         self._method: Method | None = None
@@ -194,7 +197,13 @@ class Refiner:
                 if self._adapt:
                     resolved = resolve_definition(networks[0], first.registered())
                     networks[0] = self._adapt_network(resolved, opening)
-                method = Method(networks, self._asked, first, uncertainty=self._uncertainty)
+                method = Method(
+                    networks,
+                    self._asked,
+                    first,
+                    uncertainty=self._uncertainty,
+                    keep_measured=self._keep_measured,
+                )
                 self._method = opening.enter_context(method)
                 self._stack = opening.pop_all()
         return self._method

@@ -166,6 +166,7 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
         # The smaller depth is computed from the network's own layer, not from any other.
         coarse=asked.layer is None,
         always_updated=asked.iterations is not None,
+        tuned=bool(asked.of_updates),
     )
 
 

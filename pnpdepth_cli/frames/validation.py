@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.folds import spatial_folds, under_holes
 from pnpdepth_cli.completion.outliers import inlier_weights
-from pnpdepth_cli.frames.frame import Frame, ValidationPoints
+from pnpdepth_cli.frames.frame import Frame, ValidationPoints, is_dense
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.scan_pattern import scan_pattern
 
@@ -88,7 +88,7 @@ def split_frame(
     if len(points) < MIN_POINTS:
         return whole
     chosen = None
-    if not whole.has_scan_lines:
+    if is_dense(points) and not whole.has_scan_lines:
         chosen = under_holes(points, FOLDS, seed=seed)
     if chosen is None:
         chosen = spatial_folds(points, FOLDS, seed=seed) == 0

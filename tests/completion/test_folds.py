@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from pnpdepth_cli.completion.folds import spatial_folds
+from pnpdepth_cli.completion.folds import spatial_folds, under_holes
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 
@@ -60,3 +60,71 @@ def test_of_clustered_points_whole_cells_are_held_out_as_far_off_as_pixels_are(s
     )
     assert 0.85 * of_pixels < apart < 2.8 * of_pixels
     assert held.sum() == pytest.approx(180, abs=20)
+
+
+def map_with_holes(radius: int, *, size: tuple[int, int] = (120, 160), seed: int = 0) -> np.ndarray:
+    """Which pixels of a depth map are known: all but some discs."""
+    rng = np.random.default_rng(seed)
+    row, column = np.indices(size)
+    known = np.ones(size, np.bool_)
+    while known.mean() > 0.85:
+        y, x = rng.uniform((0, 0), size)
+        known &= np.hypot(row - y, column - x) > radius
+    return known
+
+
+def points_of(known: np.ndarray) -> SparsePoints:
+    row, column = known.nonzero()
+    return points_at(torch.from_numpy(np.stack([column, row], axis=1)), known.shape)
+
+
+@pytest.mark.parametrize("radius", [3, 8, 16])
+@pytest.mark.parametrize("zoom", [1, 3])
+def test_points_under_copies_of_holes_are_as_far_from_the_others_as_pixels_in_holes(
+    radius: int, zoom: int
+) -> None:
+    known = map_with_holes(radius)
+    height, width = known.shape
+    points = points_of(known).resized(zoom * height, zoom * width)
+    held = under_holes(points, 5, seed=1)
+    assert held is not None
+    apart = nearest_points(points.select(~held), points.xy[held].double(), 1)[0].median() / zoom
+    unknown = torch.from_numpy(np.argwhere(~known)[:, ::-1].copy())
+    in_holes = nearest_points(points_of(known), unknown.double(), 1)[0].median()
+    assert 0.6 * float(in_holes) < float(apart) < 1.7 * float(in_holes)
+    assert 0.1 * len(points) < int(held.sum()) <= len(points) // 5
+
+
+def test_only_a_map_with_holes_has_points_under_copies_of_them() -> None:
+    rng = np.random.default_rng(0)
+    assert under_holes(points_of(map_with_holes(4)), 5) is not None
+    assert under_holes(points_of(np.ones((90, 120), np.bool_)), 5) is None
+    for part in (0.02, 0.3, 0.6):
+        assert under_holes(points_of(rng.uniform(size=(90, 120)) < part), 5) is None
+    between = torch.from_numpy(rng.uniform(0, 89, (8000, 2)))
+    assert under_holes(points_at(between, (90, 90)), 5) is None
+    assert under_holes(on_lines(5, 1), 5) is None
+    assert under_holes(points_at(torch.zeros(1, 2)), 5) is None
+
+
+def test_copies_of_holes_follow_the_seed() -> None:
+    points = points_of(map_with_holes(6))
+    first, same, other = (under_holes(points, 5, seed=seed) for seed in (0, 0, 1))
+    assert first is not None
+    assert same is not None
+    assert other is not None
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_of_a_large_hole_that_is_more_than_a_fold_nothing_is_hidden_but_small_ones_beside_it() -> (
+    None
+):
+    known = np.ones((100, 100), np.bool_)
+    known[20:80, 20:80] = False
+    alone = under_holes(points_of(known), 5)
+    assert alone is None or int(alone.sum()) <= 6400 // 5
+    known[2:6, 2:6] = False
+    beside = under_holes(points_of(known), 5)
+    assert beside is not None
+    assert 0 < int(beside.sum()) <= 6400 // 5

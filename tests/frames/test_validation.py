@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.frames.validation import FOLDS, split_frame, whole_frame
+from pnpdepth_cli.points import SparsePoints
 from tests.frames.scenes import depth_of_scene, frame_in_memory, split_of
 
 
@@ -37,3 +39,21 @@ def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> No
     assert kept | held <= whole
     assert not kept & held
     assert torch.equal(split.weights != 0, split.points.xy[:, 0] < 100)  # where a depth is known
+
+
+def test_validation_points_of_a_depth_map_are_under_copies_of_its_holes() -> None:
+    judged = depth_of_scene()
+    known = torch.rand(judged.shape, generator=torch.Generator().manual_seed(0)) > 1e-3
+    holes = torch.nn.functional.max_pool2d((~known)[None].float(), 9, 1, 4)[0] > 0
+    row, column = (~holes).nonzero(as_tuple=True)
+    points = SparsePoints(
+        xy=torch.stack([column, row], dim=1).float(),
+        depth=judged[row, column],
+        size=(judged.shape[0], judged.shape[1]),
+    )
+    frame = replace(frame_in_memory(), points=points)
+    split = split_frame(whole_frame(frame, None), judged, [], seed=0)
+    apart, _ = nearest_points(split.kept.points, split.points.xy.double(), 1)
+    assert not split.has_scan_lines
+    assert float(apart.max()) >= 3
+    assert 0 < len(points) - len(split.kept.points) <= len(points) // FOLDS

@@ -96,6 +96,7 @@ def load_method(
         more,
         validated=request.baselines,
         uncertainty=request.uncertainty or request.unknown == "zero",
+        keep_measured=request.keep_measured,
     )
 
 
@@ -191,6 +192,7 @@ def _record_of(
             "propagate": refined.propagation,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
+            "keep_measured": request.keep_measured,
             "holdout": request.holdout,
             "device": str(network.device),
         },

@@ -58,6 +58,9 @@ class RefineRequest:
     uncertainty: bool = option(
         False, "Write the depth's standard deviation and a mask of valid depth."
     )
+    keep_measured: bool = option(
+        False, "Keep the measured depth at its pixels, as of a depth camera whose holes are filled."
+    )
     holdout: float = option(0.0, "Hold out this fraction of the points to score at.", metavar="F")
     # Where results go, and in which form.
     output: Path | None = None
