@@ -185,7 +185,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
     except ImportError:
         raise UsageError("--figure needs matplotlib: pip install matplotlib") from None
     rows = list(dict.fromkeys(run["row"] for run in runs))
-    figure = Figure(figsize=(9, 0.55 * len(rows) + 1.3), layout="constrained")
+    figure = Figure(figsize=(9, 0.5 * len(rows) + 1.4), layout="constrained")
     panels = figure.subplots(1, len(DRAWN), sharex=True, sharey=True)
     for count, axes in zip(DRAWN, panels, strict=True):
         for place, row in enumerate(rows):
@@ -195,19 +195,22 @@ def draw(runs: Sequence[Run], path: Path) -> None:
             own = geometric_mean(some, BEFORE)
             ratio = geometric_mean(some, AFTER) / own
             axes.barh(place, ratio, height=0.6, color="tab:blue")
-            axes.text(ratio * 1.06, place, f"{ratio:.2f}", va="center", fontsize=9)
+            axes.text(ratio / 1.06, place, f"{ratio:.2f}", va="center", ha="right", color="white")
             of_linear = geometric_mean(some, LINEAR) / own
             axes.plot(of_linear, place, marker="D", color="tab:orange", linestyle="none")
         axes.axvline(1, color="black", linewidth=0.8)
         axes.set_title(f"{count} points", fontsize=10)
         axes.set_xscale("log")
-        axes.set_xticks([0.05, 0.1, 0.2, 0.5, 1, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])
+        axes.set_xlim(0.02, 5)
+        axes.set_xticks([0.05, 0.2, 1, 4], ["0.05", "0.2", "1", "4"])
         axes.minorticks_off()
-    frames = {row: len({run["frame"] for run in runs if run["row"] == row}) for row in rows}
-    panels[0].set_yticks(range(len(rows)), [f"{row} ({frames[row]})" for row in rows])
+    maps = {row: len({run["frame"] for run in runs if run["row"] == row}) for row in rows}
+    panels[0].set_yticks(range(len(rows)), [f"{row} ({maps[row]})" for row in rows])
     panels[0].invert_yaxis()
-    figure.supxlabel("MAE of the result (bar) and of linear interpolation (◆) over that of the"
-                     " aligned network", fontsize=10)  # fmt: skip
+    figure.supxlabel(
+        "MAE of the result (bar) and of linear interpolation (diamond), MAE of the network = 1",
+        fontsize=10,
+    )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110, format=path.suffix.removeprefix("."))
 
