@@ -5,9 +5,16 @@ one addend a region and a gamma, in proportions that are drawn anew for each fra
 are blurred. Their common amplitude is what gives the wanted error after alignment. It returns
 inverse depth up to scale and shift, as relative networks do, through a small decoder, so that z can
 be updated.
+
+    python -m benchmarks.simulated --gt samples/indoor/gt.png --out samples/indoor/predicted.npy
+
+writes what such a network of 4 % error predicts for a frame.
 """
 
 from __future__ import annotations
+
+import argparse
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,10 +26,15 @@ from torch import Tensor, nn
 
 from model_zoo_defs.training.learning.priors import filled
 from pnpdepth_cli.choices import OutputKind, OutputScale
+from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.definition import UNTUNED_DEFAULTS, Fixed, ModelDefinition, Settings
 from pnpdepth_cli.models.network import Network, load_network
 
 Depth = NDArray[np.float32]
+
+ERROR_OF_SAMPLE = 0.04
+SEED_OF_SAMPLE = 1
 
 EDGE_BLUR_PX = 1.5
 """Standard deviation of the blur of log depth."""
@@ -199,3 +211,25 @@ def _fault(log_depth: Depth, rng: Generator) -> Depth:
 def _blurred(log_depth: Depth, blur_px: float) -> Depth:
     """Log depth (H, W) with its edges blurred."""
     return cv2.GaussianBlur(log_depth, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
+
+
+def relative_inverse(depth: Depth) -> NDArray[np.float16]:
+    """Returns inverse depth (H, W) in 0…1, as many tools store it: 1 is the nearest pixel."""
+    inverse = 1 / depth
+    return ((inverse - inverse.min()) / np.ptp(inverse)).astype(np.float16)
+
+
+def main() -> None:
+    """Write the map that a simulated network predicts for the ground truth of a frame."""
+    parser = argparse.ArgumentParser(description="Simulate a network's depth map of one frame.")
+    parser.add_argument("--gt", type=Path, required=True, help="ground truth of the frame")
+    parser.add_argument("--out", type=Path, required=True, help="the map, as NPY of float16")
+    args = parser.parse_args()
+    gt = np.nan_to_num(read_depth(args.gt).values).astype(np.float32)
+    depth = weakened(gt, ERROR_OF_SAMPLE, np.random.default_rng(SEED_OF_SAMPLE))
+    with atomic_path(args.out) as temporary, temporary.open("wb") as file:
+        np.save(file, relative_inverse(depth))
+
+
+if __name__ == "__main__":
+    main()

@@ -13,7 +13,7 @@ the part of the truth within ± 2σ.
     python -m benchmarks.strong --data PATH --groups stored --points 20 100 500
 
 `--json FILE` keeps every run. `--tables FILE ...` prints the tables of such files and measures
-nothing.
+nothing. `--figure FILE` draws how far the points lower the error of each network.
 """
 
 from __future__ import annotations
@@ -36,10 +36,12 @@ from benchmarks.frames import drawn_inputs, errors_of, print_row
 from benchmarks.strong_maps import GROUPS, StrongFrame, can_draw, strong_frames, with_lines
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.residual_field import ResidualField
+from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.experts import weighted_mean
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
+from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.settings import Settings
 from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
@@ -51,6 +53,8 @@ STAGES = (BEFORE, UPDATED, PROPAGATED, ALONE, WITH_PRIOR, AFTER, LINEAR)
 HEADS = ("aligned", "z updated", "propagated", "compact", "with prior", "**result**", "linear")
 OWN = ("network", "network as prior", "compact", "no image")
 """Kinds of experts, whose weights are shown."""
+DRAWN = (20, 100, 500)
+"""Numbers of points of the figure."""
 ALL = "all"
 """Instead of a set: every frame of the row."""
 SIGMAS = 2
@@ -171,6 +175,46 @@ def geometric_mean(runs: Sequence[Run], stage: str) -> float:
     return float(np.exp(np.mean([np.log(run["mae"][stage]) for run in runs])))
 
 
+def draw(runs: Sequence[Run], path: Path) -> None:
+    """Draws the MAE of the result over that of the aligned network, by network and points.
+
+    Beside it is linear interpolation, over the same. Raises UsageError without matplotlib.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UsageError("--figure needs matplotlib: pip install matplotlib") from None
+    rows = list(dict.fromkeys(run["row"] for run in runs))
+    figure = Figure(figsize=(9, 0.5 * len(rows) + 1.4), layout="constrained")
+    panels = figure.subplots(1, len(DRAWN), sharex=True, sharey=True)
+    for count, axes in zip(DRAWN, panels, strict=True):
+        for place, row in enumerate(rows):
+            some = [run for run in runs if run["row"] == row and run["points"] == count]
+            if not some:
+                continue
+            own = geometric_mean(some, BEFORE)
+            ratio = geometric_mean(some, AFTER) / own
+            axes.barh(place, ratio, height=0.6, color="tab:blue")
+            axes.text(ratio / 1.06, place, f"{ratio:.2f}", va="center", ha="right", color="white")
+            of_linear = geometric_mean(some, LINEAR) / own
+            axes.plot(of_linear, place, marker="D", color="tab:orange", linestyle="none")
+        axes.axvline(1, color="black", linewidth=0.8)
+        axes.set_title(f"{count} points", fontsize=10)
+        axes.set_xscale("log")
+        axes.set_xlim(0.02, 5)
+        axes.set_xticks([0.05, 0.2, 1, 4], ["0.05", "0.2", "1", "4"])
+        axes.minorticks_off()
+    maps = {row: len({run["frame"] for run in runs if run["row"] == row}) for row in rows}
+    panels[0].set_yticks(range(len(rows)), [f"{row} ({maps[row]})" for row in rows])
+    panels[0].invert_yaxis()
+    figure.supxlabel(
+        "MAE of the result (bar) and of linear interpolation (diamond), MAE of the network = 1",
+        fontsize=10,
+    )
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110, format=path.suffix.removeprefix("."))
+
+
 def count_of(text: str) -> int | None:
     """The number of points, or None for scan lines."""
     return None if text == LINES else int(text)
@@ -188,9 +232,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="draws of the points of each frame")
     parser.add_argument("--json", type=Path, help="file that every run is written to")
     parser.add_argument("--tables", type=Path, nargs="+", help="print the runs of such files only")
+    parser.add_argument("--figure", type=Path, help="image file of the gain over each network")
     args = parser.parse_args()
     if args.tables:
-        print_tables([run for file in args.tables for run in json.loads(file.read_text())])
+        report([run for file in args.tables for run in json.loads(file.read_text())], args.figure)
         return
     if args.data is None:
         parser.error("--data is needed to measure")
@@ -204,7 +249,14 @@ def main() -> None:
                 if args.json:
                     args.json.write_text(json.dumps(runs))
         print(f"{len(runs)} runs, the last {case.row}, {case.frame.name}", file=sys.stderr)
+    report(runs, args.figure)
+
+
+def report(runs: Sequence[Run], figure: Path | None) -> None:
+    """Prints the tables of the runs, and draws the figure if it has a file."""
     print_tables(runs)
+    if figure is not None:
+        draw(runs, figure)
 
 
 if __name__ == "__main__":

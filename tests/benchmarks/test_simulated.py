@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.simulated import error_aligned, simulated_network, stored_network, weakened
 from benchmarks.strong_maps import rendered
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.network import Network
 
 
@@ -69,3 +72,14 @@ def test_a_stored_map_is_what_the_network_gives_for_any_image() -> None:
     network = stored_network("map", values, "depth", "metric")
     given = output_of(network, np.zeros((3, 4, 3), np.float32)).numpy()
     np.testing.assert_array_equal(given, values)
+
+
+def test_the_predicted_depth_of_the_sample_is_off_by_4_per_cent_after_alignment() -> None:
+    sample = Path(__file__).parents[2] / "samples" / "indoor"
+    gt = read_depth(sample / "gt.png").values
+    stored = np.load(sample / "predicted.npy").astype(np.float64)
+    known = gt > 0
+    # A line of the stored numbers is inverse depth.
+    slope, shift = np.polyfit(stored[known], 1 / gt[known], 1, w=gt[known])
+    depth = 1 / (slope * stored + shift)
+    assert error_aligned(depth, gt) == pytest.approx(0.04, rel=0.05)
