@@ -86,6 +86,14 @@ def test_the_papers_method_is_tuned_too_and_gains_a_step_that_is_asked_for() -> 
     assert refined(Brightness, method="paper", propagate="gp").propagation == "gp"
 
 
+def test_stated_updates_that_do_harm_are_not_used_which_is_said() -> None:
+    plain = refined(Brightness, 100, method="alone", iterations=0)
+    harmful = refined(Brightness, 100, method="alone", iterations=1, lr=0.8)
+    assert any("updates of z are not used" in note for note in harmful.notes)
+    assert "updated" in harmful.stages
+    assert np.array_equal(harmful.depth, plain.depth)
+
+
 def test_a_setting_that_nothing_uses_is_said() -> None:
     def unused(refined: Refined) -> list[str]:
         return [note for note in refined.notes if "not used" in note]
