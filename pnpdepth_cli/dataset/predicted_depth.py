@@ -36,9 +36,11 @@ _RAW = "save the raw array as NPY (numpy.save), or as a 16-bit PNG"
 _LIST_SUFFIXES = (".csv", ".txt")
 _DEPTH_WORDS = re.compile("depth|disp|pred|inverse|inv_")
 _OTHER_WORDS = re.compile(
-    "conf|mask|valid|sigma|uncert|std|var|label|seg|sky|normal|flow|intrin|extrin|pose|fov|focal"
+    "conf|mask(?!ed)|valid(?!_depth)|sigma|uncert|std|_var|variance|label|seg|sky|normal(?!i)|flow"
+    "|intrin|extrin|pose|fov|focal"
 )
 """Words in names of arrays that are depth, and that are maps beside it."""
+_MATRIX = 4  # rows or columns of a camera's matrix or pose at most
 _GREY = 2  # levels of 255 between the channels of a grey picture; compression makes some
 _STEPS = 256  # of 8 bits
 _FEW = 20  # different numbers; fewer are of labels
@@ -133,13 +135,12 @@ def _load(path: Path, part: str) -> DepthFile:
 def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
     """The array of an archive that is depth: the only map, or the only one named so."""
     listed = one_line(", ".join(f"{name} {array.shape}" for name, array in arrays.items()))
-    maps = [
-        name
-        for name, (shape, dtype) in arrays.items()
-        if dtype.kind in "fiu"
-        and len([side for side in shape if side != 1]) == 2
-        and not _OTHER_WORDS.search(name.lower())
-    ]
+    maps = list[str]()
+    for name, (shape, dtype) in arrays.items():
+        sides = [side for side in shape if side != 1]
+        is_map = len(sides) == 2 and min(sides) > _MATRIX and dtype.kind in "fiu"
+        if is_map and not _OTHER_WORDS.search(name.lower()):
+            maps.append(name)
     by_name = [name for name in maps if _DEPTH_WORDS.search(name.lower())]
     # A stack of maps, which is refused with its shape, is named so, too.
     stacks = [
@@ -147,9 +148,11 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
         for name in arrays
         if _DEPTH_WORDS.search(name.lower()) and not _OTHER_WORDS.search(name.lower())
     ]
-    found = by_name or maps or stacks
-    if len(arrays) == 1 or len(found) == 1:
-        return next(iter(found or arrays))
+    # The only array is refused for what it is, unless for its name.
+    alone = [name for name in arrays if len(arrays) == 1 and not _OTHER_WORDS.search(name.lower())]
+    found = by_name or maps or stacks or alone
+    if len(found) == 1:
+        return found[0]
     if not found:
         raise InputError(f"{path} has no depth map among its arrays ({listed}); {_RAW}")
     names = " and ".join(found)

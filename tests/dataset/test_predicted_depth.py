@@ -147,11 +147,18 @@ OTHERS = {
     "intrinsics": np.eye(3, dtype=np.float32)[None],
     "extrinsics": np.zeros((1, 3, 4), np.float32),
     "points": RNG.uniform(0, 1, (*SIZE, 3)).astype(np.float32),
+    "K": np.eye(3),
     "focallength_px": np.float32(700),
 }
 
 
-@pytest.mark.parametrize("name", ["depth", "disparity", "pred", "metric_depth", "arr_0", "z"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("depth", "disparity", "pred", "metric_depth", "arr_0", "z"),
+        *("normalized_depth", "masked_depth", "affine_invariant_depth", "Depth"),
+    ],
+)
 @pytest.mark.parametrize("stack", [False, True])
 def test_the_only_map_of_an_archive_is_found(name: str, stack: bool, tmp_path: Path) -> None:
     values = DISPARITY[None] if stack else DISPARITY
@@ -196,6 +203,8 @@ def test_a_channel_of_an_exr_is_named_as_an_array_is(tmp_path: Path) -> None:
         ({"depth": np.stack([DISPARITY] * 5)}, ""),  # of five images
         ({"a": DISPARITY, "b": DISPARITY}, ""),
         ({"intrinsics": np.eye(3), "conf": DISPARITY}, ""),
+        ({"conf": DISPARITY}, ""),
+        ({"depth": DISPARITY, "gt_depth": DISPARITY}, ""),
         ({"depth": DISPARITY.astype(np.complex64)}, ""),
         ({"depth": DISPARITY > 0}, ""),
     ],
