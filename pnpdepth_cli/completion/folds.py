@@ -59,7 +59,9 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
 
 
 def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | None:
-    """Returns (N,) bool: points of a depth map under copies of its holes, one of `folds` of all.
+    """Returns (N,) the number of the copied hole that a point of a depth map is under, 0 for none.
+
+    One of `folds` of the points is under one, at most.
 
     The map of what is unknown is moved over the known pixels, as a whole and around the image's
     edges, so that the distances to what stays known are those in the holes. Of the last copy only
@@ -85,7 +87,10 @@ def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | 
         copy = _some_holes(copy, room, rng)
         hidden |= copy
         room -= int(copy.sum())
-    return torch.from_numpy(hidden[grid.row, grid.column]) if hidden.any() else None
+    if not hidden.any():
+        return None
+    label, _ = ndimage.label(hidden, _AROUND)
+    return torch.from_numpy(label[grid.row, grid.column])
 
 
 class _PixelGrid(NamedTuple):

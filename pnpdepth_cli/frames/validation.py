@@ -32,15 +32,23 @@ class ValidatedFrame(ValidationPoints):
     """Whether the points are those of a scanner."""
     propagation: str
     """How the residual at the points is propagated, a name in `choices.PROPAGATIONS`, or "none"."""
+    hole: Tensor | None = None
+    """(M,) number of the hole of a depth map that a validation point is in. None: in none."""
 
     def gain(self, at: Tensor, other: Tensor) -> float:
         """Returns by how many standard errors one prediction (M,) is better than another.
 
-        In log depth; negative where it is worse.
+        In log depth; negative where it is worse. Points in one hole err together, so a hole counts
+        as one of them.
         """
         truth = log_of(self.points.depth)
         share = self.weights / self.weights.sum()
         gain = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
+        if self.hole is not None:
+            _, number = self.hole.unique(return_inverse=True)
+            total = torch.bincount(number, share)
+            gain = (torch.bincount(number, share * gain) / total)[total > 0]
+            share = torch.full_like(gain, 1 / len(gain))
         mean = (share * gain).sum()
         error = (share.square() * (gain - mean).square()).sum().sqrt()
         return float(mean / error.clamp_min(1e-12))
@@ -87,25 +95,26 @@ def split_frame(
     points = whole.whole.points
     if len(points) < MIN_POINTS:
         return whole
-    chosen = None
+    hole = None
     if is_dense(points) and not whole.has_scan_lines:
-        chosen = under_holes(points, FOLDS, seed=seed)
-    if chosen is None:
-        chosen = spatial_folds(points, FOLDS, seed=seed) == 0
+        hole = under_holes(points, FOLDS, seed=seed)
+    chosen = spatial_folds(points, FOLDS, seed=seed) == 0 if hole is None else hole > 0
     kept = replace(whole.whole, points=points.select(~chosen))
     if not bool(chosen.any()) or not all(network.sees(kept) for network in networks):
         return whole
     # Of many validation points some are drawn; all of them are kept from the experts.
     (numbers,) = chosen.nonzero(as_tuple=True)
     drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
-    validation = points.select(numbers[drawn[:MOST_VALIDATION_POINTS]])
+    numbers = numbers[drawn[:MOST_VALIDATION_POINTS]]
+    validation = points.select(numbers)
+    hole = None if hole is None else hole[numbers]
     # Each counts as much as it is consistent with its neighbours.
     at = validation.sample(judged)
     residual = validation.depth.double().log() - at.clamp_min(1e-6).double().log()
     weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
     if not bool(weights.any()):
         weights = torch.ones_like(weights)
-    return replace(whole, kept=kept, points=validation, weights=weights)
+    return replace(whole, kept=kept, points=validation, weights=weights, hole=hole)
 
 
 def log_of(depth: Tensor) -> Tensor:

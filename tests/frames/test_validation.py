@@ -25,6 +25,21 @@ def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
     assert found == pytest.approx(mean / error)
 
 
+def test_points_in_one_hole_are_one_observation_of_a_gain() -> None:
+    rng = np.random.default_rng(0)
+    (truth, at, other), shares = rng.uniform(1, 4, (3, 30)), rng.uniform(size=30)
+    hole = np.repeat([7, 3, 5], 10)
+    split = replace(
+        split_of(torch.from_numpy(truth)),
+        weights=torch.from_numpy(shares),
+        hole=torch.from_numpy(hole),
+    )
+    gains = np.abs(np.log(other / truth)) - np.abs(np.log(at / truth))
+    of_holes = [np.average(gains[hole == k], weights=shares[hole == k]) for k in (3, 5, 7)]
+    found = split.gain(torch.from_numpy(at), torch.from_numpy(other))
+    assert found == pytest.approx(np.mean(of_holes) / (np.std(of_holes) / np.sqrt(3)))
+
+
 @pytest.mark.parametrize("count", [60, 5500])
 def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> None:
     frame, judged = frame_in_memory(count), depth_of_scene()
