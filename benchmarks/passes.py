@@ -1,4 +1,4 @@
-"""How often a network runs for one frame: `python -m benchmarks.passes [--only fcrn-tiny]`.
+"""How often a network runs for one frame: `python -m benchmarks.passes [--models fcrn-tiny]`.
 
 One frame of the indoor sample is refined with a user's network, fused with `compact` and alone, and
 every pass of the two is counted by the step that makes it: whole passes, passes of the front, of
@@ -46,6 +46,8 @@ STEPS = {
     (experts, "_with_blind_expert"): "grey",
 }
 """Functions whose passes are a step by themselves."""
+ANYTHING = "anything-small"
+"""A Hugging Face folder of random weights with the shape of Depth Anything V2 Small."""
 RUNS = 3  # of the bare pass, whose median is taken
 
 
@@ -188,19 +190,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
     parser.add_argument("--methods", nargs="+", default=["fused", "alone"])
-    parser.add_argument("--only", nargs="+", help="parts of the names of networks")
+    parser.add_argument("--models", nargs="+", default=["fcrn-tiny", ANYTHING])
     args = parser.parse_args()
     print_row("frame", "", "network", "step", *KINDS, head=True)
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("fcrn-tiny", "Depth Anything V2 Small"):
-            if args.only and not any(part in name for part in args.only):
-                continue
-            model = name if name == "fcrn-tiny" else anything_small(Path(folder) / "small")
+        for name in args.models:
+            model = name
+            if name == ANYTHING:
+                model = anything_small(Path(folder) / "small")
             for chosen in args.methods:
                 for count in args.points:
                     network = load_network(model, None)
                     settings = Settings(method=chosen)
-                    report(f"{name}, {chosen}, {count}", network, sample(count), settings)
+                    title = f"{Path(name).name}, {chosen}, {count}"
+                    report(title, network, sample(count), settings)
 
 
 if __name__ == "__main__":
