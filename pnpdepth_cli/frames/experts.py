@@ -229,8 +229,8 @@ def expert_of_user(network: OpenNetwork, split: ValidatedFrame, judged: Judged) 
     if not network.takes_points:
         whole = whole or network.refine(split.whole, updates=network.always_updated)
         unexplained = unexplained_by(whole.aligned, split, judged)
-        is_strong = strength_of(unexplained) == 1
-        if not is_strong and not whole.updates and network.is_updated(split.whole):
+        wanted = network.always_updated or strength_of(unexplained) < 1
+        if wanted and not whole.updates and network.is_updated(split.whole):
             whole = network.refine(split.whole)
     return expert_of(
         network, split, network.name, known=whole, user=network, unexplained=unexplained

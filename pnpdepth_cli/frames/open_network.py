@@ -1,8 +1,8 @@
 """Networks that stay cut from frame to frame and compute nothing twice for one image.
 
-For one image and several sets of points, the front of a network that takes the image alone runs
-once, and so does the image encoder that a definition names. `prepare` makes a frame the network's
-input.
+For one image and several sets of points, a network that takes the image alone runs once, as long
+as z is not updated, and its front runs once in any case. So does the image encoder that a
+definition names. `prepare` makes a frame the network's input.
 """
 
 from __future__ import annotations
@@ -91,6 +91,7 @@ class OpenNetwork:
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
+        self._output: object = None  # for z_0
         self._encoded: dict[str, object] = {}
 
     def __enter__(self) -> OpenNetwork:
@@ -104,7 +105,7 @@ class OpenNetwork:
 
     def next_image(self) -> None:
         """Forgets what was computed for the last image."""
-        self._z0 = None
+        self._z0 = self._output = None
         self._encoded.clear()
 
     def cut(self) -> Split:
@@ -195,11 +196,24 @@ class OpenNetwork:
         self._z0 = z0 if self._of_image_only else None
         return z0
 
+    def _output_for(self, prepared: PreparedFrame) -> object:
+        """The network's output for z_0. It is the same for all points, as `_front` is."""
+        output = self._output
+        may_be_updated = self._of_image_only and self.settings.iterations > 0
+        if output is None and may_be_updated and self._coarse is None:
+            # Updates may follow, from the same front.
+            output = self.cut().rear(self._front(prepared))
+        elif output is None:
+            # A network whose z is never updated need not be cut.
+            with errors.wrap_user_errors("the network's forward"):
+                output = self.network.module(*prepared.arguments)
+        self._output = output if self._of_image_only else None
+        return output
+
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
-        """The depth without updates: one pass of the whole network, which need not be cut."""
-        with torch.no_grad(), errors.wrap_user_errors("the network's forward"):
-            output = self.network.module(*prepared.arguments)
-        depth = reader(output).detach()
+        """The depth without updates, of one pass of the network."""
+        with torch.no_grad():
+            depth = reader(self._output_for(prepared)).detach()
         at_points = prepared.points.sample(depth)
         known = at_points.isfinite()
         loss = checked_loss(self.settings.loss)(at_points[known], prepared.points.depth[known])

@@ -147,6 +147,9 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
     Outliers differ from its prediction otherwise than their neighbours do. Of many points, those
     that contradict their neighbours by themselves are outliers too.
 
+    z of a network that takes the image alone is not updated yet: how strong the network is tells
+    whether it will be (`expert_of_user`).
+
     Raises:
         NoPointsError: No point lies where the network predicts.
     """
@@ -158,14 +161,14 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
     consistent = frame
     if bool(suspected.any()):
         consistent = replace(frame, points=points.select(~suspected))
-    prediction = judge.refine(consistent, updates=not again)
+    prediction = judge.refine(consistent, updates=judge.takes_points and not again)
     field = ResidualField(prediction.aligned, points, frame.rgb)
     outlying = field.outliers
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     inliers = frame.without(outlying)
     if again or not torch.equal(outlying, suspected):
-        prediction = judge.refine(inliers)
+        prediction = judge.refine(inliers, updates=judge.takes_points)
     return Judged(judge, inliers, prediction, field, constant)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.residual_field import ResidualField
@@ -191,6 +191,53 @@ def test_the_same_frame_gives_the_same_depth_whatever_was_refined_before() -> No
         first, _, again = (refine_frame(networks, frames[n], Pipeline()) for n in (0, 1, 0))
     assert np.array_equal(first.depth, again.depth)
     assert np.array_equal(first.depth, refined(frames[0], *networks).depth)
+
+
+class Tally(nn.Module):
+    """Gives what it is given, and counts how often."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.passes = 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.passes += 1
+        return x * 1.0
+
+
+class Counted(Noise):
+    """The same depth, by a front and a rear that count their passes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.front = Tally()
+        self.rear = Tally()
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return self.rear(super().forward(self.front(rgb)))
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("outlying", [0, 10])
+@pytest.mark.parametrize(("is_strong", "updates"), [(True, 0), (False, 3)])
+def test_a_network_that_takes_the_image_alone_runs_no_more_often_than_its_updates_need(
+    is_strong: bool, updates: int, outlying: int, fused: bool
+) -> None:
+    frame = frame_in_memory(120)
+    depth = frame.points.depth
+    if is_strong:
+        depth = frame.points.sample(Noise()(frame.rgb[None])[0, 0])
+    wrong = torch.arange(120) < outlying
+    depth = torch.where(wrong, 5.0, 1.0) * depth
+    frame = replace(frame, points=replace(frame.points, depth=depth))
+    own = member(Counted, settings=replace(UPDATES, align="scale"))
+    result = refined(frame, own, *([compact()] if fused else []))
+    assert result.validation is not None
+    assert len(result.losses) == 1 + updates
+    assert len(result.used) <= 120 - outlying
+    # The plain pass serves all points and validation points; each of the two is updated by itself.
+    assert own.network.module.front.passes == 1
+    assert own.network.module.rear.passes == (1 + 2 * (1 + updates) if updates else 1)
 
 
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:

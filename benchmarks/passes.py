@@ -1,0 +1,210 @@
+"""How often a network runs for one frame: `python -m benchmarks.passes [--models fcrn-tiny]`.
+
+One frame of the indoor sample is refined with a user's network, fused with `compact` and alone, and
+every pass of the two is counted by the step that makes it: whole passes, passes of the front, of
+the rear with and without a gradient, and backward passes. Beside them stand the processor's seconds
+of the whole frame, those spent in each network, and those of one bare pass of the user's network.
+The second frame of a network that stays open is that of a batch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import nn
+
+from benchmarks.first_result import SAMPLE, anything_small
+from benchmarks.frames import EvalFrame, drawn_inputs, print_row
+from pnpdepth_cli.core import refine as updating
+from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.frames import experts, method, refine_frame, resolve, validation
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
+from pnpdepth_cli.io.depth import read_depth
+from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.models.network import Network, load_network
+from pnpdepth_cli.points import SparsePoints
+from pnpdepth_cli.settings import Settings
+
+KINDS = ("whole", "front", "rear", "rear, grad", "backward")
+STEPS = {
+    (resolve, "_with_best_input_range"): "input range",
+    (resolve, "default_layer"): "layer",
+    (refine_frame, "without_outliers"): "outliers",
+    (refine_frame, "with_mirrored"): "mirrored",
+    (experts, "_with_blind_expert"): "grey",
+}
+"""Functions whose passes are a step by themselves."""
+ANYTHING = "anything-small"
+"""A Hugging Face folder of random weights with the shape of Depth Anything V2 Small."""
+RUNS = 3  # of the bare pass, whose median is taken
+
+
+class Passes:
+    """Counts the passes of networks, and the processor's seconds in them, while it watches."""
+
+    def __init__(self) -> None:
+        self.names: dict[nn.Module, str] = {}
+        self.counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+        """How often each kind of pass was made, by network and step."""
+        self.seconds: Counter[str] = Counter()
+        self._step = ["other"]
+        self._last = ""  # network of the last pass
+        self._within: list[tuple[str, nn.Module]] = []  # the part of a cut network that runs
+        self._kept: SparsePoints | None = None
+        self._split_frame = validation.split_frame
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Inside, passes are counted."""
+        with ExitStack() as open_:
+            for (module, name), step in STEPS.items():
+                patched = self._as_step(getattr(module, name), step)
+                open_.enter_context(mock.patch.object(module, name, patched))
+            for owner, name, stand_in in (
+                (OpenNetwork, "refine", self._refine(OpenNetwork.refine)),
+                (Split, "front", self._part(Split.front, "front")),
+                (Split, "rear", self._part(Split.rear, "rear")),
+                (updating, "gradient_at", self._backward(updating.gradient_at)),
+                (refine_frame, "split_frame", self._split),
+            ):
+                open_.enter_context(mock.patch.object(owner, name, stand_in))
+            # Hooks of single modules would change what is cached of a cut network.
+            hook = nn.modules.module.register_module_forward_pre_hook(self._count)
+            open_.callback(hook.remove)
+            yield
+
+    def _as_step(self, function: Callable[..., Any], step: str) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            self._step.append(step)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._step.pop()
+
+        return run
+
+    def _split(self, *args: Any, **kwargs: Any) -> Any:
+        found = self._split_frame(*args, **kwargs)
+        self._kept = found.kept.points if len(found.points) else None
+        return found
+
+    def _refine(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def run(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Any:
+            step = self._step[-1]
+            if step == "other":
+                step = "validation points" if frame.points is self._kept else "all points"
+                if frame.prior is not None:
+                    step += ", prior"
+            self._step.append(step)
+            start = time.process_time()
+            try:
+                return function(network, frame, updates=updates)
+            finally:
+                self.seconds[network.name] += time.process_time() - start
+                self._step.pop()
+
+        return run
+
+    def _part(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        def run(split: Split, *args: Any) -> Any:
+            self._within.append((part, split._network))
+            try:
+                return function(split, *args)
+            finally:
+                self._within.pop()
+
+        return run
+
+    def _backward(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any) -> Any:
+            self.counts[self._last, self._step[-1]]["backward"] += 1
+            return function(*args)
+
+        return run
+
+    def _count(self, module: nn.Module, _inputs: object) -> None:
+        name = self.names.get(module)
+        if name is None:
+            return
+        kind = self._within[-1][0] if self._within else "whole"
+        if kind == "rear" and torch.is_grad_enabled():
+            kind = "rear, grad"
+        self._last = name
+        self.counts[name, self._step[-1]][kind] += 1
+
+
+def sample(count: int) -> Frame:
+    """The indoor sample with so many points of its ground truth."""
+    gt = read_depth(SAMPLE / "gt.png").values
+    return drawn_inputs(EvalFrame("indoor", read_rgb(SAMPLE / "rgb.png").values, gt), count, 0)
+
+
+def bare_seconds(network: Network, frame: Frame) -> float:
+    """The processor's seconds of one pass of the network alone."""
+    arguments = prepare(network, frame).arguments
+    spent = list[float]()
+    for _ in range(RUNS):
+        start = time.process_time()
+        with torch.no_grad():
+            network.module(*arguments)
+        spent.append(time.process_time() - start)
+    return statistics.median(spent)
+
+
+def report(title: str, network: Network, frame: Frame, settings: Settings) -> None:
+    """Prints the passes of a first and of a second frame, and the seconds."""
+    passes = Passes()
+    companion = load_network(method.COMPANION, None)
+    passes.names = {network.module: "own", companion.module: "compact"}
+    with ExitStack() as open_:
+        open_.enter_context(mock.patch.object(method, "load_network", return_value=companion))
+        open_.enter_context(passes.watched())
+        refiner = open_.enter_context(Method([network], settings, frame))
+        for which in ("first", "second"):
+            passes.seconds.clear()
+            start = time.process_time()
+            refiner.refine(frame)
+            spent = time.process_time() - start
+            for (name, step), counted in passes.counts.items():
+                print_row(title, which, name, step, *(counted[kind] or "" for kind in KINDS))
+            own = passes.seconds[network.definition.name]
+            seconds = f"{spent:.2f} s; in the user's network {own:.2f} s"
+            print_row(title, which, "seconds", seconds, *[""] * len(KINDS))
+            passes.counts.clear()
+    print_row(title, "", "bare pass", f"{bare_seconds(network, frame):.2f} s", *[""] * len(KINDS))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
+    parser.add_argument("--methods", nargs="+", default=["fused", "alone"])
+    parser.add_argument("--models", nargs="+", default=["fcrn-tiny", ANYTHING])
+    args = parser.parse_args()
+    print_row("frame", "", "network", "step", *KINDS, head=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in args.models:
+            model = name
+            if name == ANYTHING:
+                model = anything_small(Path(folder) / "small")
+            for chosen in args.methods:
+                for count in args.points:
+                    network = load_network(model, None)
+                    settings = Settings(method=chosen)
+                    title = f"{Path(name).name}, {chosen}, {count}"
+                    report(title, network, sample(count), settings)
+
+
+if __name__ == "__main__":
+    main()
