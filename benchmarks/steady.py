@@ -15,9 +15,11 @@ Four alignments are compared, each frame with 5, 10 or 50 points at random pixel
                is what is likelier
     behind     the same with the frames so far only, which a stream has; the variances are known
 
-The tables have geometric means over frames and seeds of the MAE in metres, aligned and with the
-residual propagated, and the shake: the standard deviation of the change from frame to frame of
-median log(depth / true depth). Nothing is to be chosen on the two sets of TUM.
+The tables have geometric means over frames and seeds of the MAE in metres: aligned, with the
+residual propagated as it is by default (`result`), and propagated with its mean held at 0 (`held`),
+as an alignment that is tied knows the level that a frame's few points do not. The shake is the
+standard deviation of the change from frame to frame of median log(depth / true depth). Nothing is
+to be chosen on the two sets of TUM.
 
     python -m benchmarks.steady --data PATH --sets icl_nuim --frames 10 --json FILE
 """
@@ -29,9 +31,9 @@ import json
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -41,6 +43,7 @@ from torch import Tensor
 
 from benchmarks.frames import MORE_SETS, SETS, EvalFrame, print_row
 from benchmarks.simulated import weakened
+from pnpdepth_cli.completion import gaussian_process
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.core.losses import MAD_TO_STD
@@ -74,6 +77,7 @@ ROUNDS = 3
 DIFFUSE = 100.0
 """Variance of the first line, whose parameters are near 1."""
 LEAST_VARIANCE = 1e-8
+STAGES = ("aligned", "result", "held")
 START = tuple(np.log([1e-3, 1e-3, 1e-3, 1e-3, ERROR**2]))
 """Logarithms of variances: of the walk's steps of level and slope, of a frame's own level and
 slope, and of the points' errors, all relative."""
@@ -87,6 +91,14 @@ class Sequenced(NamedTuple):
 
     maps: list[Tensor]
     points: list[SparsePoints]
+
+
+class Solved(NamedTuple):
+    """Factors of the posterior of the lines of a sequence."""
+
+    factor: Line  # Cholesky factor of the prior's covariance
+    root: Line  # Cholesky factor of the precision, in units of the prior
+    reduced: Line  # the solution of the triangular system with `root`
 
 
 # --- the networks ---
@@ -165,26 +177,23 @@ def aligned_pooled(sequence: Sequenced, reach: int) -> list[Tensor]:
     return depths
 
 
-def aligned_tied(sequence: Sequenced, *, behind: bool = False) -> list[Tensor]:
-    """Returns depth (H, W) in metres by lines that follow a random walk.
-
-    Args:
-        sequence: The frames.
-        behind: Whether a frame knows only those before it.
-    """
-    tried = [TiedLines(sequence.maps, sequence.points)]
-    tried.append(TiedLines([standardised(x) for x in sequence.maps], sequence.points))
-    likeliest = max(tried, key=lambda lines: lines.log_likelihood)
-    return likeliest.depths(behind=behind)
+def likeliest_lines(sequence: Sequenced) -> TiedLines:
+    """Returns the tied lines of the maps as they are, or standardised, whichever is likelier."""
+    as_given = TiedLines(sequence.maps, sequence.points)
+    divided = TiedLines([standardised(x) for x in sequence.maps], sequence.points)
+    return max(as_given, divided, key=lambda lines: lines.log_likelihood)
 
 
-ALIGNMENTS: dict[str, Callable[[Sequenced], list[Tensor]]] = {
-    "alone": aligned_alone,
-    "disparity": aligned_as_disparity,
-    **{f"pooled ±{reach}": partial(aligned_pooled, reach=reach) for reach in REACHES},
-    "tied": aligned_tied,
-    "behind": partial(aligned_tied, behind=True),
-}
+def alignments_of(sequence: Sequenced) -> dict[str, list[Tensor]]:
+    """Returns depth (H, W) in metres of each frame, by the names of the alignments."""
+    tied = likeliest_lines(sequence)
+    return {
+        "alone": aligned_alone(sequence),
+        "disparity": aligned_as_disparity(sequence),
+        **{f"pooled ±{reach}": aligned_pooled(sequence, reach) for reach in REACHES},
+        "tied": tied.depths(),
+        "behind": tied.depths(behind=True),
+    }
 
 
 def standardised(x: Tensor) -> Tensor:
@@ -216,7 +225,7 @@ class TiedLines:
             self._typical / y[:, None] * np.stack([np.ones_like(x), self._moved(x)], axis=1)
             for x, y in zip(at_points, disparity, strict=True)
         ]
-        self._weights = [np.ones(len(rows)) for rows in self._rows]
+        self._weigh([np.ones(len(rows)) for rows in self._rows])
         self._variances = np.array(START)
         for number in range(ROUNDS):
             found = minimize(self._cost, self._variances, method="L-BFGS-B", bounds=BOUNDS)
@@ -228,9 +237,9 @@ class TiedLines:
             errors = [rows @ line - 1 for rows, line in zip(self._rows, lines, strict=True)]
             size = float(np.median(np.abs(np.concatenate(errors))))
             width = CAUCHY * max(MAD_TO_STD * size, LEAST_ERROR)
-            self._weights = [1 / (1 + (error / width) ** 2) for error in errors]
+            self._weigh([1 / (1 + (error / width) ** 2) for error in errors])
 
-    def depths(self, *, behind: bool) -> list[Tensor]:
+    def depths(self, *, behind: bool = False) -> list[Tensor]:
         """Returns depth (H, W) in metres of each frame, by all frames or by those so far."""
         count = len(self._maps)
         lines = self._lines(count)
@@ -247,8 +256,19 @@ class TiedLines:
     def _moved(self, x: Line) -> Line:
         return (x - self._centre) / self._spread
 
-    def _normal(self, count: int, variances: Line) -> tuple[Line, Line, Line, float]:
-        """Factor of the prior's covariance, the normal matrix and side, and the sum of weights."""
+    def _weigh(self, weights: Sequence[Line]) -> None:
+        """The points have these weights from here on."""
+        count = len(self._rows)
+        self._matrix = np.zeros((2 * count, 2 * count))
+        self._side = np.zeros(2 * count)
+        for number, (rows, weight) in enumerate(zip(self._rows, weights, strict=True)):
+            here = slice(2 * number, 2 * number + 2)
+            self._matrix[here, here] = rows.T @ (weight[:, None] * rows)
+            self._side[here] = rows.T @ weight
+        self._total = float(sum(weight.sum() for weight in weights))
+
+    def _solved(self, count: int, variances: Line) -> Solved:
+        """What the points of the first frames say, given the variances."""
         variance = np.exp(variances)
         number = np.arange(count)
         steps = np.minimum(number[:, None], number[None])
@@ -257,36 +277,24 @@ class TiedLines:
             covariance = DIFFUSE + variance[part] * steps
             covariance = covariance + (variance[2 + part] + LEAST_VARIANCE) * np.eye(count)
             factor[part::2, part::2] = np.linalg.cholesky(covariance)
-        matrix = np.zeros((2 * count, 2 * count))
-        side = np.zeros(2 * count)
-        total = 0.0
-        for place in range(count):
-            rows, weights = self._rows[place], self._weights[place]
-            here = slice(2 * place, 2 * place + 2)
-            matrix[here, here] = rows.T @ (weights[:, None] * rows)
-            side[here] = rows.T @ weights
-            total += float(weights.sum())
-        return factor, matrix, side, total
+        matrix = self._matrix[: 2 * count, : 2 * count] / variance[4]
+        side = self._side[: 2 * count] / variance[4]
+        root = np.linalg.cholesky(np.eye(2 * count) + factor.T @ matrix @ factor)
+        reduced = np.linalg.solve(root, factor.T @ side)
+        return Solved(factor, root, reduced)
 
     def _cost(self, variances: Line) -> float:
-        """Minus the log likelihood of the points, up to a constant."""
-        count = len(self._rows)
-        factor, matrix, side, total = self._normal(count, variances)
-        error = np.exp(variances[4])
-        inner = np.eye(2 * count) + factor.T @ matrix @ factor / error
-        root = np.linalg.cholesky(inner)
-        reduced = np.linalg.solve(root, factor.T @ side) / error
-        squares = total / error - reduced @ reduced
+        """Minus the log likelihood of all points, up to a constant."""
+        solved = self._solved(len(self._rows), variances)
         points = sum(map(len, self._rows))
-        cost = squares + points * variances[4] + 2 * np.log(np.diag(root)).sum()
-        return float(cost) / 2
+        squares = self._total / np.exp(variances[4]) - solved.reduced @ solved.reduced
+        determinant = points * variances[4] + 2 * np.log(np.diag(solved.root)).sum()
+        return float(squares + determinant) / 2
 
     def _lines(self, count: int) -> Line:
         """(count, 2) level and slope of the first frames, given their points."""
-        factor, matrix, side, _ = self._normal(count, self._variances)
-        error = np.exp(self._variances[4])
-        inner = np.eye(2 * count) + factor.T @ matrix @ factor / error
-        lines: Line = factor @ np.linalg.solve(inner, factor.T @ side / error)
+        factor, root, reduced = self._solved(count, self._variances)
+        lines: Line = factor @ np.linalg.solve(root.T, reduced)
         return lines.reshape(count, 2)
 
 
@@ -317,25 +325,27 @@ def measure(
         for frame in frames
     ]
     runs = list[Run]()
-    for alignment, aligned in ALIGNMENTS.items():
-        depths = aligned(Sequenced(maps, points))
-        results = [
-            ResidualField(depth, sparse, tensor_of(frame.rgb)).depth()
-            for frame, depth, sparse in zip(frames, depths, points, strict=True)
-        ]
-        runs.append(
-            {
-                "alignment": alignment,
-                "points": count,
-                "drift": drift,
-                "seed": seed,
-                "aligned": [mae(d, f) for d, f in zip(depths, frames, strict=True)],
-                "result": [mae(d, f) for d, f in zip(results, frames, strict=True)],
-                "shake": shake(depths, frames),
-                "shake of result": shake(results, frames),
-            }
-        )
+    for alignment, depths in alignments_of(Sequenced(maps, points)).items():
+        results = propagated(depths, frames, points)
+        # The level that is tied is the one of the result, too.
+        with patch.multiple(gaussian_process, CONSTANT=0.0, SLOPE=0.0):
+            held = propagated(depths, frames, points)
+        run: Run = {"alignment": alignment, "points": count, "drift": drift, "seed": seed}
+        for what, stage in (("aligned", depths), ("result", results), ("held", held)):
+            run[what] = [mae(depth, frame) for depth, frame in zip(stage, frames, strict=True)]
+            run[f"shake, {what}"] = shake(stage, frames)
+        runs.append(run)
     return runs
+
+
+def propagated(
+    depths: Sequence[Tensor], frames: Sequence[EvalFrame], points: Sequence[SparsePoints]
+) -> list[Tensor]:
+    """Returns depth (H, W) in metres of each frame with its residual propagated."""
+    return [
+        ResidualField(depth, sparse, tensor_of(frame.rgb)).depth()
+        for depth, frame, sparse in zip(depths, frames, points, strict=True)
+    ]
 
 
 def mae(depth: Tensor, frame: EvalFrame) -> float:
@@ -363,14 +373,14 @@ def geometric_mean(values: Sequence[float]) -> float:
 
 def print_tables(runs: Sequence[Run]) -> None:
     """Prints MAE and shake of every set and number of points, then by drift."""
-    names = [name for name in ALIGNMENTS if any(run["alignment"] == name for run in runs)]
+    names = list(dict.fromkeys(run["alignment"] for run in runs))
     groups: dict[str, Callable[[Run], tuple[Any, ...]]] = {
         "all": lambda run: (run["set"], run["points"]),
         "by drift": lambda run: (run["set"], run["points"], run["faults"], run["drift"]),
     }
-    for what in ("aligned", "result", "shake", "shake of result"):
+    for what in (*STAGES, *(f"shake, {stage}" for stage in STAGES)):
         for title, key in groups.items():
-            print(f"\n{what}, {title}\n")
+            print(f"\n{what}: {title}\n")
             print_row("set", "points", "errors, drift", *names, head=True)
             for case in dict.fromkeys(key(run) for run in runs):
                 of_case = [run for run in runs if key(run) == case]
