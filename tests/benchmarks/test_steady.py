@@ -11,6 +11,7 @@ from benchmarks.steady import (
     STRETCHED,
     Sequenced,
     alignments_of,
+    change_with_interval,
     drifting,
     measure,
     print_tables,
@@ -119,3 +120,7 @@ def test_the_tables_have_a_line_for_each_number_of_points(
     printed = capsys.readouterr().out
     assert "| floor | 5 |" in printed
     assert "| floor | 7 |" in printed
+
+
+def test_a_change_that_all_frames_have_is_certain() -> None:
+    assert change_with_interval(np.log(np.full(5, 0.9))) == "-10.0 % (-10.0 … -10.0)"
