@@ -214,12 +214,9 @@ def _blurred(log_depth: Depth, blur_px: float) -> Depth:
 
 
 def relative_inverse(depth: Depth) -> NDArray[np.float16]:
-    """Returns inverse depth (H, W) up to scale and shift, from 0.1 to 1 of the nearest pixel.
-
-    0 is avoided, as in many files it is an unknown pixel.
-    """
+    """Returns inverse depth (H, W) in 0…1, as many tools store it: 1 is the nearest pixel."""
     inverse = 1 / depth
-    return (0.1 + 0.9 * (inverse - inverse.min()) / np.ptp(inverse)).astype(np.float16)
+    return ((inverse - inverse.min()) / np.ptp(inverse)).astype(np.float16)
 
 
 def main() -> None:
