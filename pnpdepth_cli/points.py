@@ -90,7 +90,7 @@ class SparsePoints(Generic[A]):
         x, y = self.xy.unbind(dim=1)
         return replace(self, xy=torch.stack([self.size[1] - 1 - x, y], dim=1))
 
-    def where(self, mask: A) -> SparsePoints[A]:
+    def where(self, mask: Tensor | NDArray[np.bool_]) -> SparsePoints[A]:
         """Returns the points where mask, (N,) bool, is true; this very object if it is everywhere.
 
         What is remembered of the object, such as its tree, stays known.

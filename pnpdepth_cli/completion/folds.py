@@ -133,7 +133,8 @@ def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -
         if sizes[number] <= room:
             taken[number] = True
             room -= sizes[number]
-    return taken[label]
+    chosen: NDArray[np.bool_] = taken[label]
+    return chosen
 
 
 def _folds_of_cells(
