@@ -21,8 +21,8 @@ MAP = 0.5
 def with_measured(refined: Refined) -> Refined:
     """Returns a refined frame that has the points' own depth at their pixels.
 
-    Only points at whole pixels have one; how many others there are is said. Of several points at a
-    pixel the nearest counts. Outliers are no points of the result and are not kept.
+    A note counts the pixels, and the points between pixels, which are not kept. Of several points
+    at a pixel the nearest counts. Outliers are no points of the result and are not kept.
 
     Raises:
         UsageError: All points lie between pixels.
@@ -36,15 +36,11 @@ def with_measured(refined: Refined) -> Refined:
         )
     measured = points.where(whole).scatter()[0, 0].numpy()
     depth = np.where(measured > 0, measured, refined.depth)
-    notes = refined.notes
+    note = f"measured pixels: {int((measured > 0).sum()):,} have the depth of their points"
     between = len(points) - int(whole.sum())
     if between:
-        notes = (
-            *notes,
-            f"`keep_measured`: {between:,} of {len(points):,} points lie between pixels, and no"
-            " pixel has exactly their depth",
-        )
-    return replace(refined, depth=depth, notes=notes)
+        note += f"; {between:,} of {len(points):,} points lie between pixels, and are not kept"
+    return replace(refined, depth=depth, notes=(*refined.notes, note))
 
 
 def with_note_on_measured(refined: Refined) -> Refined:

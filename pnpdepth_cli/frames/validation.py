@@ -45,7 +45,7 @@ class ValidatedFrame(ValidationPoints):
         share = self.weights / self.weights.sum()
         gain = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
         if self.hole is not None:
-            _, number = self.hole.unique(return_inverse=True)  # type: ignore[no-untyped-call]
+            _, number = torch.unique(self.hole, return_inverse=True)
             total = torch.bincount(number, share)
             gain = (torch.bincount(number, share * gain) / total)[total > 0]
             share = torch.full_like(gain, 1 / len(gain))

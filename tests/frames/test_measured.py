@@ -47,7 +47,7 @@ def test_points_at_pixels_are_kept_exactly_the_nearest_of_several_and_no_other_p
     expected[4, 3] = np.float32(1.6)
     assert np.array_equal(result.depth, expected)
     assert result.depth.dtype == np.float32
-    assert result.notes == ()
+    assert len(result.notes) == 1
 
 
 def test_points_between_pixels_are_counted_and_refused_if_all_are() -> None:

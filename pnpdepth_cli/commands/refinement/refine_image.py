@@ -192,7 +192,6 @@ def _record_of(
             "propagate": refined.propagation,
             "output_kind": network.definition.output_kind,
             "normalise": normalisation_name(network.definition),
-            "keep_measured": request.keep_measured,
             "holdout": request.holdout,
             "device": str(network.device),
         },
