@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from benchmarks.frames import MORE_SETS, SETS, EvalFrame, opened, without_occluded
 from benchmarks.simulated import simulated_network, stored_network
-from model_zoo_defs.training.scenes.scenes import scene_frames
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
@@ -170,6 +169,8 @@ def frames_of(name: str, data: Path, count: int) -> list[EvalFrame]:
 
 def rendered(kind: str, count: int) -> list[EvalFrame]:
     """`count` rendered frames, each of a scene of its own."""
+    from model_zoo_defs.training.scenes.scenes import scene_frames  # needs the extra `train`
+
     height, width = RENDERED_SIZE
     scenes = (
         scene_frames(RENDER_SEED, number, height=height, width=width, kinds=(kind,))[0]

@@ -259,9 +259,22 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
     field = judged.field
     if field is None or not field.is_of(aligned, points):
         field = ResidualField(aligned, points, split.whole.rgb)
+    return unexplained_of(field, judged.constant)
+
+
+def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
+    """Returns what a depth leaves unexplained, see `unexplained_by`; 1 with too few points.
+
+    Args:
+        field: Residual field of the depth.
+        constant: Residual field of a constant depth at the same points.
+    """
+    count = len(field.at_points.points)
+    if count < MIN_POINTS:
+        return 1.0
     own = field.at_inliers.leave_one_out_error
-    without = judged.constant.at_inliers.leave_one_out_error
-    return own / max(without, 1e-9) * (known - 1) / (known - 1 - FITTED)
+    without = constant.at_inliers.leave_one_out_error
+    return own / max(without, 1e-9) * (count - 1) / (count - 1 - FITTED)
 
 
 def strength_of(unexplained: float) -> float:

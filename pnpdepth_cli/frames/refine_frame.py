@@ -21,6 +21,8 @@ from pnpdepth_cli.frames.experts import (
     Judged,
     fused_experts,
     networks_alone,
+    strength_of,
+    unexplained_of,
     weighted_mean,
     with_mirrored,
 )
@@ -74,7 +76,7 @@ def refine_frame(
     # judges, else the user's: a useless network does not decide which points are used.
     judge = next((network for network in networks if network.weighs_points), networks[0])
     if pipeline.leaves_outliers_out:
-        judged = without_outliers(judge, frame)
+        judged = without_outliers(judge, frame, networks)
     else:
         judged = Judged(judge, frame, judge.refine(frame))
     inliers = judged.inliers
@@ -141,14 +143,22 @@ class Steps(NamedTuple):
         return weights
 
 
-def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
+def without_outliers(
+    judge: OpenNetwork, frame: Frame, networks: Sequence[OpenNetwork] = ()
+) -> Judged:
     """Returns the frame without its outliers, and what a network gives for it.
 
     Outliers differ from its prediction otherwise than their neighbours do. Of many points, those
-    that contradict their neighbours by themselves are outliers too.
+    that contradict their neighbours by themselves are outliers too. None is a point that agrees
+    with a strong network.
 
     z of a network that takes the image alone is not updated yet: how strong the network is tells
     whether it will be (`expert_of_user`).
+
+    Args:
+        judge: The network that judges.
+        frame: The frame.
+        networks: All networks of the frame.
 
     Raises:
         NoPointsError: No point lies where the network predicts.
@@ -166,10 +176,36 @@ def without_outliers(judge: OpenNetwork, frame: Frame) -> Judged:
     outlying = field.outliers
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
+    if bool(outlying.any()) and not is_dense(points):
+        outlying = outlying & contradict_strong(networks, frame, constant)
     inliers = frame.without(outlying)
     if again or not torch.equal(outlying, suspected):
         prediction = judge.refine(inliers, updates=judge.takes_points)
     return Judged(judge, inliers, prediction, field, constant)
+
+
+def contradict_strong(
+    networks: Sequence[OpenNetwork], frame: Frame, constant: ResidualField
+) -> Tensor:
+    """Returns (N,) bool: the outliers beside every strong network that takes the image alone.
+
+    All points are, without such a network. With few points, `compact` knows less of the scene than
+    it does.
+
+    Args:
+        networks: The networks, open.
+        frame: The frame with all its points.
+        constant: Residual field of a constant depth at these points.
+    """
+    outlying = torch.ones(len(frame.points), dtype=torch.bool)
+    for network in networks:
+        if network.takes_points:
+            continue
+        aligned = network.refine(frame, updates=False).aligned
+        field = ResidualField(aligned, frame.points, frame.rgb)
+        if strength_of(unexplained_of(field, constant)) == 1:
+            outlying &= field.outliers
+    return outlying
 
 
 def _propagated(

@@ -17,6 +17,7 @@ from pnpdepth_cli.models.network import Network
 @pytest.fixture(scope="module")
 def room() -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) and image (H, W, 3) of a rendered room."""
+    pytest.importorskip("embreex")
     (frame,) = rendered("room", 1)
     return frame.gt, frame.rgb
 

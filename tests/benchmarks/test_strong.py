@@ -64,6 +64,7 @@ def test_lines_drawn_from_truth_are_recognised_as_scan_lines() -> None:
 def test_a_run_scores_every_column_and_the_result_of_an_exact_network_is_better_than_points_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    pytest.importorskip("embreex")
     (case,) = (
         one
         for one in strong_frames(Path("nowhere"), ("simulated",), ["rendered desks"], 1)

@@ -16,7 +16,12 @@ from pnpdepth_cli.frames.experts import weighted_mean
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.fuse import OWN_SCANNER
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame, without_outliers
+from pnpdepth_cli.frames.refine_frame import (
+    Pipeline,
+    contradict_strong,
+    refine_frame,
+    without_outliers,
+)
 from pnpdepth_cli.frames.validation import MIN_POINTS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -251,3 +256,20 @@ def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
     assert torch.equal(inliers.points.xy, frame.points.xy[~bad])
     assert clean.outliers is None
     assert len(clean.points) == 60
+
+
+def test_a_point_that_agrees_with_a_strong_network_is_no_outlier(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frame = frame_in_memory(30)
+    network = member(Brightness, settings=ALIGNED)
+    monkeypatch.setattr(network.network.module, "forward", lambda rgb: depth_of_scene()[None, None])
+    wrong = frame.points.depth.clone()
+    wrong[3] *= 3
+    frame = replace(frame, points=replace(frame.points, depth=wrong))
+    called_out = torch.zeros(30, dtype=torch.bool)
+    called_out[[3, 4, 5]] = True
+    constant = ResidualField(torch.ones(SIZE), frame.points, frame.rgb)
+    with opened(network) as networks:
+        kept = called_out & contradict_strong(networks, frame, constant)
+    assert kept.nonzero().flatten().tolist() == [3]
