@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import nearest_points
@@ -70,6 +69,8 @@ def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | 
     Returns None for points that are no depth map with holes: those of a scanner, at random pixels,
     or of a map without a hole.
     """
+    from scipy import ndimage
+
     grid = _PixelGrid.of(points)
     if grid is None:
         return None
@@ -124,6 +125,8 @@ class _PixelGrid(NamedTuple):
 
 def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """The holes (R, C), or so many whole ones in random order that they have room, in pixels."""
+    from scipy import ndimage
+
     if holes.sum() <= room:
         return holes
     label, count = ndimage.label(holes, _AROUND)

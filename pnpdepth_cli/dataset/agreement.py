@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading
@@ -73,6 +72,8 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
         first: Depths of any shape, not above 0 where unknown.
         second: The others, of the same shape and pixels.
     """
+    from scipy.stats import rankdata  # slow to import
+
     both = (first > 0) & (second > 0)
     values = np.stack([first[both], second[both]]).astype(np.float64)
     count = values.shape[1]

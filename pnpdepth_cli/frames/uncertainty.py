@@ -21,7 +21,6 @@ from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from scipy import ndimage
 from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points, pixels_of
@@ -224,6 +223,8 @@ def beyond_range(points: SparsePoints) -> Tensor:
     That is in gaps among and beside the points, if the points end sharply at one depth and many
     points beside the gaps are there.
     """
+    from scipy import ndimage
+
     nowhere = torch.zeros(points.size, dtype=torch.bool)
     depth = points.depth.double()
     farthest = float(depth.max())
