@@ -72,8 +72,6 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
         first: Depths of any shape, not above 0 where unknown.
         second: The others, of the same shape and pixels.
     """
-    from scipy.stats import rankdata  # slow to import
-
     both = (first > 0) & (second > 0)
     values = np.stack([first[both], second[both]]).astype(np.float64)
     count = values.shape[1]
@@ -82,11 +80,21 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
     values = values[:, :: max(1, count // _MOST)]
     log_ratio = np.log(values[0]) - np.log(values[1])
     low, middle, high = np.quantile(log_ratio, (0.16, 0.5, 0.84)).tolist()
-    ranks = np.stack([rankdata(each) for each in values])
+    ranks = np.stack([_ranks(each) for each in values])
     ranks -= ranks.mean(axis=1, keepdims=True)
     length = float(np.linalg.norm(ranks[0]) * np.linalg.norm(ranks[1]))
     rank = float(ranks[0] @ ranks[1]) / length if length > 0 else 0.0
     return Agreement(count, rank, math.exp(middle), (high - low) / 2)
+
+
+def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The ranks (N,) of values (N,) from 1, the mean rank for equal ones.
+
+    As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
+    """
+    _, number, count = np.unique(values, return_inverse=True, return_counts=True)
+    mean_rank = np.cumsum(count) - (count - 1) / 2
+    return np.asarray(mean_rank[number], np.float64)
 
 
 def check_order(what: str, first: NDArray[np.floating], second: NDArray[np.floating]) -> str | None:

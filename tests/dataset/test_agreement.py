@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
 from pnpdepth_cli.errors import InputError
@@ -89,3 +90,9 @@ def test_no_quotient_is_advised_where_the_ratio_varies() -> None:
     near = compare_depths(2 * RNG.permuted(DEPTH), DEPTH)  # as a network without a scale may be
     assert unit_warning("predictions", near, {"--scale": FLOAT}, fitted=True) is None
     assert unit_warning("depths", compare_depths(NOISY, DEPTH), {"--scale": FLOAT}) is None
+
+
+def test_the_rank_correlation_is_spearmans_also_of_equal_depths() -> None:
+    first = RNG.integers(1, 9, 500).astype(float)
+    second = first + RNG.integers(0, 5, 500)
+    assert compare_depths(first, second).rank == pytest.approx(spearmanr(first, second).statistic)
