@@ -48,6 +48,8 @@ _MANY_OUTLIERS = 0.25
 """Fraction of the points that may be far off the aligned prediction without a warning."""
 _MOST_LOST = 0.5
 """Fraction of the points that may lie where the prediction is unknown, without a warning."""
+_FEW_UNKNOWN = 1e-4
+"""Fraction of the image below which nothing is said of unknown pixels without a point."""
 _SUGGESTION_SIDE = 128  # pixels of the synthetic frame that suggests layers
 
 
@@ -264,7 +266,7 @@ class AlignedDepth:
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
         """Where the network says nothing, such as of the sky, and how many points lie there."""
         unknown, lost = float(raw.isnan().cpu().double().mean()), int((~seen).sum())
-        if not unknown:
+        if not lost and unknown < _FEW_UNKNOWN:
             return ()
         note = (
             f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
