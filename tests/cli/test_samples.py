@@ -46,6 +46,7 @@ def result(capsys: pytest.CaptureFixture[str], line: str) -> Any:
         ("--model fcrn-tiny --uncertainty", 1.041, 0.070, SIGMA),
         ("--model fcrn-tiny --method alone --propagate none", 1.056, 0.894, set()),
         ("--model fcrn-tiny --method paper", 1.386, 1.317, set()),
+        (f"--depth {SAMPLES}/indoor/predicted.npy", 0.120, 0.030, set()),
     ],
 )
 def test_refine_writes_its_files_and_lowers_the_error(

@@ -103,8 +103,6 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if request.refine.files.min_confidence is not None and not masked:
         raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")
     _check_names(frames, request.refine)
-    if request.depth is not None:
-        frames = _with_depths(request.depth, frames)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
     for sequence in sequences_of(frames).values():
@@ -116,10 +114,16 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     if not chosen:
         fact = f"no frame of {source} has a name like {request.names!r}"
         raise UsageError(f"{fact}; the first is {frames[0].name}")
+    chosen = chosen[:: request.every][: request.limit][number - 1 :: of]
+    if request.depth is not None:
+        with_depths = _with_depths(request.depth, chosen)
+        by_name = {frame.name: frame for frame in with_depths}
+        chosen = with_depths
+        frames = [by_name.get(frame.name, frame) for frame in frames]
     return BatchFrames(
         layout=layout,
         frames=frames,
-        chosen=chosen[:: request.every][: request.limit][number - 1 :: of],
+        chosen=chosen,
         unmatched=[f"{path} {why}" for path, why in lost if not _is_inside(path, output)],
         poses=poses,
     )

@@ -222,6 +222,20 @@ def test_a_least_confidence_is_for_frames_with_a_mask_and_none_of_their_own(root
         find_frames(replace(request, source=root))
 
 
+def test_a_folder_of_depth_maps_takes_the_place_of_a_network(root: Path) -> None:
+    (root / "maps").mkdir()
+    for name in "abc":
+        truth = read_depth(root / f"gt/{name}.png").values
+        np.save(root / f"maps/{name}.npy", 0.5 + 2 / truth)
+    refine = {"method": "alone", "model": "compact", "checkpoint": None}
+    with pytest.raises(InputError, match="named d"):
+        batch(root, depth=root / "maps", refine=refine)
+    summary = batch(root, depth=root / "maps", names="[abc]", refine=refine)
+    assert summary.counts["done"] == 3
+    assert {*summary.weights} == {"depth map"}
+    assert summary.errors["ground_truth"]["after"]["mae"] < 0.02
+
+
 def test_a_stopped_batch_goes_on_without_what_a_kill_left(root: Path) -> None:
     stops = iter([False, False, True, True])
     assert batch(root, Recorder(lambda: next(stops))).counts["pending"] == 2
