@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import nn
+from torch.utils._python_dispatch import _disable_current_modes
 
 from pnpdepth_cli.models import cut_layers, decisions, network
 from pnpdepth_cli.models.cut_layers import default_layer
@@ -44,7 +45,11 @@ def file(tmp_path: Path, cache: Path) -> str:
 
 def write(path: Path, seed: int) -> Path:
     torch.manual_seed(seed)
-    torch.onnx.export(Small().eval(), (torch.rand(1, 3, *SIZE),), str(path), dynamo=False)
+    image = torch.rand(1, 3, *SIZE)
+    with (
+        _disable_current_modes()
+    ):  # such as of `pytest --rounding`, which the exporter cannot trace
+        torch.onnx.export(Small().eval(), (image,), str(path), dynamo=False)
     return path
 
 
