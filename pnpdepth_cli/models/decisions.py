@@ -62,7 +62,7 @@ def recalled(
         file: File or weights that it was read from; None keeps nothing.
         question: What is decided, with all that it depends on besides the network.
         decide: Function that decides it; called unless the answer is known.
-        valid: Whether an answer can be right; another one is not believed.
+        valid: Whether an answer can be right; another one is not taken.
     """
     digest = None if file is None else _digest(module, file)
     if digest is None:

@@ -184,7 +184,7 @@ class Network:
         """Returns the prediction as `raw_of` does, but not finite where it is not.
 
         Raises:
-            ModelError: As of `raw_of`.
+            ModelError: It holds no prediction, or several tensors, as `raw_of` says.
         """
         # The definition's `output` picks the depth, or it is the only tensor.
         name = f"network {self.definition.name!r}"

@@ -138,7 +138,7 @@ def test_decisions_of_another_version_are_not_taken(
 
 
 @pytest.mark.parametrize("answer", [["no layer"], [], "down", [1], None])
-def test_an_answer_that_cannot_be_right_is_not_believed(
+def test_an_answer_that_cannot_be_right_is_not_taken(
     answer: object, file: str, asked: list[str]
 ) -> None:
     first = decided(file)
