@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.batch.running import spread
+from pnpdepth_cli.commands.many_frames.running import spread
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of

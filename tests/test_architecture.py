@@ -41,6 +41,16 @@ MAY_IMPORT = {
     "api": {*GROUND_FLOOR, "core", "completion", "models", "frames"},
 }
 
+IN_COMMANDS = {
+    "requests": set[str](),
+    "shared": {"requests"},
+    "evaluation": {"requests", "shared"},
+    "exports": {"shared"},
+    "refinement": {"requests", "shared"},
+    "many_frames": {"requests", "shared", "refinement"},
+}
+"""Which folders of `commands` each folder imports; a command imports any folder, and no command."""
+
 
 @functools.cache
 def imported_modules(file: Path) -> frozenset[str]:
@@ -60,6 +70,26 @@ def test_a_package_imports_only_what_its_arrow_allows(package: str) -> None:
         parts = (name.split(".") for name in imported_modules(file))
         used = {p[1] for p in parts if p[0] == "pnpdepth_cli" and len(p) > 1}
         assert used & MAY_IMPORT.keys() <= MAY_IMPORT[package] | {package}, file
+
+
+@pytest.mark.parametrize("room", [*IN_COMMANDS, *COMMANDS])
+def test_a_command_uses_no_other_command(room: str) -> None:
+    folder = PACKAGE / "commands" / room
+    allowed = IN_COMMANDS.get(room, {*IN_COMMANDS}) | {room}
+    for file in folder.glob("*.py") if room in IN_COMMANDS else [folder.with_suffix(".py")]:
+        parts = (name.split(".") for name in imported_modules(file))
+        used = {p[2] for p in parts if p[:2] == ["pnpdepth_cli", "commands"] and len(p) > 2}
+        assert used <= allowed, file
+
+
+@pytest.mark.parametrize("package", ["commands", "cli"])
+def test_a_command_is_one_file_of_its_name(package: str) -> None:
+    files = {file.stem for file in (PACKAGE / package).glob("*.py")}
+    of_all = {
+        "commands": {"__init__"},
+        "cli": {"__init__", "main", "options", "printing", "terminal"},
+    }
+    assert files - of_all[package] == {*COMMANDS}
 
 
 @pytest.mark.parametrize("package", ["core", "completion", "models", "frames"])
@@ -148,9 +178,10 @@ def test_few_functions_wrap_equation_3(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_name_is_a_place() -> None:
-    """No two classes, and no two files but `__init__`, have one name."""
+    """No two classes, and no two files but `__init__` and a command's pair, have one name."""
     files = sorted(PACKAGE.rglob("*.py"))
     nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
     classes = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
-    modules = Counter(file.stem for file in files if file.stem != "__init__")
+    pairs = {PACKAGE / "cli" / f"{command}.py" for command in COMMANDS}
+    modules = Counter(file.stem for file in files if file not in pairs and file.stem != "__init__")
     assert [name for name, count in [*classes.items(), *modules.items()] if count > 1] == []

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames, request_of
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import evaluate
+from pnpdepth_cli.commands.eval import evaluate
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
-from pnpdepth_cli.commands.refinement.refine_image import read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.many_frames.find_frames import find_frames, request_of
+from pnpdepth_cli.commands.refinement.requested import read_requested
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.eval_request import EvalRequest
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
-from tests.commands.evaluation.test_evaluate import code_image, depth_file
+from tests.commands.test_eval import code_image, depth_file
 from tests.data_sets import SELECTED, codes, eth3d, ibims, image, void
 
 KITTI = (352, 1216)

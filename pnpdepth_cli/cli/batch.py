@@ -1,4 +1,4 @@
-"""`pnpdepth refine` and `batch`."""
+"""`pnpdepth batch`: the options, the combinations of `--vary`, Ctrl-C, and what is printed."""
 
 from __future__ import annotations
 
@@ -18,131 +18,56 @@ import click
 from click.core import ParameterSource
 
 from pnpdepth_cli.cli import options
-from pnpdepth_cli.cli.terminal import INTERRUPTED, print_json, progress_bar, say, say_above_bar
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
+from pnpdepth_cli.cli.terminal import INTERRUPTED, progress_bar, say, say_above_bar
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.errors import DivergedError, FramesFailedError, UsageError
+from pnpdepth_cli.errors import FramesFailedError, UsageError
 from pnpdepth_cli.settings import OF_UPDATES, Settings
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.records import BatchSummary
+    from pnpdepth_cli.commands.many_frames.records import BatchSummary
 
 DEFAULT = "default"
 """A value that leaves the option out."""
-_NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
 _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
 """Characters that a folder's name cannot have, on some system."""
-_min_confidence = click.option(
-    "--min-confidence",
-    type=float,
-    metavar="N",
-    help="Least value of a confidence mask, such as 2 of 0…2, whose depth is used."
-    "  [default: above 0]",
-)
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
 
 
 @click.command(
-    short_help="Refine the depth of one image.",
-    cls=options.GroupedCommand,
-    common=(
-        *(
-            "--sparse",
-            "--depth",
-            "--gt",
-            "--calib",
-            "--model",
-            "--checkpoint",
-            "--method",
-            "--layer",
-        ),
-        *("--holdout", "--uncertainty", "--output", "--overwrite", "--json"),
-    ),
-    groups={
-        "Input": (
-            *("--sparse", "--sparse-mask", "--min-confidence", "--depth", "--gt"),
-            *(ScanOptions, ReadOptions),
-        ),
-        "Network": _NETWORK,
-        "Method": (Settings, "--uncertainty", "--keep-measured", "--holdout"),
-        "Output": ("--output", RefineRequest, "--json"),
-    },
-)
-@click.argument("image", type=options.FILE, required=False)
-@click.option(
-    "--sparse",
-    type=options.FILE,
-    required=True,
-    help="Sparse depth: a map (16-bit PNG, EXR, NPY, …), points x y depth (NPY, CSV), a LiDAR scan"
-    " with --calib (BIN, NPY, PCD, PLY), or the folder of a COLMAP model.",
-)
-@click.option(
-    "--sparse-mask",
-    type=options.FILE,
-    help="Confidence of the sparse depth, or a mask: image or array of its size or the image's.",
-)
-@_min_confidence
-@click.option(
-    "--depth",
-    "depths",
-    type=options.FILE,
-    multiple=True,
-    help="Depth map that a network predicted (NPY, NPZ, EXR, 16-bit PNG, …; FILE.npz:KEY): depth or"
-    " disparity in any unit, which takes the place of a network's output. Several are fused.",
-)
-@click.option("--gt", type=options.FILE, help="Ground truth depth to score against.")
-@click.option(
-    "-o",
-    "--output",
-    type=options.FILE,
-    help="Output folder, or one depth file such as depth.exr.  [default: ./IMAGE_refined/]",
-)
-@options.refinement(without=["seed", "baselines", "format"])
-@options.as_json
-def refine(as_json: bool, **values: Any) -> None:
-    """Refine a depth network's prediction for IMAGE with sparse depth.
-
-    \b
-    pnpdepth refine img.png --sparse s.png
-    pnpdepth refine img.png --sparse s.exr --gt gt.png -o out/
-    pnpdepth refine img.png --sparse s.csv --depth predicted.npy
-    pnpdepth refine img.png --sparse s.npy --model net.onnx --layer Relu_315
-    pnpdepth refine 000001.png --sparse 000001.bin --calib 000001.txt
-
-    Writes <name>_depth.png (16 bit, with its scale), <name>_preview.png, <name>.json and
-    <name>_improvement.png (blue better, orange worse): with ground truth at each pixel, else at
-    held-out or validation points.
-    """
-    from pnpdepth_cli.cli.printing import print_refinement
-    from pnpdepth_cli.commands.refinement.refine_image import refine_image
-
-    request = options.request_of(values)
-    record = refine_image(request)
-    if as_json:
-        print_json(record.to_json())
-    else:
-        print_refinement(record)
-    if record.status == "diverged":
-        raise DivergedError(record.message or "")
-
-
-@click.command(
+    "batch",
     short_help="Refine all frames of a folder or a list.",
     cls=options.GroupedCommand,
     common=(
-        *("--layout", "--sample", "--limit", "--shard", "--model", "--checkpoint", "--method"),
-        *("--holdout", "--uncertainty", "--output", "--html", "--vary"),
+        "--layout",
+        "--sample",
+        "--limit",
+        "--shard",
+        "--model",
+        "--checkpoint",
+        "--method",
+        "--holdout",
+        "--uncertainty",
+        "--output",
+        "--html",
+        "--vary",
     ),
     groups={
         "Frames": (
-            *("--sample", "--layout", "--protocol", "--frames", "--every", "--limit", "--shard"),
+            "--sample",
+            "--layout",
+            "--protocol",
+            "--frames",
+            "--every",
+            "--limit",
+            "--shard",
         ),
         "Sequences": ("--accumulate", "--poses", "--pose-kind", "--adapt"),
         "Input": ("--min-confidence", ScanOptions, ReadOptions),
-        "Network": _NETWORK,
+        "Network": options.NETWORK,
         "Method": (Settings, "--baselines", "--uncertainty", "--keep-measured", "--holdout"),
         "Study": ("--vary",),
         "Output": ("--output", RefineRequest, BatchRequest),
@@ -157,7 +82,7 @@ def refine(as_json: bool, **values: Any) -> None:
     metavar="[PATTERN:]N|P%",
     help="Sample the sparse depth from the ground truth, as `pnpdepth sample` does.",
 )
-@_min_confidence
+@options.min_confidence
 @options.options_of_groups(BatchRequest)
 @click.option(
     "--vary",
@@ -169,7 +94,7 @@ def refine(as_json: bool, **values: Any) -> None:
 )
 @options.refinement(without=["camera"])
 @click.pass_context
-def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> None:
+def command(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> None:
     """Refine all frames of FOLDER, of a LIST of them (CSV), or of a ROS BAG.
 
     \b
@@ -209,7 +134,7 @@ def batch(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> No
         raise click.exceptions.Exit(INTERRUPTED)
     counts = sum((Counter(summary.counts) for summary in summaries), Counter[str]())
     if bad := counts["chosen_not_done"]:
-        from pnpdepth_cli.commands.tables import count_of
+        from pnpdepth_cli.commands.shared.tables import count_of
 
         raise FramesFailedError(
             f"{bad:,} of {count_of(counts['chosen'], 'frame')} failed or diverged; the reasons are"
@@ -222,7 +147,7 @@ def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> 
 
     The folder, below the output, is that of the results.
     """
-    from pnpdepth_cli.commands.batch.find_frames import unpack
+    from pnpdepth_cli.commands.frames import unpack
 
     own = options.take_options(BatchRequest, values)
     own |= {name: values.pop(name) for name in ("source", "output")}
@@ -240,8 +165,8 @@ def _run(
     Notes that an earlier run of the study printed, which are in `said`, are not printed again.
     """
     from pnpdepth_cli.cli.printing import print_batch
-    from pnpdepth_cli.commands.batch.run_batch import run_batch
-    from pnpdepth_cli.commands.tables import count_of
+    from pnpdepth_cli.commands.batch import run_batch
+    from pnpdepth_cli.commands.shared.tables import count_of
 
     def say_once(line: str) -> None:
         if line not in said:

@@ -35,22 +35,22 @@ _LONGEST = 2000  # most characters of a message; a longer one loses its middle
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""
 
-COMMANDS = {
-    "refine": "refine_commands:refine",
-    "batch": "refine_commands:batch",
-    "models": "models_command:models",
-    "layers": "models_command:layers",
-    "project": "sparse_commands:project",
-    "frames": "sparse_commands:frames",
-    "sample": "sparse_commands:sample",
-    "simulate": "sparse_commands:simulate",
-    "cloud": "result_commands:cloud",
-    "export": "result_commands:export",
-    "eval": "result_commands:evaluate",
-    "compare": "result_commands:compare",
-    "doctor": "models_command:doctor",
-}
-"""The subcommands in the order of the help, as `module:function` in `pnpdepth_cli.cli`."""
+COMMANDS = (
+    "refine",
+    "batch",
+    "models",
+    "layers",
+    "project",
+    "frames",
+    "sample",
+    "simulate",
+    "cloud",
+    "export",
+    "eval",
+    "compare",
+    "doctor",
+)
+"""The subcommands in the order of the help: each is `command` of its file in `pnpdepth_cli.cli`."""
 
 
 class _Commands(click.Group):
@@ -62,8 +62,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        module, name = COMMANDS[cmd_name].split(":")
-        command = getattr(importlib.import_module(f"pnpdepth_cli.cli.{module}"), name)
+        command = importlib.import_module(f"pnpdepth_cli.cli.{cmd_name}").command
         assert isinstance(command, click.Command)
         return command
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import click
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
@@ -29,6 +29,8 @@ class _File(click.Path):
 FILE = _File(path_type=Path)
 _WITHOUT = (None, False, 0, math.inf)  # defaults that are no value to show
 _NAME_COLUMN = 22
+NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
+"""The options of the network, a group of the help."""
 _HELP = ("--help", "--help-all")
 _SHOW_ALL = "pnpdepth.help_all"
 Command = Callable[..., None]
@@ -116,6 +118,13 @@ pose_kind = click_option(_DECLARED["pose_kind"])
 seed = click_option(_DECLARED["seed"])
 overwrite = click_option(_DECLARED["overwrite"])
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+min_confidence = click.option(
+    "--min-confidence",
+    type=float,
+    metavar="N",
+    help="Least value of a confidence mask, such as 2 of 0…2, whose depth is used."
+    "  [default: above 0]",
+)
 _sparse_output = click.option(
     "-o",
     "--output",

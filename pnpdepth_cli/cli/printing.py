@@ -13,15 +13,15 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from pnpdepth_cli.cli.terminal import printable, say
-from pnpdepth_cli.commands import tables
 from pnpdepth_cli.commands.requests import check_outputs
+from pnpdepth_cli.commands.shared import tables
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.stages import GT
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.batch.records import BatchSummary
-    from pnpdepth_cli.commands.make_sparse import Written
+    from pnpdepth_cli.commands.many_frames.records import BatchSummary
+    from pnpdepth_cli.commands.shared.sparse_files import Written
 
 _STDOUT = Path("-")
 _WIDE = 1000  # columns of what is no terminal

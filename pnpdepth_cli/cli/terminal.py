@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.settings import Settings, flag_of, options_of
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 
-from pnpdepth_cli.commands.batch.adapted import with_adapted_weights
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
-from pnpdepth_cli.commands.batch.find_frames import BatchFrames, find_frames
-from pnpdepth_cli.commands.batch.records import BatchSummary, Records, write_summary
-from pnpdepth_cli.commands.pipeline import in_order
-from pnpdepth_cli.commands.tables import count_of, names_of_depths
+from pnpdepth_cli.commands.many_frames.adapted import with_adapted_weights
+from pnpdepth_cli.commands.many_frames.find_frames import BatchFrames, find_frames
+from pnpdepth_cli.commands.many_frames.records import BatchSummary, Records, write_summary
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
+from pnpdepth_cli.commands.shared.pipeline import in_order
+from pnpdepth_cli.commands.shared.tables import count_of, names_of_depths
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
@@ -40,7 +40,7 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
     request = replace(request, refine=refine)
     found, own = find_frames(request), Records(request)
     if request.html is not None:
-        from pnpdepth_cli.commands.batch.batch_report import check_batch_report
+        from pnpdepth_cli.commands.many_frames.batch_report import check_batch_report
 
         check_batch_report(request, request.html)
     for note in _notes(request, found):
@@ -60,7 +60,7 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         to_do = [frame for frame, why in zip(found.chosen, reasons, strict=True) if why]
         listener.say(_plan(reasons))
         if to_do:
-            from pnpdepth_cli.commands.batch.running import refine_all  # imports torch
+            from pnpdepth_cli.commands.many_frames.running import refine_all  # imports torch
 
             listener.begin(len(to_do))
             worked = len(to_do) < len(found.chosen)

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.commands.requests import CloudRequest, check_outputs
-from pnpdepth_cli.commands.results import ResultFrame, result_frames
+from pnpdepth_cli.commands.requests import check_outputs
+from pnpdepth_cli.commands.requests.cloud_request import CloudRequest
+from pnpdepth_cli.commands.shared.results import ResultFrame, result_frames
 from pnpdepth_cli.dataset.arrays import camera_of_exif, camera_of_file, image_of_size
 from pnpdepth_cli.dataset.frame_record import Pose
 from pnpdepth_cli.dataset.range_ends import far_values

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands import statistics
-from pnpdepth_cli.commands.evaluation.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.requests import check_outputs
-from pnpdepth_cli.commands.statistics import Clusters, find_clusters
-from pnpdepth_cli.commands.tables import Style, Table, count_of, some_names
+from pnpdepth_cli.commands.requests.eval_request import WITHOUT_SPARSE, EvalRequest
+from pnpdepth_cli.commands.shared import statistics
+from pnpdepth_cli.commands.shared.statistics import Clusters, find_clusters
+from pnpdepth_cli.commands.shared.tables import Style, Table, count_of, some_names
 from pnpdepth_cli.dataset.frame_files import groups_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError

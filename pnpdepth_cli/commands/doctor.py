@@ -13,7 +13,7 @@ import psutil
 import torch
 
 import pnpdepth_cli
-from pnpdepth_cli.commands.tables import count_of
+from pnpdepth_cli.commands.shared.tables import count_of
 from pnpdepth_cli.models import decisions
 
 _DEVELOPERS = ("test", "docs", "train")  # extras that no command needs

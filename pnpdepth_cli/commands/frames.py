@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.requests import FramesRequest
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.frames_request import FramesRequest
 from pnpdepth_cli.dataset.plausible import scan_returns
 from pnpdepth_cli.dataset.scan_points import choose_camera
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
@@ -33,6 +34,7 @@ from pnpdepth_cli.io.bags import (
     Message,
     check_topics,
     choose_topic,
+    is_bag,
     messages,
     open_bag,
 )
@@ -123,6 +125,30 @@ def write_frames(request: FramesRequest, say: Say) -> int:
     }
     write_json(request.output / RECORD, record)
     return len(times)
+
+
+def unpack(request: BatchRequest, say: Say) -> BatchRequest:
+    """Returns the request with the frames of its bag as source; any other request as it is.
+
+    The frames are written to OUTPUT_frames, and stay there for the next run.
+    """
+    if not is_bag(request.source):
+        return request
+    folder = request.output.with_name(f"{request.output.name}_frames")
+    whole = request.limit is None or request.names is not None
+    between = None if whole else (0, request.every * (request.limit or 1) - 1)
+    # The points are metres in these files, so a scale that the user states is of the bag.
+    frames = FramesRequest(
+        bag=request.source,
+        output=folder,
+        between=between,
+        depth_scale=request.reading.depth_scale,
+        overwrite=True,
+    )
+    if not has_frames(frames):
+        say(f"bag: wrote {write_frames(frames, say):,} frames to {folder}")
+    refine = request.refine.with_fields(depth_scale=None)
+    return replace(request, source=folder, refine=refine)
 
 
 def has_frames(request: FramesRequest) -> bool:

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from pnpdepth_cli.cli import refine_commands as command
+from pnpdepth_cli.cli.batch import _finishing_on_interrupt
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.cli.terminal import progress_bar, say_above_bar
-from pnpdepth_cli.commands.batch.batch_request import Listener
+from pnpdepth_cli.commands.requests.batch_request import Listener
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from tests.commands.batches import add_frame
 
@@ -81,7 +81,7 @@ def test_ctrl_c_finishes_the_frame_prints_how_to_continue_and_exits_130(root: Pa
 
 def test_the_second_ctrl_c_interrupts_and_the_old_handling_comes_back() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with command._finishing_on_interrupt() as stopped:
+    with _finishing_on_interrupt() as stopped:
         assert not stopped()
         os.kill(os.getpid(), signal.SIGINT)
         assert stopped()

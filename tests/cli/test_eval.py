@@ -1,4 +1,4 @@
-"""`pnpdepth eval`, `compare` and `export` as a user has them."""
+"""`pnpdepth eval`, and `compare` of what it prints, as a user has them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import pytest
 
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.io.depth import write_depth
-from tests.commands.test_export import project, results
 
 
 def code_of(line: str) -> int:
@@ -86,11 +85,3 @@ def test_names_of_bytes_are_scored(frames: Path, capfdbinary: pytest.CaptureFixt
     for form in ("--json", "--csv -", "--columns rmse"):
         assert code_of(f"eval out gt {form}") == 0
     assert b"\\udcff" in capfdbinary.readouterr().out
-
-
-def test_export_counts_frames_and_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, dense = results(project(tmp_path, "OPENCV")), tmp_path / "dense"
-    assert code_of(f"export {folder} --to colmap -o {dense}") == 0
-    out, err = capsys.readouterr()
-    assert out == f"wrote 3 frames in model units: {dense}\n"
-    assert " 3 of 3 images have lens distortion" in err

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from pnpdepth_cli.cli.main import cli
 from pnpdepth_cli.cli.options import GroupedCommand
-from pnpdepth_cli.commands.refinement.refine_request import GROUPS, RefineRequest
+from pnpdepth_cli.commands.requests.refine_request import GROUPS, RefineRequest
 from pnpdepth_cli.settings import flag_of, options_of
 
 MOST_OPTIONS = {"refine": 32, "batch": 47}

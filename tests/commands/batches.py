@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest, Listener
-from pnpdepth_cli.commands.batch.records import BatchSummary
-from pnpdepth_cli.commands.batch.run_batch import run_batch
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.batch import run_batch
+from pnpdepth_cli.commands.many_frames.records import BatchSummary
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 from tests.commands.frames import frame_on_disk

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
-from pnpdepth_cli.commands.refinement.refine_image import refine_image
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refine import refine_image
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.models.registry import find_definition

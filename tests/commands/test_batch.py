@@ -15,10 +15,10 @@ import torch
 from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames
-from pnpdepth_cli.commands.batch.records import write_summary
-from pnpdepth_cli.commands.refinement.refine_image import refine_image
+from pnpdepth_cli.commands.many_frames.find_frames import find_frames
+from pnpdepth_cli.commands.many_frames.records import write_summary
+from pnpdepth_cli.commands.refine import refine_image
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.cloud import write_depth_cloud
-from pnpdepth_cli.commands.requests import CloudRequest
+from pnpdepth_cli.commands.requests.cloud_request import CloudRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import FileRecord

@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.evaluation.compare import (
+from pnpdepth_cli.commands.compare import (
     Comparison,
     compare,
     comparison_table,
@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.evaluation.compare import (
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import write_json
-from tests.commands.evaluation.test_evaluate import frame, scored
+from tests.commands.test_eval import frame, scored
 
 
 def saved(folder: Path, *frames: dict[str, Scores], groups: str = "", **summary: object) -> str:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import Evaluation, evaluate, means_table
+from pnpdepth_cli.commands.eval import Evaluation, evaluate, means_table
 from pnpdepth_cli.commands.evaluation.scoring import scores_of
+from pnpdepth_cli.commands.requests.eval_request import EvalRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnpdepth_cli.commands.exports import export_results
+from pnpdepth_cli.commands.export import export_results
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
 from pnpdepth_cli.errors import InputError, OutputError

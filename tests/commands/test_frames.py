@@ -13,8 +13,8 @@ pytest.importorskip("rosbags")
 from rosbags.highlevel import AnyReader
 
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.commands.bag_frames import RECORD, write_frames
-from pnpdepth_cli.commands.requests import FramesRequest
+from pnpdepth_cli.commands.frames import RECORD, write_frames
+from pnpdepth_cli.commands.requests.frames_request import FramesRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.scan_points import read_scan_points

@@ -16,9 +16,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
-from pnpdepth_cli.commands.evaluation.evaluate import evaluate
-from pnpdepth_cli.commands.make_sparse import sample_depth
+from pnpdepth_cli.commands.eval import evaluate
+from pnpdepth_cli.commands.requests.eval_request import EvalRequest
+from pnpdepth_cli.commands.sample import sample_depth
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError

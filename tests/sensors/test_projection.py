@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera, Extrinsics
-from pnpdepth_cli.commands.refinement.refine_image import read_requested
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.requested import read_requested
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.calibration import read_calibration

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
-from pnpdepth_cli.commands.tables import write_text
+from pnpdepth_cli.commands.shared.tables import write_text
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.sensors.point_cloud import depth_normals
 

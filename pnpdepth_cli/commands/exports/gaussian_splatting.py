@@ -22,7 +22,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from pnpdepth_cli.commands.exports import Export, ExportFrame, distortion_note
-from pnpdepth_cli.commands.tables import write_text
+from pnpdepth_cli.commands.shared.tables import write_text
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.colmap_model import MODEL_PARTS, model_files
 from pnpdepth_cli.io.depth import write_depth

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest, endings_of
 from pnpdepth_cli.commands.requests import check_outputs
+from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest, endings_of
 from pnpdepth_cli.completion.interpolation import in_hull, linear
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord

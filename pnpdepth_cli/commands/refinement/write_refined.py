@@ -1,8 +1,8 @@
-"""`pnpdepth refine`: one image, its sparse depth, and a network; refined depth and its record."""
+"""Scores a refined frame, and writes its depth with its companions and record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,92 +12,30 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.commands.pipeline import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.refinement.outputs import (
-    plan_outputs,
     remove_outdated,
     within_range,
     without_unknown,
     write_outputs,
 )
-from pnpdepth_cli.commands.refinement.refine_request import Outputs, RefineRequest
-from pnpdepth_cli.commands.tables import names_of_depths
+from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest
+from pnpdepth_cli.commands.shared.pipeline import peak_memory_mb, timed, versions
+from pnpdepth_cli.commands.shared.tables import names_of_depths
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset import frame_record
-from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.open_network import OpenNetwork
-from pnpdepth_cli.frames.resolve import normalisation_name, with_input_range
+from pnpdepth_cli.frames.resolve import normalisation_name
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.visualisation import gain
-from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.spent import parts_of
 from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
 Stages = dict[str, frame_record.Scores]
-
-
-def refine_image(request: RefineRequest) -> frame_record.FrameRecord:
-    """Refines one frame, writes its depth and companions, and returns its record.
-
-    Args:
-        request: Files, network and settings of the refinement.
-
-    Raises:
-        PnpDepthError: What was asked for is at fault; then nothing is written.
-    """
-    seconds = dict[str, float]()
-    outputs = plan_outputs(request)
-    with timed(seconds, "read"):
-        inputs = read_requested(request)
-    with timed(seconds, "load network"), parts_of(seconds, "load network"):
-        method = load_method(request, inputs)
-    with timed(seconds, "refine"), method:
-        frame = method.refine(inputs, with_stages=inputs.gt is not None)
-    return write_refined(request, outputs, method, inputs, frame, seconds)
-
-
-def read_requested(request: RefineRequest) -> Frame:
-    """Returns the frame that is asked for, as `read_frame` reads it."""
-    return read_frame(
-        request.files,
-        request.read_options,
-        seed=request.method.seed,
-        holdout=request.holdout,
-        needs_camera=request.view_3d,
-    )
-
-
-def load_method(
-    request: RefineRequest, first: Frame, more: Callable[[], Sequence[Frame]] = tuple
-) -> Method:
-    """Returns the method that is asked for; this first frame decides what networks leave open.
-
-    Args:
-        request: Networks and settings of the refinement.
-        first: The first frame.
-        more: Function of further frames, which decide as well; called only if a network needs it.
-
-    Raises:
-        UsageError: The request combines what cannot be combined.
-        ModelError: The network cannot be loaded.
-    """
-    own = load_network(request.model, request.checkpoint, request.device)
-    others = [load_network(model, None, request.device) for model in request.more_models]
-    return Method(
-        [with_input_range(own, request.normalise), *others],
-        request.method,
-        first,
-        more,
-        validated=request.baselines,
-        uncertainty=request.uncertainty or request.unknown == "zero",
-        keep_measured=request.keep_measured,
-    )
 
 
 def write_refined(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest, parse_sample
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys

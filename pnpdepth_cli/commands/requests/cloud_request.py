@@ -1,27 +1,13 @@
-"""What the user asks of clouds and bags, and which files that may replace.
-
-Imports neither numpy nor torch.
-"""
+"""What the user asks of `pnpdepth cloud`. Imports neither numpy nor torch."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.settings import option
-
-
-def check_outputs(paths: Iterable[Path], inputs: Iterable[Path] = (), *, overwrite: bool) -> None:
-    """Raises OutputError for a file that is an input, or that exists and may not be replaced."""
-    resolved = {path.resolve() for path in inputs}
-    for path in paths:
-        if path.resolve() in resolved:
-            raise OutputError(f"{path} is one of the inputs; name another output")
-        if path.exists() and not overwrite:
-            raise OutputError(f"{path} exists; --overwrite replaces it, or name another output")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,35 +55,3 @@ class CloudRequest:
             raise UsageError("--image is for one depth file; records name the images of a folder")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise UsageError(f"--voxel must be a length above 0, got {self.voxel:g}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class FramesRequest:
-    """Which bag to write as files, and where."""
-
-    bag: Path
-    output: Path
-    """The folder for rgb/, sparse/, calib.txt, poses.txt and frames.json."""
-    topics: tuple[str, ...] = ()
-    """Topics of images, of points (PointCloud2) and of poses; else the only one of its kind."""
-    tolerance: float = option(
-        0.05, "Largest time between an image and its scan.", metavar="SECONDS"
-    )
-    clock_offset: float | None = option(
-        None,
-        "Added to the times of the points.  [default: 0; by the times of the log if above 1 s]",
-        metavar="SECONDS",
-    )
-    between: tuple[int, int] | None = option(
-        None, "Only the frames of these numbers, from 0.", metavar="FIRST LAST"
-    )
-    every: int = option(1, "Only every N-th of these.", metavar="N", least=1)
-    depth_scale: float | None = None
-    """Numbers per metre of the points. None: what the bag says, else millimetres of integers."""
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.between is not None and not 0 <= self.between[0] <= self.between[1]:
-            raise UsageError("--between {} {} has no frame; give FIRST LAST".format(*self.between))
-        if not self.tolerance >= 0:
-            raise UsageError(f"--tolerance must be >= 0, got {self.tolerance:g}")

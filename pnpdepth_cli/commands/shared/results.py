@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.refine_request import endings_of
+from pnpdepth_cli.commands.requests.refine_request import endings_of
 from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, source_of
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.errors import InputError

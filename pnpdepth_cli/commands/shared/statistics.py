@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.commands.tables import count_of
+from pnpdepth_cli.commands.shared.tables import count_of
 
 Floats = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from itertools import count
 
 import pytest
 
-from pnpdepth_cli.commands.pipeline import in_order
+from pnpdepth_cli.commands.shared.pipeline import in_order
 
 
 def test_results_come_in_order_few_items_are_taken_ahead_and_an_error_ends_the_work() -> None:

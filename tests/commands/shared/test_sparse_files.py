@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pnpdepth_cli.commands.make_sparse import Written, project_scan, sample_depth, simulate_scan
+from pnpdepth_cli.commands.project import project_scan
+from pnpdepth_cli.commands.sample import sample_depth
+from pnpdepth_cli.commands.shared.sparse_files import Written
+from pnpdepth_cli.commands.simulate import simulate_scan
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.file_record import SamplePattern

@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
-from pnpdepth_cli.commands import statistics
-from pnpdepth_cli.commands.statistics import Clusters, block_length, find_clusters
+from pnpdepth_cli.commands.shared import statistics
+from pnpdepth_cli.commands.shared.statistics import Clusters, block_length, find_clusters
 from pnpdepth_cli.dataset.frame_files import groups_of
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 from math import nan
 from typing import Any
 
-from pnpdepth_cli.commands import tables
-from pnpdepth_cli.commands.tables import Table, refinement_tables
+from pnpdepth_cli.commands.shared import tables
+from pnpdepth_cli.commands.shared.tables import Table, refinement_tables
 from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
 from pnpdepth_cli.measures import MEASURES
 from tests.builders import method_record

@@ -11,10 +11,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import Listener
-from pnpdepth_cli.commands.batch.find_frames import input_files, request_of, sequences_of
-from pnpdepth_cli.commands.batch.records import Records
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.many_frames.find_frames import input_files, request_of, sequences_of
+from pnpdepth_cli.commands.many_frames.records import Records
+from pnpdepth_cli.commands.requests.batch_request import Listener
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import DivergedError, InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
@@ -80,7 +80,7 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
     """Writes adapted weights if they are better beyond chance; returns why they are not."""
     from safetensors.torch import save_file  # these import torch
 
-    from pnpdepth_cli.commands.refinement.refine_image import read_requested
+    from pnpdepth_cli.commands.refinement.requested import read_requested
     from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network

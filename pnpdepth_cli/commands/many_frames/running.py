@@ -22,12 +22,13 @@ from types import ModuleType
 from typing import Any
 
 from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
-from pnpdepth_cli.commands.batch.batch_request import LOCAL, BatchRequest, Listener
-from pnpdepth_cli.commands.batch.find_frames import request_of
-from pnpdepth_cli.commands.batch.records import Records
-from pnpdepth_cli.commands.pipeline import THREADS, in_order, timed
-from pnpdepth_cli.commands.refinement.refine_image import load_method, read_requested, write_refined
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.many_frames.find_frames import request_of
+from pnpdepth_cli.commands.many_frames.records import Records
+from pnpdepth_cli.commands.refinement.requested import load_method, read_requested
+from pnpdepth_cli.commands.refinement.write_refined import write_refined
+from pnpdepth_cli.commands.requests.batch_request import LOCAL, BatchRequest, Listener
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
+from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order, timed
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, StorageError, UsageError

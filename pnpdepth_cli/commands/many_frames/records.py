@@ -20,11 +20,17 @@ from pathlib import Path
 import numpy as np
 
 from pnpdepth_cli import __version__
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import CSV, JSON, BatchFrames, input_files, request_of
-from pnpdepth_cli.commands.refinement.refine_request import GROUPS, Outputs, RefineRequest
-from pnpdepth_cli.commands.statistics import find_clusters
-from pnpdepth_cli.commands.tables import Table, stage_titles, write_text
+from pnpdepth_cli.commands.many_frames.find_frames import (
+    CSV,
+    JSON,
+    BatchFrames,
+    input_files,
+    request_of,
+)
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.refine_request import GROUPS, Outputs, RefineRequest
+from pnpdepth_cli.commands.shared.statistics import find_clusters
+from pnpdepth_cli.commands.shared.tables import Table, stage_titles, write_text
 from pnpdepth_cli.dataset.frame_files import FrameFiles, groups_of
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError
@@ -264,7 +270,7 @@ def write_summary(
     write_json(request.output / JSON, {**asdict(summary), "frames": frames})
     write_text(request.output / CSV, _table(summary, records).csv())
     if request.html is not None:
-        from pnpdepth_cli.commands.batch.batch_report import write_batch_report
+        from pnpdepth_cli.commands.many_frames.batch_report import write_batch_report
 
         write_batch_report(request, request.html, summary, records)
     return summary

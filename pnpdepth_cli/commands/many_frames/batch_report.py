@@ -13,9 +13,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.records import BatchSummary
-from pnpdepth_cli.commands.tables import bases_of, mean_weights_text, means_tables, weights_text
+from pnpdepth_cli.commands.many_frames.records import BatchSummary
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.shared.tables import (
+    bases_of,
+    mean_weights_text,
+    means_tables,
+    weights_text,
+)
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io import report

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.commands.batch.batch_request import parse_address
-from pnpdepth_cli.commands.batch.running import spread
+from pnpdepth_cli.commands.many_frames.running import spread
+from pnpdepth_cli.commands.requests.batch_request import parse_address
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, OutputError, StorageError, UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.batch.find_frames import find_frames
 from pnpdepth_cli.commands.cloud import write_depth_cloud
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.commands.requests import CloudRequest
+from pnpdepth_cli.commands.many_frames.find_frames import find_frames
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.cloud_request import CloudRequest
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.file_record import SamplePattern

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pnpdepth_cli.commands.batch.batch_request import BatchRequest
-from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
-from pnpdepth_cli.commands.requests import FramesRequest
+from pnpdepth_cli.commands.requests.batch_request import BatchRequest
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset import frame_files
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, as_pose, groups_of
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import file_and_part
-from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.io.colmap_model import model_files
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line
@@ -43,32 +41,6 @@ class BatchFrames:
     unmatched: Sequence[str]
     poses: str | None
     """Where the poses of the frames are from, as a line; None without poses."""
-
-
-def unpack(request: BatchRequest, say: Callable[[str], None]) -> BatchRequest:
-    """Returns the request with the frames of its bag as source; any other request as it is.
-
-    The frames are written to OUTPUT_frames, and stay there for the next run.
-    """
-    if not is_bag(request.source):
-        return request
-    from pnpdepth_cli.commands.bag_frames import has_frames, write_frames
-
-    folder = request.output.with_name(f"{request.output.name}_frames")
-    whole = request.limit is None or request.names is not None
-    between = None if whole else (0, request.every * (request.limit or 1) - 1)
-    # The points are metres in these files, so a scale that the user states is of the bag.
-    frames = FramesRequest(
-        bag=request.source,
-        output=folder,
-        between=between,
-        depth_scale=request.reading.depth_scale,
-        overwrite=True,
-    )
-    if not has_frames(frames):
-        say(f"bag: wrote {write_frames(frames, say):,} frames to {folder}")
-    refine = request.refine.with_fields(depth_scale=None)
-    return replace(request, source=folder, refine=refine)
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:

@@ -1,0 +1,50 @@
+"""What a request asks for, from its files: the frame, and the method with its networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from pnpdepth_cli.commands.requests.refine_request import RefineRequest
+from pnpdepth_cli.dataset.read_frame import read_frame
+from pnpdepth_cli.frames.frame import Frame
+from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.resolve import with_input_range
+from pnpdepth_cli.models.network import load_network
+
+
+def read_requested(request: RefineRequest) -> Frame:
+    """Returns the frame that is asked for, as `read_frame` reads it."""
+    return read_frame(
+        request.files,
+        request.read_options,
+        seed=request.method.seed,
+        holdout=request.holdout,
+        needs_camera=request.view_3d,
+    )
+
+
+def load_method(
+    request: RefineRequest, first: Frame, more: Callable[[], Sequence[Frame]] = tuple
+) -> Method:
+    """Returns the method that is asked for; this first frame decides what networks leave open.
+
+    Args:
+        request: Networks and settings of the refinement.
+        first: The first frame.
+        more: Function of further frames, which decide as well; called only if a network needs it.
+
+    Raises:
+        UsageError: The request combines what cannot be combined.
+        ModelError: The network cannot be loaded.
+    """
+    own = load_network(request.model, request.checkpoint, request.device)
+    others = [load_network(model, None, request.device) for model in request.more_models]
+    return Method(
+        [with_input_range(own, request.normalise), *others],
+        request.method,
+        first,
+        more,
+        validated=request.baselines,
+        uncertainty=request.uncertainty or request.unknown == "zero",
+        keep_measured=request.keep_measured,
+    )
