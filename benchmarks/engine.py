@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from benchmarks.frames import print_row
 from benchmarks.hand_cuts import ZOO, Case
-from pnpdepth_cli.core.refine import refine
+from pnpdepth_cli.core.refine_z import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings

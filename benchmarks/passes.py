@@ -25,7 +25,7 @@ from torch import nn
 
 from benchmarks.first_result import SAMPLE, anything_small
 from benchmarks.frames import EvalFrame, drawn_inputs, print_row
-from pnpdepth_cli.core import refine as updating
+from pnpdepth_cli.core import refine_z as updating
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames import experts, method, refine_frame, resolve, validation
 from pnpdepth_cli.frames.frame import Frame

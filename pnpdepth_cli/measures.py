@@ -337,6 +337,22 @@ OF_SIGMA = (
 Their functions take the deviation (H, W) in metres too, 0 where unknown."""
 
 
+DEVKIT_MEASURES = (
+    Measure("mae", "MAE", "m", decimals=6, main=True),
+    Measure("rmse", "RMSE", "m", decimals=6, main=True),
+    Measure("inverse_mae", "inverse MAE", "1/m", decimals=6, main=True),
+    Measure("inverse_rmse", "inverse RMSE", "1/m", decimals=6, main=True),
+    Measure("log_mae", "log MAE", decimals=6),
+    Measure("log_rmse", "log RMSE", decimals=6),
+    Measure("scale_invariant_log", "scale invariant log", decimals=6),
+    Measure("abs_relative", "abs relative", decimals=6),
+    Measure("squared_relative", "squared relative", decimals=6),
+)
+"""The figures of KITTI's development kit, in its order and with its six decimals.
+
+`commands/evaluation/kitti_devkit.py` computes them. Its squared relative is (p − g)²/g²."""
+
+
 def parse_keys(text: str) -> tuple[str, ...]:
     """Returns the keys in a text such as `rmse,mae`."""
     return tuple(dict.fromkeys(text.split(",")))

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from pnpdepth_cli import errors
 from pnpdepth_cli.core.losses import checked_loss
-from pnpdepth_cli.core.refine import Refinement, refine
+from pnpdepth_cli.core.refine_z import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Run, intercepted
 from pnpdepth_cli.frames.frame import Frame, Prediction, is_dense

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from pnpdepth_cli.choices import UPDATES
-from pnpdepth_cli.core.refine import Refinement, refine
+from pnpdepth_cli.core.refine_z import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import DivergedError, ModelError
 from pnpdepth_cli.points import SparsePoints

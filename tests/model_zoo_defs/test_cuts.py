@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pnpdepth_cli.api import load_network
-from pnpdepth_cli.core.refine import refine
+from pnpdepth_cli.core.refine_z import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.models.definition import Fixed
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from pnpdepth_cli.core.refine import refine
+from pnpdepth_cli.core.refine_z import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Near, Normalisation

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.measures import Measure
+from pnpdepth_cli.measures import DEVKIT_MEASURES
 
 Floats = NDArray[np.float32]
 
@@ -42,23 +42,6 @@ def fill_background(depth: Floats) -> Floats:
         filled[: rows[0]] = filled[rows[0]]
         filled[rows[-1] + 1 :] = filled[rows[-1]]
     return filled
-
-
-DEVKIT_MEASURES = tuple(
-    Measure(title.lower().replace(" ", "_"), title, unit, decimals=6, main=bool(unit))
-    for title, unit in (
-        ("MAE", "m"),
-        ("RMSE", "m"),
-        ("inverse MAE", "1/m"),
-        ("inverse RMSE", "1/m"),
-        ("log MAE", ""),
-        ("log RMSE", ""),
-        ("scale invariant log", ""),
-        ("abs relative", ""),
-        ("squared relative", ""),
-    )
-)
-"""Measures in the kit's order, with its six decimals. Its squared relative is (p − g)²/g²."""
 
 
 def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:

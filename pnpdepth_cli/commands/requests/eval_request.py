@@ -11,6 +11,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.dataset.frame_files import inverse_factor
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import (
+    DEVKIT_MEASURES,
     OF_SIGMA,
     Measure,
     by_depth,
@@ -123,8 +124,6 @@ class EvalRequest:
     def measures(self) -> tuple[Measure, ...]:
         """The measures in order, and how tables show them."""
         if self.is_devkit:
-            from pnpdepth_cli.commands.evaluation.kitti_devkit import DEVKIT_MEASURES
-
             return DEVKIT_MEASURES
         usual = with_thresholds(self._thresholds)
         of_parts = () if self.depth_limits is None else by_depth(usual, *self.depth_limits)

@@ -30,7 +30,7 @@ from pnpdepth_cli.models.definition import (
     graph_definition,
 )
 from pnpdepth_cli.models.file_graph import FileGraph, Operation, SizeLimit
-from pnpdepth_cli.models.onnx import layers  # noqa: F401  (it registers its operators)
+from pnpdepth_cli.models.onnx import image_operators  # noqa: F401  (it registers its operators)
 from pnpdepth_cli.models.onnx.operators import HOST_INPUTS, ONLY, OPERATORS, Node
 from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
 from pnpdepth_cli.spent import spent_on
