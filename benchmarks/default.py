@@ -48,8 +48,8 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.refine_frame import LEAST_PART
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
+from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 from pnpdepth_cli.models.network import Network
-from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 COUNTS = (20, 100, 500)
 NETWORKS = {

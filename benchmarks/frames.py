@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.many_frames.running import spread
 from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
 from pnpdepth_cli.frames.method import Method, pipeline_of
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refine_frame import refine_frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.measures import score
 from pnpdepth_cli.models.definition import Normalisation
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.points import SparsePoints

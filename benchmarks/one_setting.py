@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from benchmarks.frames import SETS, EvalFrame, drawn_inputs, opened, without_occluded
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.measures import score
 from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import Settings
 

@@ -36,10 +36,9 @@ from benchmarks.paper_figures import FINE_THRESHOLDS, MEASURES, ROWS, PaperRow
 from benchmarks.paper_report import heading, markdown, plot
 from benchmarks.paper_sets import ROOMS, STREETS, FrameSet, cut_by, rendered, shared
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import resolve_layer, resolve_settings
-from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
+from pnpdepth_cli.measures import DELTA_THRESHOLDS, score, with_thresholds
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.registry import all_definitions
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings

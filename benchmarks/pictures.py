@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from benchmarks.frames import SETS, by_default, drawn_inputs, opened
-from pnpdepth_cli.stages import PROPAGATED
+from pnpdepth_cli.measures import PROPAGATED
 
 FRAME, COUNT, SEED = "00025", 500, 0
 

@@ -42,8 +42,8 @@ from pnpdepth_cli.frames.frame import Frame, Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 from pnpdepth_cli.settings import Settings
-from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 COUNTS = (5, 10, 20, 50, 100, 500)
 LINES = "lines"

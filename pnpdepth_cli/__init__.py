@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "2.0.0"
+from pnpdepth_cli.version import __version__
 
 if TYPE_CHECKING:
     from pnpdepth_cli.api import *  # noqa: F403

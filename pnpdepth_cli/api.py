@@ -13,8 +13,6 @@ from torch import nn
 from pnpdepth_cli.camera import Camera as Camera
 from pnpdepth_cli.completion.alignment import Alignment as Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration as ImageRegistration
-from pnpdepth_cli.core.metrics import Scores as Scores
-from pnpdepth_cli.core.metrics import score as score_tensors
 from pnpdepth_cli.core.split import Split as Split
 from pnpdepth_cli.errors import DeviceError as DeviceError
 from pnpdepth_cli.errors import DivergedError as DivergedError
@@ -32,6 +30,8 @@ from pnpdepth_cli.frames.refiner import Refiner as Refiner
 from pnpdepth_cli.frames.refiner import Unit as Unit
 from pnpdepth_cli.frames.refiner import in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
+from pnpdepth_cli.measures import Scores as Scores
+from pnpdepth_cli.measures import score as score_tensors
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.definition import Fixed as Fixed
 from pnpdepth_cli.models.definition import ModelDefinition as ModelDefinition

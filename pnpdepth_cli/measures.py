@@ -1,7 +1,8 @@
-"""The error measures of depth: what each is called, how it is shown, and its formula.
+"""The error measures of depth: what each is called, how it is shown, its formula, and of what.
 
 `MEASURES` are computed everywhere, `TABLE` has those that `eval --columns` computes on request. A
-measure is one entry of either, and nowhere else. Importing this module imports no library.
+measure is one entry of either, and nowhere else. A depth has errors at several stages of its
+refinement, on several bases; `score` measures one. Importing this module imports no library.
 
 Sources: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k, SILog),
 the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE, iMAE), Depth Pro
@@ -11,7 +12,7 @@ the paper and NYU's tables (log10), the KITTI depth completion benchmark (iRMSE,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -25,6 +26,31 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.float32]
     Floats = NDArray[np.float64]
+
+BEFORE = "before"
+"""The user's network, aligned with the points."""
+UPDATED = "updated"
+"""The user's network after the updates of z."""
+PROPAGATED = "propagated"
+"""The user's network after propagation of the residual."""
+ALONE = "alone"
+"""The network that takes a prior, without one."""
+AFTER = "after"
+"""The result."""
+LINEAR = "linear"
+"""Linear interpolation of all points, which is no stage but is compared with them."""
+
+GT = "ground_truth"
+HELD_OUT = "held_out"
+VALIDATION = "validation"
+USED = "used"
+BASES = {
+    GT: "against ground truth",
+    HELD_OUT: "at held-out points",
+    VALIDATION: "at validation points",
+    USED: "at points used",
+}
+"""What errors are measured on, the best first. A change at the points used means nothing."""
 
 DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 """Thresholds of δ1 to δ3 (Eigen et al. 2014). The paper's KITTI rows use 1.01^k."""
@@ -351,6 +377,59 @@ DEVKIT_MEASURES = (
 """The figures of KITTI's development kit, in its order and with its six decimals.
 
 `commands/evaluation/kitti_devkit.py` computes them. Its squared relative is (p − g)²/g²."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores(Mapping[str, float]):
+    """Errors of a prediction over the pixels with known ground truth and valid prediction.
+
+    A mapping from the keys of `pnpdepth_cli.measures.MEASURES`, such as `scores["rmse"]`.
+    """
+
+    values_by_key: Mapping[str, float]
+    """The measures by key; NaN where no pixel is scored."""
+    pixels: int
+    """Number of scored pixels."""
+    coverage: float
+    """Scored pixels over pixels with known ground truth."""
+
+    def __getitem__(self, key: str) -> float:
+        """Returns the measure with this key."""
+        return self.values_by_key[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_by_key)
+
+    def __len__(self) -> int:
+        return len(self.values_by_key)
+
+    def to_json(self) -> dict[str, int | float | None]:
+        """Returns the measures, the number of pixels and the coverage by their names."""
+        return {**self, "pixels": self.pixels, "coverage": self.coverage}
+
+
+def score(
+    predicted: Tensor, ground_truth: Tensor, measures: Sequence[Measure] = MEASURES
+) -> Scores:
+    """Returns the scores of a prediction against the ground truth.
+
+    Args:
+        predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
+        ground_truth: Ground truth depth of the same shape, likewise.
+        measures: Measures, of which those that are formulas of pixels are computed.
+    """
+    known = ground_truth.isfinite() & (ground_truth > 0)
+    scored = known & predicted.isfinite() & (predicted > 0)
+    p, g = predicted[scored].double(), ground_truth[scored].double()
+    return Scores(
+        values_by_key={
+            measure.key: float(measure.of_pixels(p, g))
+            for measure in measures
+            if measure.of_pixels is not None
+        },
+        pixels=len(g),
+        coverage=len(g) / int(known.sum()) if known.any() else math.nan,
+    )
 
 
 def parse_keys(text: str) -> tuple[str, ...]:

@@ -20,8 +20,18 @@ from pnpdepth_cli.cli.main import COMMANDS, run
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "pnpdepth_cli"
 GROUND_FLOOR = (
-    *("errors", "stages", "measures", "camera", "points", "protocols", "choices", "file_record"),
-    *("settings", "budget", "scan_pattern", "spent"),
+    "version",
+    "errors",
+    "measures",
+    "camera",
+    "points",
+    "protocols",
+    "choices",
+    "file_record",
+    "settings",
+    "budget",
+    "scan_pattern",
+    "spent",
 )
 """Each imports only those before it."""
 MAY_IMPORT = {

@@ -16,9 +16,10 @@ from typing import NoReturn
 
 import click
 
-from pnpdepth_cli import __version__, errors
+from pnpdepth_cli import errors
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.cli.terminal import INTERRUPTED, printable, say
+from pnpdepth_cli.version import __version__
 
 _EXIT_CODES = """\b
 Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 input file · 4 network,

@@ -17,7 +17,7 @@ from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.shared import tables
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.stages import GT
+from pnpdepth_cli.measures import GT
 
 if TYPE_CHECKING:
     from pnpdepth_cli.commands.many_frames.records import BatchSummary

@@ -23,8 +23,16 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
-from pnpdepth_cli.measures import COVERAGE, MEASURES, Measure, choose_measures, frame_means
-from pnpdepth_cli.stages import AFTER, BEFORE, GT
+from pnpdepth_cli.measures import (
+    AFTER,
+    BEFORE,
+    COVERAGE,
+    GT,
+    MEASURES,
+    Measure,
+    choose_measures,
+    frame_means,
+)
 
 Means = dict[str, float | None]
 """Means by the key of their measure; None where no frame has it."""

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from pnpdepth_cli import errors
 from pnpdepth_cli.core.influence import Field
 from pnpdepth_cli.core.split import Split
-from pnpdepth_cli.models.cut_layers import fields_of
+from pnpdepth_cli.frames.resolve import fields_of
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
 

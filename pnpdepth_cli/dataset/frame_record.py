@@ -20,8 +20,8 @@ from pnpdepth_cli.choices import LENSES
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, what_applies
 from pnpdepth_cli.io.file_bytes import Fingerprint, one_line, plain, read_json, write_json
+from pnpdepth_cli.measures import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 from pnpdepth_cli.points import METRES
-from pnpdepth_cli.stages import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 
 _CONVERTING = threading.Lock()
 """msgspec learns the types at the first record, and crashes if two threads have a first one."""

@@ -22,8 +22,8 @@ from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW, OpenNetwork
 from pnpdepth_cli.frames.validation import MIN_POINTS, ValidatedFrame, log_of
+from pnpdepth_cli.measures import LINEAR
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.stages import LINEAR
 
 # Prior weights were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms and streets with
 # each set left out in turn (docs/notes/fusion.md).

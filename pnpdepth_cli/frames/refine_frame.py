@@ -30,7 +30,7 @@ from pnpdepth_cli.frames.frame import Frame, Refined, Validation, is_dense
 from pnpdepth_cli.frames.fuse import Share, fit_weights, shares_on_lines, with_shares
 from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
 from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
-from pnpdepth_cli.stages import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
+from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 LEAST_PART = 0.01
 """A network with less weight has no part in the result, which is said."""

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import torch
+from torch import Tensor, nn
 
 from pnpdepth_cli import errors
+from pnpdepth_cli.core.influence import Field, influential_fields
+from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
-from pnpdepth_cli.models.cut_layers import default_layer
+from pnpdepth_cli.models.decisions import recalled_layers
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     ModelDefinition,
     Normalisation,
 )
+from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, align_output
+from pnpdepth_cli.models.shapes import by_shapes
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 from pnpdepth_cli.spent import spent_on
@@ -37,6 +45,16 @@ _CLEARLY_BETTER = 0.6
 
 FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scenes and ICL-NUIM.
 """
+
+GAPS = 6.0
+"""Gaps between points that the influential field of the default layer should span.
+
+The paper's rule of thumb is that the field of a point should reach the next points, so that updates
+reach all pixels. On real frames fields several gaps wide, and at least half the image, were better:
+a network's error is smooth over surfaces, and later layers follow each point and its noise."""
+LEAST_FRACTION = 0.5
+"""Fraction of the image's shorter side that a field should span in any case. Both are the best of
+several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to LiDAR."""
 
 
 def with_input_range(network: Network, name: str | None) -> Network:
@@ -76,6 +94,78 @@ def normalisation_name(definition: ModelDefinition) -> str | None:
     """Returns the name of the rgb range that the network is given; None if it has none."""
     names = (name for name, how in NORMALISATIONS.items() if how == definition.normalisation)
     return None if "rgb" not in definition.input_kind else next(names, None)
+
+
+def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
+    """Returns the layer whose output z is updated if no option names one.
+
+    It is the definition's own, if it states one. Else it is the last of its layers whose
+    influential field in the depth map is wide enough for so many even points in an image of this
+    size (rows, columns), because that costs least; or the one with the widest field. All fields
+    follow from one pass. None if the definition has no layers.
+    """
+    definition = network.definition
+    frame = FrameMap.fit(definition.size, *size)
+    if definition.defaults.layer is not None or len(definition.layers) < 2 or not point_count:
+        return definition.default_layer
+    enough = min(wanted_field(frame.network, point_count), *frame.network)
+
+    def decide() -> list[str]:
+        with errors.out_of_memory_is_a_device_error(network.device):
+            arguments = network.synthetic_arguments(frame)
+            fields = fields_of(network, arguments, definition.layers)
+            ordered = _by_preference(definition.layers, fields, enough)
+            first = partial(_first_usable, ordered)
+            return [by_shapes(network.module, arguments, first) or definition.layers[0]]
+
+    question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
+    with spent_on("layer"):
+        return recalled_layers(network, question, decide)[0]
+
+
+def _first_usable(
+    layers: Sequence[str], module: nn.Module, arguments: tuple[Tensor, ...]
+) -> str | None:
+    """The first of the layers that the network can be cut at."""
+    for layer in layers:
+        with suppress(errors.ModelError), Split(module, layer) as split, torch.no_grad():
+            split.rear(split.front(*arguments))
+            return layer
+    return None
+
+
+def fields_of(
+    network: Network, arguments: tuple[Tensor, ...], layers: Sequence[str]
+) -> dict[str, Field]:
+    """Returns the influential fields of layers in a frame with these arguments of the network.
+
+    See `influential_fields`.
+    """
+
+    def measured(module: nn.Module, arguments: tuple[Tensor, ...]) -> dict[str, Field]:
+        return influential_fields(module, arguments, layers, network.map_of)
+
+    return by_shapes(network.module, arguments, measured)
+
+
+def _by_preference(layers: Sequence[str], fields: Mapping[str, Field], enough: float) -> list[str]:
+    """The layers whose field is wide enough, from the last one, then the others, widest first."""
+    # No field is wider than the image. Of equally wide ones, that of the larger patch of z is
+    # taken, and then the last.
+    widths = {
+        name: (min(field.in_output), field.stride * min(field.in_z or (0,)))
+        for name in reversed(layers)
+        if (field := fields.get(name)) is not None
+    }
+    wide = [name for name, (width, _) in widths.items() if width >= enough]
+    others = [name for name in widths if name not in wide]
+    return [*wide, *sorted(others, key=widths.__getitem__, reverse=True)]
+
+
+def wanted_field(size: tuple[int, int], point_count: int) -> float:
+    """Returns how wide an influential field should be, in pixels, for so many even points."""
+    spacing = math.sqrt(size[0] * size[1] / point_count)
+    return max(GAPS * spacing, LEAST_FRACTION * min(size))
 
 
 def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:

@@ -25,9 +25,9 @@ from torch import Tensor
 
 from pnpdepth_cli.completion.interpolation import in_hull, linear, nearest_points, pixels_of
 from pnpdepth_cli.frames.frame import Refined, Validation, is_dense
+from pnpdepth_cli.measures import AFTER
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_pattern
-from pnpdepth_cli.stages import AFTER
 
 MIN_INLIER_WEIGHT = 0.05
 """Validation points with less weight do not calibrate."""

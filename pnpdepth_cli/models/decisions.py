@@ -20,10 +20,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pnpdepth_cli import __version__
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.models.file_graph import FileGraph
 from pnpdepth_cli.models.shapes import is_of_transformers
+from pnpdepth_cli.version import __version__
 
 if TYPE_CHECKING:
     from torch import nn

@@ -11,8 +11,8 @@ from PIL import Image
 from benchmarks.frames import EvalFrame
 from benchmarks.strong import STAGES, geometric_mean, measure, print_tables
 from benchmarks.strong_maps import can_draw, stored_frames, strong_frames, with_lines
+from pnpdepth_cli.measures import AFTER, BEFORE
 from pnpdepth_cli.scan_pattern import scan_pattern
-from pnpdepth_cli.stages import AFTER, BEFORE
 
 
 def write_stored(folder: Path, values: np.ndarray) -> None:

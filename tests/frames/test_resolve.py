@@ -6,14 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from torch import nn
 
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import (
     NORMALISATIONS,
     choose_input_range,
+    default_layer,
     resolve_layer,
     resolve_member,
+    wanted_field,
 )
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import Settings
 from tests.frames.scenes import Brightness, Nearest, frame_in_memory, member
 
@@ -62,3 +68,25 @@ def test_what_is_left_open_serves_a_propagated_result_and_what_is_stated_is_obey
         found = resolve_member(member(build).network, frame, asked)
         settings = found.settings
         assert (settings.iterations, settings.align, found.always_updated) == expected
+
+
+def test_a_field_spans_several_gaps_between_points_and_half_the_image() -> None:
+    assert wanted_field((100, 400), 100) == 120
+    assert wanted_field((100, 400), 10_000) == 50
+
+
+@pytest.mark.parametrize(("points", "layer"), [(20, "0"), (1536, "2"), (0, "0")])
+def test_few_points_want_a_deep_layer_unless_one_is_stated(points: int, layer: str) -> None:
+    torch.manual_seed(0)
+    # a layer at stride 16, and one at full size whose field is 17 pixels wide
+    late = nn.ConvTranspose2d(4, 4, 16, stride=16), nn.Conv2d(4, 4, 3, padding=1)
+    layers = nn.Conv2d(3, 4, 16, stride=16), *late, nn.Conv2d(4, 1, 9, padding=4)
+    definition = ModelDefinition(
+        name="net", input_kind="rgb", size=Multiple(16), build=lambda: nn.Sequential(*layers),
+        complete=True, layers=("0", "2"),
+    )  # fmt: skip
+    network = load_network(definition, None)
+    assert default_layer(network, (32, 48), points) == layer
+    for stated in ({"layers": ("2",)}, {"defaults": Settings(layer="2")}):
+        definition = replace(network.definition, **stated)
+        assert default_layer(replace(network, definition=definition), (32, 48), points) == "2"

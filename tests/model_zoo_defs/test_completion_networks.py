@@ -14,7 +14,7 @@ from model_zoo_defs.latefusion import Encoder
 from model_zoo_defs.nconv import NConv
 from model_zoo_defs.pncnn import Pncnn
 from model_zoo_defs.sparseconv import SparseConv
-from pnpdepth_cli.core.metrics import score
+from pnpdepth_cli.measures import score
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import load_network
 

@@ -12,8 +12,9 @@ import torch
 from torch import nn
 from torch.utils._python_dispatch import _disable_current_modes
 
-from pnpdepth_cli.models import cut_layers, decisions, network
-from pnpdepth_cli.models.cut_layers import default_layer
+from pnpdepth_cli.frames import resolve
+from pnpdepth_cli.frames.resolve import default_layer
+from pnpdepth_cli.models import decisions, network
 from pnpdepth_cli.models.network import load_network
 
 SIZE = (64, 96)
@@ -73,7 +74,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         monkeypatch.setattr(owner, name, counted)
 
     counting(network, "suggest_layers")
-    counting(cut_layers, "fields_of")
+    counting(resolve, "fields_of")
     return made
 
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.requests.eval_request import EvalRequest
 from pnpdepth_cli.commands.shared.results import ResultFrame
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset.agreement import compare_depths
 from pnpdepth_cli.dataset.arrays import (
     apply_masks,
@@ -32,13 +31,12 @@ from pnpdepth_cli.errors import InputError, PnpDepthError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
 from pnpdepth_cli.io.formats import DepthFile, Reading
-from pnpdepth_cli.measures import OF_SIGMA
+from pnpdepth_cli.measures import AFTER, GT, OF_SIGMA, score
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol
 from pnpdepth_cli.sensors.lens import rays_of_image
 from pnpdepth_cli.sensors.projection import pixel_index
 from pnpdepth_cli.sensors.simulation import sample_points
-from pnpdepth_cli.stages import AFTER, GT
 
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -24,8 +24,17 @@ from pnpdepth_cli.commands.shared.tables import (
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io import report
-from pnpdepth_cli.measures import MEASURES, Measure, choose_measures
-from pnpdepth_cli.stages import AFTER, BASES, BEFORE, GT, USED, VALIDATION
+from pnpdepth_cli.measures import (
+    AFTER,
+    BASES,
+    BEFORE,
+    GT,
+    MEASURES,
+    USED,
+    VALIDATION,
+    Measure,
+    choose_measures,
+)
 
 _LABELS = {
     "first": "Depth before",

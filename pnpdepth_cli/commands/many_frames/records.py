@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.many_frames.find_frames import (
     CSV,
     JSON,
@@ -37,9 +36,9 @@ from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.atomic import LOCKS, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint, is_unchanged, plain, read_bytes, write_json
-from pnpdepth_cli.measures import COVERAGE, MEASURES, frame_means
+from pnpdepth_cli.measures import AFTER, BASES, COVERAGE, GT, MEASURES, frame_means
 from pnpdepth_cli.models.definition import file_and_part
-from pnpdepth_cli.stages import AFTER, BASES, GT
+from pnpdepth_cli.version import __version__
 
 _IMAGES = ("preview", "improvement")
 """Kinds of outputs for a person, which may be deleted."""

@@ -30,10 +30,10 @@ from pnpdepth_cli.io.visualisation import (
     preview,
     write_mask,
 )
+from pnpdepth_cli.measures import AFTER, BEFORE, LINEAR
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
-from pnpdepth_cli.stages import AFTER, BEFORE, LINEAR
 
 _BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
 _LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding

@@ -22,7 +22,6 @@ from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest
 from pnpdepth_cli.commands.shared.pipeline import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.shared.tables import names_of_depths
 from pnpdepth_cli.completion.interpolation import linear
-from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.dataset import frame_record
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.frames.frame import Frame, Refined
@@ -32,8 +31,8 @@ from pnpdepth_cli.frames.resolve import normalisation_name
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.visualisation import gain
+from pnpdepth_cli.measures import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION, score
 from pnpdepth_cli.points import SparsePoints
-from pnpdepth_cli.stages import AFTER, BEFORE, GT, HELD_OUT, LINEAR, USED, VALIDATION
 
 Stages = dict[str, frame_record.Scores]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import psutil
 
-from pnpdepth_cli import __version__
+from pnpdepth_cli.version import __version__
 
 if TYPE_CHECKING:
     import torch

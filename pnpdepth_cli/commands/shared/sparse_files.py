@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli import __version__
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import OutputError
@@ -20,6 +19,7 @@ from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, w
 from pnpdepth_cli.io.file_bytes import plain, write_json
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
+from pnpdepth_cli.version import __version__
 
 
 class Written(NamedTuple):

@@ -14,12 +14,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pnpdepth_cli import stages
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.file_bytes import one_line
-from pnpdepth_cli.measures import MEASURES, Measure, choose_measures
+from pnpdepth_cli.measures import (
+    AFTER,
+    ALONE,
+    BASES,
+    BEFORE,
+    GT,
+    HELD_OUT,
+    LINEAR,
+    MEASURES,
+    PROPAGATED,
+    UPDATED,
+    USED,
+    Measure,
+    choose_measures,
+)
 
 Style = Literal["", "bold", "dim", "good", "bad"]
 Cell = tuple[str, Style]
@@ -148,8 +161,8 @@ def write_text(path: Path, text: str) -> None:
 
 def bases_of(errors: Errors) -> list[str]:
     """Returns what errors are shown on: ground truth and held-out points, else the best."""
-    found = [basis for basis in stages.BASES if errors.get(basis)]
-    return [basis for basis in found if basis in (stages.GT, stages.HELD_OUT)] or found[:1]
+    found = [basis for basis in BASES if errors.get(basis)]
+    return [basis for basis in found if basis in (GT, HELD_OUT)] or found[:1]
 
 
 def means_tables(
@@ -182,8 +195,8 @@ def _table(
 ) -> Table:
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
-    last = stages.AFTER
-    scores, linear = by_stage[last], by_stage.get(stages.LINEAR, {})
+    last = AFTER
+    scores, linear = by_stage[last], by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
@@ -192,7 +205,7 @@ def _table(
         count = count_of(scores["frames"] or 0, "frame")
     elif "coverage" in scores:
         count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
-    remark = ", where a change proves nothing" * (basis == stages.USED)
+    remark = ", where a change proves nothing" * (basis == USED)
     # The rows.
     rows = []
     for stage in shown:
@@ -203,12 +216,12 @@ def _table(
         if own.get("frames") != scores.get("frames"):
             title += f" (over {own['frames']:,} frames)"
         against: Cell = ("", "")
-        if stage != stages.LINEAR:
+        if stage != LINEAR:
             of_same = own.get("frames") == linear.get("frames")
             against = change(linear.get("mae") if of_same else None, own.get("mae"))
         rows.append([*((text, style) for text in (title, *texts)), against])
     return Table(
-        title=f"{about}: errors {stages.BASES[basis]}{remark}, {count}",
+        title=f"{about}: errors {BASES[basis]}{remark}, {count}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],
         rows=rows,
     )
@@ -224,28 +237,28 @@ def stage_titles(record: FrameRecord) -> dict[str, str]:
     name = method.networks[0].name
     updates = len(record.loss) - 1  # fewer than asked if they diverged
     # The steps of the user's network.
-    steps = {stages.BEFORE: name}
+    steps = {BEFORE: name}
     if record.alignment is not None:
-        steps[stages.BEFORE] = f"{name}, aligned with the points"
+        steps[BEFORE] = f"{name}, aligned with the points"
     if updates > 0:
-        steps[stages.UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
+        steps[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
     if method.propagation != "none":
-        steps[stages.PROPAGATED] = f"{name}, residual propagated"
+        steps[PROPAGATED] = f"{name}, residual propagated"
     # What becomes of them.
     weighted = [expert for expert, weight in record.weights.items() if weight > 0]
     if weighted in ([], [name]):
-        _, steps[stages.AFTER] = steps.popitem()
+        _, steps[AFTER] = steps.popitem()
     else:
-        steps[stages.ALONE] = f"{method.names[-1]} alone"
-        steps[stages.AFTER] = f"fused ({weights_text(record.weights)})"
-    steps[stages.LINEAR] = _LINEAR
+        steps[ALONE] = f"{method.names[-1]} alone"
+        steps[AFTER] = f"fused ({weights_text(record.weights)})"
+    steps[LINEAR] = _LINEAR
     return steps
 
 
 def names_of_depths(record: FrameRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a record are of, in a few words."""
     titles = stage_titles(record)
-    return titles.get(stages.BEFORE, titles[stages.AFTER]), titles[stages.AFTER]
+    return titles.get(BEFORE, titles[AFTER]), titles[AFTER]
 
 
 def weights_text(weights: Mapping[str, float]) -> str:

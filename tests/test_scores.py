@@ -9,8 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.measures import MEASURES, with_thresholds
+from pnpdepth_cli.measures import MEASURES, score, with_thresholds
 
 
 def brute(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
