@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -92,7 +93,8 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         hint = "refine the whole image (--protocol whole)"
         raise InputError(f"{result.depth} is not of the size of {image}; {hint}")
     path = output / "images" / name
-    if isinstance(image, Path) and image.resolve().is_relative_to(output.resolve()):
+    folder = Path(os.path.realpath(output))
+    if isinstance(image, Path) and Path(os.path.realpath(image)).is_relative_to(folder):
         path = image
     return ExportFrame(
         result=result,

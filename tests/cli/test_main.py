@@ -186,3 +186,30 @@ def test_a_library_that_renamed_what_is_used_of_it_is_no_damaged_file(
     monkeypatch.setattr(function, Mock(side_effect=AttributeError("no such function")))
     with pytest.raises(AttributeError, match="no such function"):
         read(tmp_path / name)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows needs a right to make links")
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["refine", "LOOP", "--sparse", str(GT), "-o", "out"], 3),
+        (["refine", str(GT), "--sparse", "LOOP", "-o", "out"], 3),
+        (["refine", str(GT), "--sparse", str(GT), "--depth", "LOOP", "-o", "out"], 3),
+        (["refine", str(GT), "--sparse", str(GT), "--calib", "LOOP", "-o", "out"], 3),
+        (["refine", str(GT), "--sparse", str(GT), "--model", "LOOP", "-o", "out"], 4),
+        (["refine", str(GT), "--sparse", str(GT), "-o", "LOOP/out"], 2),
+        (["batch", "LOOP", "-o", "out"], 3),
+        (["frames", "LOOP", "-o", "out"], 3),
+        (["eval", "LOOP", str(GT)], 3),
+        (["compare", "LOOP", "LOOP"], 3),
+        (["cloud", "LOOP", "-o", "out.ply"], 3),
+        (["export", "LOOP", "--to", "colmap", "-o", "out"], 3),
+    ],
+)
+def test_a_link_to_itself_is_no_file(
+    arguments: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("loop.png").symlink_to("loop.png")
+    assert run([argument.replace("LOOP", "loop.png") for argument in arguments]) == code
+    assert [path.name for path in tmp_path.iterdir()] == ["loop.png"]

@@ -5,6 +5,7 @@ The command line declares its options by these. Imports neither numpy nor torch.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,9 +14,9 @@ from pnpdepth_cli.errors import OutputError
 
 def check_outputs(paths: Iterable[Path], inputs: Iterable[Path] = (), *, overwrite: bool) -> None:
     """Raises OutputError for a file that is an input, or that exists and may not be replaced."""
-    resolved = {path.resolve() for path in inputs}
+    resolved = {os.path.realpath(path) for path in inputs}
     for path in paths:
-        if path.resolve() in resolved:
+        if os.path.realpath(path) in resolved:
             raise OutputError(f"{path} is one of the inputs; name another output")
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, or name another output")
