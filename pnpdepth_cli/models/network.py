@@ -268,10 +268,9 @@ class AlignedDepth:
         unknown, lost = float(raw.isnan().cpu().double().mean()), int((~seen).sum())
         if not lost and unknown < _FEW_UNKNOWN:
             return ()
-        note = (
-            f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there; left"
-            f" {lost:,} of {len(seen):,} sparse points there out of the loss"
-        )
+        note = f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there"
+        if lost:
+            note += f"; {lost:,} of {len(seen):,} sparse points are there, and not in the loss"
         doubt = "; are the network's weights and input range (`normalise`) right?"
         return (f"warning: {note}{doubt}" if lost > _MOST_LOST * len(seen) else note,)
 
