@@ -140,7 +140,8 @@ def _read_pixels(
             rgb, notes = image.values, [f"image: {image.note}"] if image.note else []
         else:
             rgb = arrays.read_image(files.image)
-        size, found["image"] = (rgb.shape[0], rgb.shape[1]), (arrays.record_of(files.image), notes)
+        size = (rgb.shape[0], rgb.shape[1])
+        found["image"] = arrays.record_of(files.image, kind="image"), notes
     if files.gt is not None:
         truth, record, lines = _read_ground_truth(files, options, files.gt, size)
         found["gt"] = record, lines
@@ -243,7 +244,9 @@ def _sample_sparse(
     return sparse_depth.SparseDepth(
         points=points,
         reading=reading,
-        record=FileRecord(path=str(files.gt), sampled=replace(options.sample, seed=seed)),
+        record=FileRecord(
+            path=str(files.gt), kind="sampled", sampled=replace(options.sample, seed=seed)
+        ),
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 

@@ -115,7 +115,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, depth=np.where(frame.valid, frame.depth, np.float32(0)))
     source = inputs.sources["sparse"]
-    is_scan = source.calibration or scan_pattern(frame.used.xy, frame.used.size)
+    is_scan = source.kind == "scan" or scan_pattern(frame.used.xy, frame.used.size)
     if frame.valid is not None or not is_scan:
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())

@@ -41,7 +41,7 @@ def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> No
     run(frame, iterations=0, output=frame.folder / "d.npy")
     exact = np.load(frame.folder / "d.npy")
     record = run(frame, iterations=0)
-    written = read_depth(Path(record.outputs["depth"])).values
+    written = read_depth(Path(record.refined().outputs["depth"])).values
     assert written == pytest.approx(exact.clip(0.001, 65.534), abs=0.00051)
     beyond = np.count_nonzero((exact > 65.534) | (exact < 0.0005))
     assert any(f" {beyond:,} of {exact.size:,} pixels clipped" in note for note in record.notes)
@@ -93,12 +93,12 @@ def test_without_ground_truth_improvement_is_at_points_that_nothing_used(
     run(frame, gt=frame.gt)  # of an earlier run
     assert path.is_file()
     record = run(frame, overwrite=True, **options)
-    assert path.is_file() == (heading is not None) == ("improvement" in record.outputs)
+    assert path.is_file() == (heading is not None) == ("improvement" in record.refined().outputs)
     if heading is None:
         return
     basis = heading.partition(" ")[0].replace("-", "_")
-    footer = record.figures["improvement"].footer
+    footer = record.refined().figures["improvement"].footer
     assert footer is not None
     assert footer.startswith(f"at {record.errors[basis]['after']['points']:,} {heading}: ")
-    if basis == "held_out" and record.improved_fraction is not None:
-        assert f"{100 * record.improved_fraction:.1f} % better" in footer
+    if basis == "held_out" and record.refined().improved_fraction is not None:
+        assert f"{100 * record.refined().improved_fraction:.1f} % better" in footer
