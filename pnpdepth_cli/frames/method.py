@@ -180,9 +180,7 @@ class Method:
         refined = follow(refined)
         if not self._uncertainty:
             return refined
-        source = frame.sources.get("sparse")
-        of_matches = source is not None and source.kind == "colmap"
-        return with_uncertainty(refined, of_matches=of_matches)
+        return with_uncertainty(refined, of_matches=frame.of_matches)
 
     def share_registration(self, frames: Iterable[Frame]) -> None:
         """Decides the registration that images of one size share, by all these frames together.

@@ -22,6 +22,7 @@ from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest
 from pnpdepth_cli.commands.shared.pipeline import peak_memory_mb, timed, versions
 from pnpdepth_cli.commands.shared.tables import names_of_depths
 from pnpdepth_cli.completion.interpolation import linear
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_record import (
     BatchState,
     CameraRecord,
@@ -34,7 +35,7 @@ from pnpdepth_cli.dataset.frame_record import (
     Scores,
 )
 from pnpdepth_cli.errors import ModelError
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.resolve import normalisation_name
@@ -51,7 +52,7 @@ def write_refined(
     request: RefineRequest,
     outputs: Outputs,
     method: Method,
-    inputs: Frame,
+    inputs: ReadFrame,
     frame: Refined,
     seconds: dict[str, float],
     *,
@@ -101,7 +102,7 @@ def write_refined(
 
 
 def _frame_of(
-    request: RefineRequest, method: Method, frame: Frame, refined: Refined
+    request: RefineRequest, method: Method, frame: ReadFrame, refined: Refined
 ) -> FrameRecord:
     """The record of a refined frame, without its result."""
     files = request.files
@@ -120,12 +121,12 @@ def _frame_of(
 
 
 def _result_of(
-    request: RefineRequest, method: Method, frame: Frame, refined: Refined
+    request: RefineRequest, method: Method, frame: ReadFrame, refined: Refined
 ) -> ResultRecord:
     """The record of a result, without its outputs and times."""
     network = method.own.network
     weights = network.checkpoint
-    held_out = _held_out(frame)
+    held_out = frame.held_out
     is_map = network.definition.input_kind == "map"
     # The points that were used, of which some are of neighbouring frames.
     own_used = len(frame.own) - len(held_out)
@@ -182,12 +183,7 @@ def _network_record(member: OpenNetwork) -> NetworkRecord:
     return NetworkRecord(name=member.name, layer=member.layer, **settings)
 
 
-def _held_out(frame: Frame) -> SparsePoints:
-    """The points of the frame that nothing uses."""
-    return frame.points.select(slice(0)) if frame.held_out is None else frame.held_out
-
-
-def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[str, Stages]:
+def _errors_of(refined: Refined, frame: ReadFrame, *, with_baselines: bool) -> dict[str, Stages]:
     """The errors of each stage and of linear interpolation, by each basis that the frame has."""
 
     def baselines(points: SparsePoints, before: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -198,7 +194,7 @@ def _errors_of(refined: Refined, frame: Frame, *, with_baselines: bool) -> dict[
                     yield name, BASELINES[name](points, before)
 
     errors, validation = dict[str, Stages](), refined.validation
-    held_out = _held_out(frame)
+    held_out = frame.held_out
     before, after = torch.from_numpy(refined.before), torch.from_numpy(refined.depth)
     maps, beside = {BEFORE: before, AFTER: after}, dict[str, Tensor]()
     if frame.gt is not None or len(held_out):
@@ -237,12 +233,12 @@ def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
     return stages if AFTER in stages and BEFORE in stages else {}
 
 
-def _improved_fraction(refined: Refined, frame: Frame) -> float | None:
+def _improved_fraction(refined: Refined, frame: ReadFrame) -> float | None:
     """The fraction of the pixels with ground truth, else of held-out points, whose error fell."""
     before, after, gt = refined.before, refined.depth, frame.gt
     if gt is None:
         maps = torch.from_numpy(before), torch.from_numpy(after)
-        held_out = _held_out(frame)
+        held_out = frame.held_out
         points = held_out.select(held_out.known_in(maps[1]))
         before, after = (points.sample(depth).numpy() for depth in maps)
         gt = points.depth.numpy()

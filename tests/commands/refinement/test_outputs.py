@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.outputs import output_scale
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import SparsePoints
@@ -32,7 +32,8 @@ def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points() -> None:
         (0.005, 80.0, None, 256),
     ):
         points = SparsePoints(xy=torch.eye(2), depth=torch.tensor([nearest, farthest]), size=(2, 2))
-        assert output_scale(Frame(rgb=None, points=points, depth_scale=scale)) == expected
+        frame = ReadFrame(rgb=None, points=points, own=points, held_out=points, depth_scale=scale)
+        assert output_scale(frame) == expected
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> None:
