@@ -140,7 +140,7 @@ def registered(
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
     """The frame as the program reads one, with `count` points, or all of its LiDAR (None)."""
     points = frame.points(count, seed).tensors()
-    return Frame(rgb=tensor_of(frame.rgb), points=points, gt=frame.gt, register=frame.register)
+    return Frame(rgb=tensor_of(frame.rgb), points=points, register=frame.register)
 
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:

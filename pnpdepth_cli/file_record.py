@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from pnpdepth_cli.errors import UsageError
 
 PATTERNS = ("uniform", "shuffle", "grid", "lines", "features")
 """Which pixels of dense depth become sparse points: `pnpdepth_cli.sensors.simulation`."""
+
+FileKind = Literal[
+    "image", "depth", "scan", "colmap", "sampled", "neighbour", "calibration", "unread"
+]
+"""What a file of a frame is.
+
+- depth: a map or a list of points, such as sparse depth, ground truth or a network's depth map
+- scan: points of a LiDAR, projected by a calibration
+- colmap: a COLMAP model
+- sampled: ground truth that points were sampled from
+- neighbour: points of a neighbouring frame
+- unread: a file of which nothing but the path is known
+"""
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:
@@ -57,9 +71,11 @@ class SamplePattern:
 
 @dataclass(frozen=True, kw_only=True)
 class FileRecord:
-    """A file of a frame, and how it was read. What does not apply is None or empty."""
+    """A file of a frame, and how it was read. What does not apply to its kind is None or empty."""
 
     path: str
+    kind: FileKind = "unread"
+    """What it is."""
     sha256: str | dict[str, str] | None = None
     """SHA-256 of the content; of a COLMAP model, that of each of its files."""
     read_as: str | None = None
@@ -70,30 +86,36 @@ class FileRecord:
     """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
     dropped: dict[str, int] = field(default_factory=dict)
     """Number of points that were dropped, by the reason."""
-    sampled: SamplePattern | None = None
-    """How points were sampled from the file, which is of ground truth."""
     mask: str | None = None
-    """Path of the mask, or confidence, that was applied."""
+    """Path of the mask, or confidence, that was applied to the points."""
     least: float | None = None
     """Least confidence of a point that is used."""
+    sampled: SamplePattern | None = None
+    """Of "sampled": how the points were sampled."""
     calibration: str | None = None
-    """Path of the calibration by which a scan was projected."""
+    """Of a scan: path of the calibration by which it was projected."""
     camera: int | None = None
-    """Number of the camera in the calibration."""
+    """Of a scan: number of the camera in the calibration."""
     extrinsics: str | None = None
-    """Path of the pose of the scanner."""
+    """Of a scan: path of the pose of the scanner."""
     keep_occluded: bool = False
-    """Whether points of a scan that are occluded by nearer ones were kept."""
+    """Of a scan: whether points that are occluded by nearer ones were kept."""
     image: str | None = None
-    """Name of the image in a COLMAP model."""
+    """Of a COLMAP model: name of the image in it."""
     unit_scale: float | None = None
-    """Metres per unit of a COLMAP model."""
+    """Of a COLMAP model: metres per unit."""
     poses: str | None = None
-    """Where the motion to a neighbouring frame is from."""
+    """Of a neighbour: where the motion to it is from."""
     motion: list[list[float]] | None = None
-    """(3, 4) from the camera's coordinates at the neighbour to those at the frame."""
+    """Of a neighbour: (3, 4) from the camera's coordinates there to those at the frame."""
     contradicts_images: bool = False
-    """Whether the images show another motion."""
+    """Of a neighbour: whether the images show another motion."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a kind without what belongs to it."""
+        needed = {"sampled": self.sampled, "scan": self.calibration, "colmap": self.image}
+        if self.kind in needed and needed[self.kind] is None:
+            raise ValueError(f"a file of kind {self.kind!r} does not say how it was read")
 
 
 @dataclass(frozen=True, kw_only=True)

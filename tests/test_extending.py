@@ -49,15 +49,15 @@ def test_the_files_of_the_page_work_from_another_package(tmp_path: Path) -> None
     run("batch", "list.csv", *network, *method, *more, "-o", "out")
     record = json.loads((tmp_path / "out" / "rgb.json").read_text())
     assert record["model"]["name"] == "my-net"
-    named = [record["settings"][key] for key in ("loss", "update", "propagate")]
+    named = [record["result"]["settings"][key] for key in ("loss", "update", "propagate")]
     assert named == ["charbonnier", "rmsprop", "median"]
     assert record["errors"]["validation"]["farthest"]["mae"] > 0
-    assert record["loss"][-1] < record["loss"][0]
+    assert record["result"]["loss"][-1] < record["result"]["loss"][0]
     files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
     by_file = ["--loss", files_of[0], "--update", files_of[1], "--lr", "1%"]
     by_file += ["--propagate", "median", "-o", "by_file.raw", "--json"]
     again = json.loads(run("refine", *files, *network, *by_file))
-    assert again["loss"] == record["loss"]
+    assert again["result"]["loss"] == record["result"]["loss"]
     measures = ["--columns", "mae,median_error", "--json"]
     scores = json.loads(run("eval", "out/rgb_depth.raw", "indoor/gt.png", *measures))
     assert {"rmse", "median_error"} <= {each["key"] for each in scores["measures"]}

@@ -59,7 +59,8 @@ def fields() -> str:
         for node in ast.parse(inspect.getsource(module)).body
         if isinstance(node, ast.ClassDef) and node.name not in NOT_ON_THE_PAGE
     ]
-    nodes.sort(key=lambda node: node.name != "FrameRecord")
+    first = ["FrameRecord", "ResultRecord"]
+    nodes.sort(key=lambda node: first.index(node.name) if node.name in first else len(first))
     blocks = ("\n".join(class_lines(node)) for node in nodes)
     return "```python\n{}\n```\n\n".format("\n\n".join(blocks))
 

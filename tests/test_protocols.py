@@ -21,6 +21,7 @@ from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
+from tests.builders import result_record
 from tests.commands.test_eval import code_image, depth_file
 from tests.data_sets import SELECTED, codes, eth3d, ibims, image, void
 
@@ -92,7 +93,8 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
     for frame, each in read.items():
         depth_file(tmp_path / "out" / f"{frame}_depth.npy", np.full(each.gt.shape, 2.0))
         height, width = each.gt.shape
-        record = FrameRecord(inputs={"sparse": each.sources["sparse"]}, size=(width, height))
+        result = result_record(size=(width, height))
+        record = FrameRecord(inputs={"sparse": each.sources["sparse"]}, result=result)
         record.write(tmp_path / "out" / f"{frame}.json")
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
     assert [scores_of(frame)["pixels"] for frame in found.frames] == [pixels] * frames

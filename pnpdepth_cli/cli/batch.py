@@ -26,7 +26,7 @@ from pnpdepth_cli.errors import FramesFailedError, UsageError
 from pnpdepth_cli.settings import OF_UPDATES, Settings
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.many_frames.records import BatchSummary
+    from pnpdepth_cli.commands.many_frames.summary import BatchSummary
 
 DEFAULT = "default"
 """A value that leaves the option out."""

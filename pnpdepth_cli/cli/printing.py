@@ -21,7 +21,7 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.measures import GT
 
 if TYPE_CHECKING:
-    from pnpdepth_cli.commands.many_frames.records import BatchSummary
+    from pnpdepth_cli.commands.many_frames.summary import BatchSummary
     from pnpdepth_cli.commands.shared.sparse_files import Written
 
 _STDOUT = Path("-")
@@ -78,26 +78,26 @@ def print_notes(notes: Sequence[str]) -> None:
 
 def print_refinement(record: FrameRecord) -> None:
     """Prints the end of `pnpdepth refine`: notes, errors before and after, files, times."""
-    assert record.method is not None
+    result = record.refined()
     # Notes and tables of errors.
     print_notes(record.notes)
     for table in tables.refinement_tables(record):
         print_table(table, err=True)
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
-    if record.improved_fraction is not None:
+    if result.improved_fraction is not None:
         where = "scored pixels" if GT in record.errors else "held-out points"
-        say(f"improved: {record.improved_fraction:.1%} of the {where}")
+        say(f"improved: {result.improved_fraction:.1%} of the {where}")
     # Updates, times and files.
-    parts = [_times(record.seconds)]
-    parts.append(f"peak {record.peak_memory_mb['process']:,.0f} MB")
-    updates = len(record.loss) - 1
+    parts = [_times(result.seconds)]
+    parts.append(f"peak {result.peak_memory_mb['process']:,.0f} MB")
+    updates = len(result.loss) - 1
     if updates > 0:
-        settings = record.settings
+        settings = result.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
         parts.insert(0, f"{tables.count_of(updates, 'update')} of z ({how})")
     say(" · ".join(parts))
-    say(f"wrote {'  '.join(record.outputs.values())}")
+    say(f"wrote {'  '.join(result.outputs.values())}")
 
 
 def _times(seconds: Mapping[str, float]) -> str:

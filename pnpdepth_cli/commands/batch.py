@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from pnpdepth_cli.commands.many_frames.adapted import with_adapted_weights
 from pnpdepth_cli.commands.many_frames.find_frames import BatchFrames, find_frames
-from pnpdepth_cli.commands.many_frames.records import BatchSummary, Records, write_summary
+from pnpdepth_cli.commands.many_frames.records import Records
+from pnpdepth_cli.commands.many_frames.summary import BatchSummary, write_summary
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.shared.pipeline import in_order
 from pnpdepth_cli.commands.shared.tables import count_of, names_of_depths
@@ -40,6 +41,7 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
     request = replace(request, refine=refine)
     found, own = find_frames(request), Records(request)
     if request.html is not None:
+        # Imported where it is used: what draws pages takes 50 ms.
         from pnpdepth_cli.commands.many_frames.batch_report import check_batch_report
 
         check_batch_report(request, request.html)
@@ -71,7 +73,12 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         with in_turn(request.output):
             known = in_order(lambda f: of_frame[f.name].find(f), found.frames, _READERS)
             results = [record for record in known if isinstance(record, FrameRecord)]
-            return write_summary(request, found, own.settings, results)
+            summary = write_summary(request, found, own.settings, results)
+            if request.html is not None:
+                from pnpdepth_cli.commands.many_frames.batch_report import write_batch_report
+
+                write_batch_report(request, request.html, summary, results)
+            return summary
 
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
@@ -79,9 +86,9 @@ def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
     told = False
     for record in records:
         listener.frame(record)
-        if not told and record.method is not None:
+        if not told and record.result is not None:
             told = True
-            for note in (names_of_depths(record)[1], *record.notes):
+            for note in (names_of_depths(record.result)[1], *record.notes):
                 listener.say(f"{record.name}: {note}")
 
 

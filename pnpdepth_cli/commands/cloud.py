@@ -92,7 +92,8 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
     place = {_points_file(frame): index for index, frame in enumerate(frames)}
     ties: list[list[tuple[int, Extrinsics]]] = [[] for _ in frames]
     for here, frame in enumerate(frames):
-        for neighbour in frame.record.neighbours:
+        result = frame.record.result
+        for neighbour in () if result is None else result.neighbours:
             there = place.get(neighbour.path)
             if there is None or neighbour.motion is None:
                 continue
@@ -186,7 +187,7 @@ def _camera(
         return camera_of_file(request.calib, None, size, frame.depth)
     of_record, _ = frame.camera_and_pose
     if of_record is not None:
-        if frame.record.size != (size[1], size[0]):
+        if frame.size != size:
             raise InputError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"

@@ -204,7 +204,7 @@ def _pair(files: FrameFiles, prediction: Path | None) -> tuple[FrameFiles, Resul
     except PnpDepthError:  # the record is damaged
         return files, ResultFrame(name=files.name, depth=prediction)
     sparse = result.record.inputs.get("sparse")
-    if sparse is not None and not (sparse.sampled or sparse.calibration):
+    if sparse is not None and sparse.kind == "depth":
         path = Path(sparse.path)
         files = replace(files, sparse=path if path.is_file() else files.sparse)
     return replace(files, image=result.image or files.image), result

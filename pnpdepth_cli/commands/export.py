@@ -82,14 +82,15 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
     if export.needs_pose and pose is None:
         raise InputError(f"{result.depth} lacks a pose in its record; `batch --poses` gives it")
     # The scale and the name of the record must be usable.
-    (width, height), sparse = record.size or (0, 0), record.inputs.get("sparse")
+    size = result.size or (0, 0)
+    sparse = record.inputs.get("sparse")
     scale = (sparse and sparse.unit_scale) or 1.0
     own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
     name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
     if not 1e-9 < scale < 1e9 or name_problem(name) or not name.isprintable():
         raise InputError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
-    if isinstance(image, Path) and (height, width) not in sizes_of(image):
+    if isinstance(image, Path) and size not in sizes_of(image):
         hint = "refine the whole image (--protocol whole)"
         raise InputError(f"{result.depth} is not of the size of {image}; {hint}")
     path = output / "images" / name
@@ -101,7 +102,7 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         image=image,
         image_path=path,
         image_name=name,
-        size=(height, width),
+        size=size,
         camera=camera,
         pose=pose,
         unit_scale=scale,

@@ -29,7 +29,7 @@ def project_scan(
     rgb = read_rgb(image).values
     size = (rgb.shape[0], rgb.shape[1])
     projected = read_scan_points(scan, options, size, image, scale=depth_scale)
-    records = {"image": record_of(image), "scan": projected.record}
+    records = {"image": record_of(image, kind="image"), "scan": projected.record}
     settings = {"command": "project", **plain(asdict(options))}
     return write_sparse_files(
         files, projected.points, settings, records, [*projected.notes], rgb=rgb

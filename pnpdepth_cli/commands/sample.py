@@ -36,7 +36,7 @@ def sample_depth(
     inputs = {"depth": record_of(depth)}
     rgb = None
     if image is not None:
-        inputs["image"] = record_of(image)
+        inputs["image"] = record_of(image, kind="image")
         rgb = read_rgb(image).values
     points = sample_points(dense, pattern, seed, image=rgb)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))

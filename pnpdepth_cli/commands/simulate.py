@@ -44,6 +44,6 @@ def simulate_scan(
     points = simulate_lidar(dense, calibration.camera, lidar, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{lidar.name}, seed {seed}'))}")
     settings = {"command": "simulate", "sensor": plain(asdict(lidar)), "seed": seed}
-    read_as = FileRecord(path=str(calib), read_as=calibration.camera.source)
+    read_as = FileRecord(path=str(calib), kind="calibration", read_as=calibration.camera.source)
     inputs = {"depth": record_of(depth), "calibration": read_as}
     return write_sparse_files(files, points, settings, inputs, notes)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_files import IMAGE_SUFFIXES, ImageSource, file_of
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
-from pnpdepth_cli.file_record import FileRecord
+from pnpdepth_cli.file_record import FileKind, FileRecord
 from pnpdepth_cli.io import file_bytes
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import known_metres, load_stored
@@ -33,9 +33,12 @@ off above, where a LiDAR sees nothing, with the calibration adjusted."""
 _ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios of images of one view
 
 
-def record_of(source: ImageSource, reading: Reading | None = None) -> FileRecord:
+def record_of(
+    source: ImageSource, reading: Reading | None = None, *, kind: FileKind = "depth"
+) -> FileRecord:
     """Returns what a record keeps of a file, and of how it was read."""
-    record = FileRecord(path=str(source), sha256=file_bytes.fingerprint(file_of(source)).sha256)
+    digest = file_bytes.fingerprint(file_of(source)).sha256
+    record = FileRecord(path=str(source), kind=kind, sha256=digest)
     if reading is None:
         return record
     return replace(record, read_as=reading.source, scale=reading.scale, assumed=reading.assumed)

@@ -23,6 +23,8 @@ from pnpdepth_cli.io.file_bytes import Fingerprint, one_line, plain, read_json, 
 from pnpdepth_cli.measures import AFTER, GT, HELD_OUT, LINEAR, VALIDATION
 from pnpdepth_cli.points import METRES
 
+SCHEMA = 2
+"""Version of the schema of a record; another one is not read."""
 _CONVERTING = threading.Lock()
 """msgspec learns the types at the first record, and crashes if two threads have a first one."""
 
@@ -136,37 +138,24 @@ class BatchState:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameRecord:
-    """A refined frame, or one that failed, of which nothing more is known."""
+class ResultRecord:
+    """A refined depth map: how it was made, of what, and its files."""
 
-    name: str = ""
-    """The frame's name; a slash stands for a folder."""
-    group: str | None = None
-    """The sequence that the data set says it belongs to."""
-    status: Literal["done", "diverged", "failed"] = "done"
-    message: str | None = None
-    """Why it diverged or failed."""
-    batch: BatchState | None = None
-    """None for `pnpdepth refine`."""
-    inputs: dict[str, FileRecord] = field(default_factory=dict)
-    """The image, the sparse depth and the ground truth."""
-    neighbours: list[FileRecord] = field(default_factory=list)
-    """Points of neighbouring frames."""
     outputs: dict[str, str] = field(default_factory=dict)
     """The files by kind; of a batch, below its output folder."""
-    size: tuple[int, int] | None = None
+    size: tuple[int, int]
     """(width, height)"""
-    unit: str = METRES
-    """Unit of all depths: "m", or "model units" of a COLMAP model without scale."""
-    points: PointsRecord | None = None
+    points: PointsRecord
     """The sparse depth."""
+    neighbours: list[FileRecord] = field(default_factory=list)
+    """Points of neighbouring frames."""
     camera: CameraRecord | None = None
     """The camera in pixels of the image. None: unknown."""
-    model: ModelRecord | None = None
+    model: ModelRecord
     """The user's network."""
-    method: MethodRecord | None = None
+    method: MethodRecord
     """How the frame was refined."""
-    settings: dict[str, str | int | float | None] = field(default_factory=dict)
+    settings: dict[str, str | int | float | None]
     """The settings of the user's network, with nothing left open."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of the experts in the result, by name."""
@@ -176,12 +165,8 @@ class FrameRecord:
     """How the network's output was aligned with the points."""
     loss: list[float | None] = field(default_factory=list)
     """Loss at the points before the first update and after each."""
-    errors: dict[str, dict[str, Scores]] = field(default_factory=dict)
-    """Errors by basis (`BASES`), then by stage: before, after, linear, and those of the method."""
     improved_fraction: float | None = None
     """Fraction of the scored pixels, else of the held-out points, whose error fell."""
-    notes: list[str] = field(default_factory=list)
-    """Lines for a person; a warning begins with "warning"."""
     figures: dict[str, FigureRecord] = field(default_factory=dict)
     """Where the panels of the PNGs for a person lie, by kind."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -192,22 +177,61 @@ class FrameRecord:
     """Versions of the program, Python and the numerical libraries."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for errors that are not of the result, and for half a result."""
-        if lacking := [basis for basis, stages in self.errors.items() if AFTER not in stages]:
-            raise ValueError(f"the errors {lacking[0]} are not of the result")
-        if self.batch is None or self.status == "failed":
-            return
-        # A summary and a report read these of a result of a batch.
-        if self.method is None or self.model is None:
-            raise ValueError("it does not say how the frame was refined")
+        """Raises ValueError for half a result."""
         if not self.method.networks:
             raise ValueError("it names no network")
+        # A report of a batch reads these.
         for name in ("align", "iterations", "propagate"):
             if name not in self.settings:
                 raise ValueError(f"its settings lack {name!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecord:
+    """A frame that was refined, or scored, or that failed."""
+
+    schema: int = SCHEMA
+    """Version of this schema."""
+    name: str = ""
+    """The frame's name; a slash stands for a folder."""
+    group: str | None = None
+    """The sequence that the data set says it belongs to."""
+    status: Literal["done", "diverged", "failed"] = "done"
+    message: str | None = None
+    """Why it diverged or failed."""
+    batch: BatchState | None = None
+    """None for `pnpdepth refine` and `eval`."""
+    inputs: dict[str, FileRecord] = field(default_factory=dict)
+    """The files, by what they are of: the image, the sparse depth, the ground truth."""
+    unit: str = METRES
+    """Unit of all depths: "m", or "model units" of a COLMAP model without scale."""
+    errors: dict[str, dict[str, Scores]] = field(default_factory=dict)
+    """Errors by basis (`BASES`), then by stage: before, after, linear, and those of the method."""
+    notes: list[str] = field(default_factory=list)
+    """Lines for a person; a warning begins with "warning"."""
+    result: ResultRecord | None = None
+    """The refined depth. None of a frame that failed, or that `eval` scored."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for errors that are not of the result, and for half a record."""
+        for basis, stages in self.errors.items():
+            if AFTER not in stages:
+                raise ValueError(f"the errors {basis} are not of the result")
+        if self.batch is None or self.status == "failed":
+            return
+        # A summary and a report read these of a result of a batch.
+        if self.result is None:
+            raise ValueError("it does not say how the frame was refined")
         for basis, stages in self.errors.items():
             if stages[AFTER].get("pixels" if basis == GT else "points") is None:
                 raise ValueError(f"the errors {basis} lack how many pixels or points they are of")
+
+    def refined(self) -> ResultRecord:
+        """Returns the result of a frame that was refined. Raises InputError for any other."""
+        if self.result is None:
+            why = self.message or "it was not refined"
+            raise InputError(f"frame {self.name!r} has no result: {why}; refine it again")
+        return self.result
 
     @property
     def warnings(self) -> list[str]:
@@ -246,6 +270,11 @@ class FrameRecord:
         Raises:
             InputError: It is none.
         """
+        if isinstance(entry, dict) and entry.get("schema") != SCHEMA:
+            raise InputError(
+                f"{source} is no record of this version of pnpdepth, whose schema is {SCHEMA}; run"
+                " again the command that wrote it"
+            )
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)

@@ -68,7 +68,7 @@ def read_neighbours(
             points = points_of(each.files)
         except NoPointsError as error:
             notes.append(f"warning: a neighbour adds no points: {error}")
-            records.append(record_of(source))
+            records.append(record_of(source, kind="neighbour"))
             continue
         here, there, shown, basis = files.image, each.files.image, None, ""
         is_nearest = each.apart == 1 and 1 not in scans
@@ -100,7 +100,7 @@ def read_neighbours(
         else:
             scans.setdefault(each.apart, []).append((points, motion))
         record = replace(
-            record_of(source),
+            record_of(source, kind="neighbour"),
             poses=poses,
             motion=None if motion is None else motion.tolist(),
             contradicts_images=off,

@@ -95,6 +95,7 @@ def read_predicted_depth(
         notes += _orientation_warning(values, image)
     source = FileRecord(
         path=str(path),
+        kind="depth",
         sha256=fingerprint(file).sha256,
         read_as=stored.reading.source,
         scale=stored.reading.scale,

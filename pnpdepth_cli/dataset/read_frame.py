@@ -13,6 +13,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.dataset import arrays, sparse_depth
 from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,
     FrameFiles,
@@ -26,7 +27,7 @@ from pnpdepth_cli.dataset.predicted_depth import read_predicted_depth
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.frames.frame import Frame, registration_to_make, tensor_of
+from pnpdepth_cli.frames.frame import registration_to_make, tensor_of
 from pnpdepth_cli.io.depth import describe_range, holds_integers, read_depth
 from pnpdepth_cli.io.formats import DepthFile, Reading
 from pnpdepth_cli.io.rgb import orientation_in, read_rgb
@@ -47,7 +48,7 @@ def read_frame(
     seed: int = 0,
     holdout: float = 0.0,
     needs_camera: bool = False,
-) -> Frame:
+) -> ReadFrame:
     """Returns the frame of these files.
 
     Args:
@@ -108,10 +109,11 @@ def read_frame(
             f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
             " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
         )
-    return Frame(
+    return ReadFrame(
         rgb=None if rgb is None else tensor_of(np.ascontiguousarray(files.part.apply(rgb))),
         points=points,
-        given=given,
+        own=given,
+        of_matches=sparse.record.kind == "colmap",
         held_out=held_out,
         register=None if one_view else registration_to_make(options.registration, Settings()),
         one_view=one_view,
@@ -140,7 +142,8 @@ def _read_pixels(
             rgb, notes = image.values, [f"image: {image.note}"] if image.note else []
         else:
             rgb = arrays.read_image(files.image)
-        size, found["image"] = (rgb.shape[0], rgb.shape[1]), (arrays.record_of(files.image), notes)
+        size = (rgb.shape[0], rgb.shape[1])
+        found["image"] = arrays.record_of(files.image, kind="image"), notes
     if files.gt is not None:
         truth, record, lines = _read_ground_truth(files, options, files.gt, size)
         found["gt"] = record, lines
@@ -243,7 +246,9 @@ def _sample_sparse(
     return sparse_depth.SparseDepth(
         points=points,
         reading=reading,
-        record=FileRecord(path=str(files.gt), sampled=replace(options.sample, seed=seed)),
+        record=FileRecord(
+            path=str(files.gt), kind="sampled", sampled=replace(options.sample, seed=seed)
+        ),
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 

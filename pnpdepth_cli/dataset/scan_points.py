@@ -138,6 +138,7 @@ def read_scan_points(
         camera=replace(camera, source=f"calibration of {path.name}"),
         record=FileRecord(
             path=str(path),
+            kind="scan",
             sha256=fingerprint(path).sha256,
             read_as=reading.source,
             calibration=str(named),

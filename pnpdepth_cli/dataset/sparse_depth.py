@@ -261,6 +261,7 @@ def read_colmap_points(
         reading=reading,
         record=FileRecord(
             path=str(model.folder),
+            kind="colmap",
             sha256={p.name: fingerprint(p).sha256 for p in model_files(find_model(path))},
             read_as=reading.source,
             image=name,

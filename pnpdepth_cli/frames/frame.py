@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,6 @@ from pnpdepth_cli.completion.image_registration import (
     evidence,
 )
 from pnpdepth_cli.errors import DivergedError, UsageError
-from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import METRES, SparsePoints
 from pnpdepth_cli.settings import Settings
@@ -30,16 +29,17 @@ Registration = str | tuple[float, float, float]
 """What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
 Register = ImageRegistration | Literal["auto"] | None
 """How an image is to be moved to its points. "auto": as the points say."""
+AnyFrame = TypeVar("AnyFrame", bound="Frame")
+"""A frame, or a frame as it was read."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """An image and its sparse depth."""
+    """An image and its sparse depth: what a method needs."""
 
     rgb: Tensor | None  # (3, H, W) float32 in 0…1. None without an image.
     points: SparsePoints  # sparse depth at pixel coordinates of the image, on the CPU
-    gt: DepthMap | None = None  # (H, W) metres, 0 = unknown. None without ground truth.
-    held_out: SparsePoints | None = None  # points that nothing uses, to score at
+    of_matches: bool = False  # whether the points are of matched images, as of a COLMAP model
     unit: str = METRES  # of all depths: "m", or "model units" of a COLMAP model without scale
     register: Register = None  # how `rgb` is to be moved to the points
     one_view: bool = False
@@ -53,28 +53,14 @@ class Frame:
     that take one. None without."""
     registration: ImageRegistration | None = None
     """How `rgb` was moved to the points. None: it was not."""
-    given: SparsePoints | None = None
-    """All points of the frame's own files, also those held out. None: `points`."""
     camera: Camera | None = None
     """The camera in pixels of the image. None: unknown."""
-    pose: NDArray[np.float64] | None = None
-    """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
-    depth_scale: float | None = None
-    """Integers per metre of the file of the sparse depth. None if it holds metres."""
-    sources: Mapping[str, FileRecord] = field(default_factory=dict)
-    """What a record keeps of each file, by its part."""
-    neighbours: tuple[FileRecord, ...] = ()
-    """Files of neighbouring frames, whose points are among `points`."""
     notes: tuple[str, ...] = ()
+    """What a person should know of the inputs, a line each."""
 
     def __repr__(self) -> str:
         height, width = self.size
         return f"Frame({width}×{height}, {len(self.points):,} points)"
-
-    @property
-    def own(self) -> SparsePoints:
-        """All points of the frame's own files, also those held out."""
-        return self.points if self.given is None else self.given
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,7 +78,7 @@ class Frame:
         assert self.image is not None
         return estimate_registration([evidence(self.image, self.points)])
 
-    def registered(self) -> Frame:
+    def registered(self: AnyFrame) -> AnyFrame:
         """Returns the frame with its image moved to the points, if it has to be."""
         image, how = self.image, self.register
         if image is None or how is None:

@@ -180,8 +180,7 @@ class Method:
         refined = follow(refined)
         if not self._uncertainty:
             return refined
-        source = frame.sources.get("sparse")  # only a COLMAP model names an image
-        return with_uncertainty(refined, of_matches=bool(source and source.image))
+        return with_uncertainty(refined, of_matches=frame.of_matches)
 
     def share_registration(self, frames: Iterable[Frame]) -> None:
         """Decides the registration that images of one size share, by all these frames together.

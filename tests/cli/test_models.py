@@ -37,7 +37,7 @@ def test_onnx_is_refined_and_checked(
     output = ["-o", str(frame.folder / "o.exr"), "--iterations", "2", "--json"]
     assert run([*arguments, *output]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert record["settings"]["layer"] == "Relu_d"
+    assert record["result"]["settings"]["layer"] == "Relu_d"
     assert any("agrees with onnxruntime" in note for note in record["notes"])
     assert run(["models", "check", net, "--image", str(frame.image)]) == 0
     checked = json.loads(capsys.readouterr().out)

@@ -74,12 +74,14 @@ def test_unsupported_depth_is_said_and_zero_if_asked(capsys: pytest.CaptureFixtu
     assert errors["after"]["mae"] == pytest.approx(np.abs(depth - truth)[known].mean(), abs=0.01)
     assert errors["after"]["coverage"] == pytest.approx(known.sum() / (truth > 0).sum())
     assert errors["linear"]["mae"] < kept["errors"]["ground_truth"]["linear"]["mae"]
-    assert f"of {known.sum():,} pixels improved" in zero["figures"]["improvement"]["footer"]
+    assert (
+        f"of {known.sum():,} pixels improved" in zero["result"]["figures"]["improvement"]["footer"]
+    )
     # Without a mask, a note gives the part that lies outside of the scan.
     plain = result(capsys, f"refine {scan}")
-    assert {*plain["outputs"]} == {"depth", "preview", "improvement", "record"}
+    assert {*plain["result"]["outputs"]} == {"depth", "preview", "improvement", "record"}
     assert any("--unknown zero" in note for note in plain["notes"])
-    assert plain["points"]["used"] == pytest.approx(16007, abs=5)
+    assert plain["result"]["points"]["used"] == pytest.approx(16007, abs=5)
 
 
 def test_a_batch_is_done_once_then_scored_and_compared(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from pnpdepth_cli.commands.batch import run_batch
-from pnpdepth_cli.commands.many_frames.records import BatchSummary
+from pnpdepth_cli.commands.many_frames.summary import BatchSummary
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord
@@ -126,8 +126,10 @@ def results(folder: Path) -> dict[str, bytes | dict[str, Any]]:
         contents[name] = path.read_bytes()
         if path.suffix == ".json" and not path.name.startswith("."):  # those need not be whole
             record = json.loads(path.read_text())
-            for key in ("seconds", "peak_memory_mb", "batch"):
-                record.pop(key, None)
-            outputs = {kind: Path(file).name for kind, file in record["outputs"].items()}
-            contents[name] = record | {"outputs": outputs}
+            record.pop("batch", None)
+            result = record["result"]
+            for key in ("seconds", "peak_memory_mb"):
+                result.pop(key)
+            result["outputs"] = {kind: Path(file).name for kind, file in result["outputs"].items()}
+            contents[name] = record
     return contents

@@ -16,14 +16,14 @@ from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.many_frames.find_frames import find_frames
-from pnpdepth_cli.commands.many_frames.records import write_summary
+from pnpdepth_cli.commands.many_frames.summary import write_summary
 from pnpdepth_cli.commands.refine import refine_image
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest
-from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.file_bytes import plain
-from tests.builders import method_record
+from tests.builders import result_record
 from tests.commands.batches import (
     NAMES,
     Recorder,
@@ -290,11 +290,9 @@ def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: 
     records = [
         FrameRecord(
             name=f"{'ab'[number % 2]}/{number:04}",
-            weights={"net": weight},
             errors={"ground_truth": {"before": unknown, "after": after}},
             notes=[*(kind.format(number) for kind in kinds), "gt: 5 pixels"],
-            model=ModelRecord(name="net", spec="net"),
-            method=method_record("net", "compact"),
+            result=result_record("net", "compact", weights={"net": weight}),
         )
         for number, weight in enumerate((0.1, 0.4, 0.1, 0.2))
     ]
@@ -317,15 +315,11 @@ def test_mean_weights_add_up_where_a_frame_lacks_a_network(root: Path) -> None:
         {"net": 0.2, "compact": 0.8},
         {},  # of a method without weights
     ]
-    settings = {"align": "none", "iterations": 0, "propagate": "none"}
     records = [
         FrameRecord(
             name=f"{number}",
-            weights=own,
-            settings=settings,
             errors={"ground_truth": {"before": {"mae": 1.0}, "after": {"mae": 2.0}}},
-            model=ModelRecord(name="net", spec="net"),
-            method=method_record("net", "compact"),
+            result=result_record("net", "compact", weights=own),
         )
         for number, own in enumerate(weights)
     ]

@@ -16,20 +16,24 @@ from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
+from tests.builders import result_record
 
 HEIGHT, WIDTH = 24, 32
 STILL = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
-def frame(folder: Path, name: str, depth: float = 2.0, **record: Any) -> Path:
-    """A depth file as `refine` writes it, with its image and these entries of its record."""
+def frame(folder: Path, name: str, depth: float = 2.0, **entries: Any) -> Path:
+    """A depth file as `refine` writes it, with its image and these entries of its result."""
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}_depth.png"
     write_depth(path, np.full((HEIGHT, WIDTH), depth, np.float32))
     image = folder / f"{name}.png"
     cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8))
-    inputs = {"image": FileRecord(path=str(image))}
-    FrameRecord(inputs=inputs, size=(WIDTH, HEIGHT), **record).write(folder / f"{name}.json")
+    record = FrameRecord(
+        inputs={"image": FileRecord(path=str(image), kind="image")},
+        result=result_record(size=(WIDTH, HEIGHT), **entries),
+    )
+    record.write(folder / f"{name}.json")
     return path
 
 

@@ -24,6 +24,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
+from tests.builders import result_record
 from tests.data_sets import SELECTED, image, touch
 from tests.test_scores import brute
 
@@ -120,7 +121,7 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> No
 
 def test_images_count_alike_and_one_without_prediction_not_at_all(tmp_path: Path) -> None:
     depth_file(tmp_path / "gt" / "c.npy", [[1, 1]])
-    sparse = FileRecord(path=str(depth_file(tmp_path / "sparse.npy", [[0, 9]])))
+    sparse = FileRecord(path=str(depth_file(tmp_path / "sparse.npy", [[0, 9]])), kind="depth")
     for name, prediction, gt in (("a", [2, 3], [1, 4]), ("ü b", [8, 0], [5, 5])):
         frame(tmp_path, [prediction], [gt], name)
         FrameRecord(inputs={"sparse": sparse}).write(tmp_path / "out" / f"{name}.json")
@@ -237,14 +238,16 @@ def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Pa
     points = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
     frame(tmp_path, np.where(points > 0, gt, gt + 1), gt)
     path, record = str(depth_file(tmp_path / "points.npy", points)), tmp_path / "out" / "a.json"
-    drawn = FileRecord(path=path, sampled=SamplePattern(kind="uniform", count=30, seed=7))
+    pattern = SamplePattern(kind="uniform", count=30, seed=7)
+    drawn = FileRecord(path=path, kind="sampled", sampled=pattern)
     for source, size, given in (
-        (FileRecord(path=path), None, 30),
-        (FileRecord(path=path, calibration="calib.txt"), None, None),  # a scan
+        (FileRecord(path=path, kind="depth"), None, 30),
+        (FileRecord(path=path, kind="scan", calibration="calib.txt"), None, None),
         (drawn, (10, 10), 30),  # drawn again
         (drawn, (9, 9), None),
     ):
-        FrameRecord(inputs={"sparse": source}, size=size).write(record)
+        result = None if size is None else result_record(size=size)
+        FrameRecord(inputs={"sparse": source}, result=result).write(record)
         assert scores_of(scored(tmp_path).frames[0])["given"] == given
         if given is None:
             with pytest.raises(InputError, match="no frame could be scored"):
@@ -318,7 +321,7 @@ def test_distances_of_a_wide_camera_are_scored_as_depth(tmp_path: Path) -> None:
         evaluate(request)
     intrinsics = np.array([[32.0, 0, 31.5], [0, 32, 23.5], [0, 0, 1]])
     camera = CameraRecord.of(Camera(intrinsics=intrinsics), None)
-    FrameRecord(size=(64, 48), camera=camera).write(tmp_path / "out" / "a.json")
+    FrameRecord(result=result_record(camera=camera)).write(tmp_path / "out" / "a.json")
     by_record = evaluate(request)
     (tmp_path / "out" / "a.json").unlink()
     image(tmp_path / "a.png", 48, 64)

@@ -18,6 +18,7 @@ from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
+from tests.builders import result_record
 from tests.colmap_models import HEIGHT, WIDTH, write_text_model
 
 DEPTH = (3.6 + 0.01 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)
@@ -45,10 +46,12 @@ def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = No
         assert seen.camera is not None
         FrameRecord(
             unit=seen.unit,
-            camera=CameraRecord.of(seen.camera, seen.pose),
-            size=(WIDTH, HEIGHT),
-            inputs={"image": FileRecord(path=str(image)), "sparse": seen.record},
-            outputs={"valid": f"{name}_valid.png"},
+            inputs={"image": FileRecord(path=str(image), kind="image"), "sparse": seen.record},
+            result=result_record(
+                camera=CameraRecord.of(seen.camera, seen.pose),
+                size=(WIDTH, HEIGHT),
+                outputs={"valid": f"{name}_valid.png"},
+            ),
         ).write(folder / f"{name}.json")
     return folder
 
@@ -196,12 +199,12 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
 @pytest.mark.parametrize(
     ("entry", "value"),
     [
-        ("camera.pose", None),
+        ("result.camera.pose", None),
         ("unit", "m"),  # the others are in model units
         ("inputs.sparse.image", "b.png"),  # as of the next frame
-        ("size", [9, 9]),
-        ("camera.distortion", [0.1] * 8),  # not Nerfstudio's
-        ("camera.pose", [1, 2]),
+        ("result.size", [9, 9]),
+        ("result.camera.distortion", [0.1] * 8),  # not Nerfstudio's
+        ("result.camera.pose", [1, 2]),
         ("inputs.sparse.image", "../../../ESC"),
         ("inputs.sparse.image", "/etc/x.png"),
     ],
@@ -270,7 +273,7 @@ def test_a_bag_has_the_lens_as_ros_names_it(
         _, _, data = next(reader.messages(connections=wanted))
         info = reader.deserialize(data, wanted[0].msgtype)
     assert (info.distortion_model, len(info.d)) == (model, count)
-    of_record = FrameRecord.read(other / "out/a.json").camera
+    of_record = FrameRecord.read(other / "out/a.json").refined().camera
     assert of_record is not None
     expected = [*of_record.distortion, *[0.0] * count][:count]
     assert info.d.tolist() == expected

@@ -162,7 +162,7 @@ def test_a_batch_writes_a_bag_out_once(tmp_path: Path, capsys: pytest.CaptureFix
     assert len(times[0]) == 3
     assert times[0] == times[1]
     (record,) = (FrameRecord.read(path) for path in (tmp_path / "out").glob("*_000000.json"))
-    assert record.neighbours[0].poses.startswith(str(tmp_path / "out_frames/poses.txt"))
+    assert record.refined().neighbours[0].poses.startswith(str(tmp_path / "out_frames/poses.txt"))
 
 
 def test_topics_can_be_named_and_images_without_a_scan_in_time_are_none(tmp_path: Path) -> None:
@@ -287,9 +287,9 @@ def test_a_bag_goes_in_and_a_bag_comes_out(depth: str, tmp_path: Path) -> None:
             by_topic.setdefault(connection.topic, []).append((time_ns, message))
     for place, name in enumerate(names):
         record = FrameRecord.read(out / f"{name}.json")
-        assert record.camera is not None
-        assert record.points is not None
-        camera, pose = record.camera.read()
+        assert record.refined().camera is not None
+        assert record.refined().points is not None
+        camera, pose = record.refined().camera.read()
         time_ns = int(name.replace("_", "")) * 1000
         of_frame = {topic: messages[place][1] for topic, messages in by_topic.items()}
         assert {messages[place][0] for messages in by_topic.values()} == {time_ns}
@@ -319,8 +319,8 @@ def test_a_bag_goes_in_and_a_bag_comes_out(depth: str, tmp_path: Path) -> None:
         assert stamp.sec * 10**9 + stamp.nanosec == time_ns
         # The points that were used, where the camera sees them, and the cloud of the depth.
         points = cloud_points(of_frame["/camera/points_used"], "")
-        assert len(points) == record.points.used
-        nearest, farthest = record.points.nearest, record.points.farthest
+        assert len(points) == record.refined().points.used
+        nearest, farthest = record.refined().points.nearest, record.refined().points.farthest
         assert (points[:, 2].min(), points[:, 2].max()) == pytest.approx((nearest, farthest))
         cloud = cloud_points(of_frame["/camera/cloud"], "")
         x, y, z = cloud.T.astype(np.float64)

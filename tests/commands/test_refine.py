@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from pnpdepth_cli import Refiner
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ResultRecord
 from pnpdepth_cli.errors import (
     InputError,
     ModelError,
@@ -38,7 +38,7 @@ def test_refinement_lowers_the_error_that_its_files_have(frame: FrameOnDisk) -> 
     for basis in ("used", "ground_truth"):
         before, after = (record.errors[basis][stage]["mae"] or 0 for stage in ("before", "after"))
         assert after < 0.8 * before
-    assert len(record.loss) == 41
+    assert len(record.refined().loss) == 41
     # No iterations give the network's own prediction bit for bit.
     plain = run(frame, **asked, iterations=0, output=frame.folder / "own.npy")
     network = load_network(str(frame.model), frame.checkpoint)
@@ -52,10 +52,9 @@ def test_refinement_lowers_the_error_that_its_files_have(frame: FrameOnDisk) -> 
     error = np.abs(np.load(frame.folder / "out/img_depth.npy") - truth)
     improved = (error < np.abs(own - truth)).mean()
     assert record.errors["ground_truth"]["after"]["mae"] == pytest.approx(error.mean(), abs=1e-9)
-    assert plain.improved_fraction == 0 < improved < 1
-    assert record.improved_fraction == pytest.approx(improved, abs=1e-3)
-    points, known = record.points, read_depth(frame.sparse).values
-    assert points is not None
+    assert plain.refined().improved_fraction == 0 < improved < 1
+    assert record.refined().improved_fraction == pytest.approx(improved, abs=1e-3)
+    points, known = record.refined().points, read_depth(frame.sparse).values
     assert (points.nearest, points.farthest) == (known[known > 0].min(), known.max())
 
 
@@ -64,11 +63,11 @@ def test_held_out_points_are_a_seeded_share_that_the_loss_never_sees(frame: Fram
         run(frame, holdout=0.25, seed=seed, output=frame.folder / name)
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
-    assert first.points is not None
-    assert (first.points.held_out, first.points.used) == (15, 45)
+    results = [record.refined() for record in (first, again, other)]
+    assert (results[0].points.held_out, results[0].points.used) == (15, 45)
     assert first.errors["held_out"]["after"]["points"] == 15
-    assert first.loss == again.loss != other.loss
-    assert first.improved_fraction in [n / 15 for n in range(16)]
+    assert results[0].loss == results[1].loss != results[2].loss
+    assert results[0].improved_fraction in [n / 15 for n in range(16)]
     for path in (frame.folder / "a").glob("*.png"):
         assert path.read_bytes() == (frame.folder / "b" / path.name).read_bytes()
 
@@ -143,7 +142,8 @@ def test_the_papers_method_is_the_papers_setting_bit_for_bit(frame: FrameOnDisk)
     by_name = run(frame, method="paper", output=one)
     by_options = run(frame, **paper, method="alone", output=other)
     assert one.read_bytes() == other.read_bytes()
-    assert by_name.settings == by_options.settings | {"method": "paper"}
+    settings = by_options.refined().settings | {"method": "paper"}
+    assert by_name.refined().settings == settings
 
 
 def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
@@ -152,18 +152,20 @@ def test_networks_that_are_given_are_fused(frame: FrameOnDisk) -> None:
     second.write_text(text)
     with pytest.raises(UsageError, match="method 'paper' refines one network, not 2"):
         run(frame, more_models=(str(second),))
-    method = run(frame, more_models=(str(second),), method="fused", iterations=3).method
-    assert method is not None
+    record = run(frame, more_models=(str(second),), method="fused", iterations=3)
+    method = record.refined().method
     assert method.names == ["tiny", "second", "compact"]
     assert [network.iterations for network in method.networks] == [3, 5, 2]  # two have their own
     own = run(frame, method="alone", overwrite=True)
-    assert own.weights == {"tiny": 1.0}
+    assert own.refined().weights == {"tiny": 1.0}
 
 
 def test_the_standard_deviation_is_positive_and_rounded_in_a_png(frame: FrameOnDisk) -> None:
     asked = {"uncertainty": True, "method": "fused"}
     records = [run(frame, **asked, format=f, output=frame.folder / f) for f in ("png", "npy")]
-    sigma, exact = (read_depth(Path(record.outputs["sigma"])).values for record in records)
+    sigma, exact = (
+        read_depth(Path(record.refined().outputs["sigma"])).values for record in records
+    )
     assert sigma.shape == frame.depth.shape
     assert (sigma > 0).all()
     assert np.abs(exact - sigma).max() < 0.00051
@@ -183,18 +185,19 @@ def write_frame(root: Path, seed: int, count: int) -> dict[str, Path]:
     return files
 
 
-def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> FrameRecord:
+def refined(folder: Path, own: FrameOnDisk, count: int = 500, **options: Any) -> ResultRecord:
     """The record of the frame, refined with these options."""
     files: dict[str, Any] = write_frame(folder, 0, count)
     fields = {"output": folder / "out", "overwrite": True, "method": "alone"}
-    return run(own, **files | fields | options)
+    return run(own, **files | fields | options).refined()
 
 
 def test_an_image_is_moved_unless_off_or_by_the_paper(tmp_path: Path, frame: FrameOnDisk) -> None:
     moved = refined(tmp_path, frame)
     assert moved.registration is not None
     assert moved.registration["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.012)
-    assert any(note.startswith("image: moved") for note in moved.notes)
+    notes = FrameRecord.read(Path(moved.outputs["record"])).notes
+    assert any(note.startswith("image: moved") for note in notes)
     assert refined(tmp_path, frame, method="paper").registration is None
     assert refined(tmp_path, frame, registration="off").registration is None
     given = refined(tmp_path, frame, registration=(0.9, -5.0, 3.0)).registration
@@ -213,11 +216,10 @@ def test_moving_gives_what_an_image_moved_on_disk_gives(tmp_path: Path, frame: F
 
 def test_held_out_points_take_no_part(tmp_path: Path, frame: FrameOnDisk) -> None:
     whole = refined(tmp_path, frame, count=800).registration
-    record = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
-    assert record.points is not None
-    assert record.points.held_out == 400
-    assert None not in (whole, record.registration)
-    assert record.registration != whole
+    part = refined(tmp_path, frame, count=800, holdout=0.5, seed=3)
+    assert part.points.held_out == 400
+    assert None not in (whole, part.registration)
+    assert part.registration != whole
 
 
 def test_frames_share_a_registration_none_shows_alone(tmp_path: Path, frame: FrameOnDisk) -> None:
@@ -227,7 +229,7 @@ def test_frames_share_a_registration_none_shows_alone(tmp_path: Path, frame: Fra
     network = {"model": str(frame.model), "checkpoint": frame.checkpoint}
     batch(tmp_path, source=tmp_path / "in", refine=network | {"method": "alone"})
     records = (tmp_path / "out").glob("0*.json")
-    first, *others = (FrameRecord.read(path).registration for path in records)
+    first, *others = (FrameRecord.read(path).refined().registration for path in records)
     assert first is not None
     assert first["zoom"] == pytest.approx(UNREGISTERED.zoom, abs=0.02)
     assert others == [first] * 7

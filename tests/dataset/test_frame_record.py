@@ -11,16 +11,16 @@ import pytest
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset.frame_record import (
+    SCHEMA,
     BatchState,
     CameraRecord,
     FrameRecord,
-    ModelRecord,
     PointsRecord,
 )
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FigureRecord, FileRecord, SamplePattern
 from pnpdepth_cli.io.file_bytes import Fingerprint
-from tests.builders import method_record
+from tests.builders import result_record
 
 CAMERA = Camera(
     intrinsics=np.array([[50.1, 0, 31.3], [0, 51, 22], [0, 0, 1]]),
@@ -37,9 +37,10 @@ RECORD = FrameRecord(
     message="the loss is not finite",
     batch=BatchState(settings="0" * 64, inputs={"image": FILE}),
     inputs={
-        "image": FileRecord(path="a.png", sha256="1" * 64, read_as="PNG"),
+        "image": FileRecord(path="a.png", kind="image", sha256="1" * 64, read_as="PNG"),
         "sparse": FileRecord(
             path="model",
+            kind="sampled",
             sha256={"cameras.bin": "2" * 64},
             camera=0,
             scale=256.0,
@@ -48,20 +49,23 @@ RECORD = FrameRecord(
             sampled=SamplePattern(kind="uniform", count=30, seed=7),
         ),
     },
-    neighbours=[FileRecord(path="b.png", poses="poses.txt", motion=POSE.tolist())],
-    outputs={"depth": "a_depth.png"},
-    size=(64, 48),
-    points=PointsRecord(used=9, held_out=1, nearest=0.5, farthest=4.5, moved=2),
-    camera=CameraRecord.of(CAMERA, POSE),
-    model=ModelRecord(name="net", spec="net.py", checkpoint=None, checkpoint_sha256=None),
-    method=method_record("net", name="paper", propagation="none"),
-    settings={"layer": "middle", "iterations": 5, "align": "affine", "propagate": "none"},
-    alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
-    loss=[1.0, None],
     errors={"used": {"before": {"mae": 1.0, "points": 9}, "after": {"mae": None, "points": 9}}},
     notes=["warning: far"],
-    figures={"preview": FigureRecord(size=(9, 8), panels={"Image": (0, 1, 2, 3)}, scale_m=(1, 2))},
-    seconds={"read": 0.1},
+    result=result_record(
+        "net",
+        neighbours=[
+            FileRecord(path="b.png", kind="neighbour", poses="poses.txt", motion=POSE.tolist())
+        ],
+        outputs={"depth": "a_depth.png"},
+        points=PointsRecord(used=9, held_out=1, nearest=0.5, farthest=4.5, moved=2),
+        camera=CameraRecord.of(CAMERA, POSE),
+        alignment={"kind": "affine", "coefficients": [1.0, 0.0], "order": None},
+        loss=[1.0, None],
+        figures={
+            "preview": FigureRecord(size=(9, 8), panels={"Image": (0, 1, 2, 3)}, scale_m=(1, 2))
+        },
+        seconds={"read": 0.1},
+    ),
 )
 
 
@@ -74,9 +78,10 @@ def read_again(record: FrameRecord) -> FrameRecord:
 def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: FrameRecord) -> None:
     entry = record.to_json()
     assert read_again(record) == record
-    parts = [part for part in entry.values() if isinstance(part, dict)]
-    parts += [*entry.get("inputs", {}).values(), *entry.get("figures", {}).values(), entry]
-    own = [part for part in parts if part is not entry.get("alignment")]
+    result = entry.get("result", {})
+    parts = [part for part in (*entry.values(), *result.values()) if isinstance(part, dict)]
+    parts += [*entry.get("inputs", {}).values(), *result.get("figures", {}).values(), entry]
+    own = [part for part in parts if part is not result.get("alignment")]
     assert not [name for part in own for name, value in part.items() if value in (None, {}, [])]
     assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
 
@@ -85,9 +90,9 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
     errors = {"used": {"after": {"mae": float("nan"), "rmse": float("inf")}}}
     (stages,) = read_again(FrameRecord(errors=errors)).errors.values()
     assert stages == {"after": {"mae": None, "rmse": None}}
-    camera = read_again(RECORD).camera
+    camera = read_again(RECORD).refined().camera
     again, pose = camera.read()
-    assert CameraRecord.of(again, pose) == RECORD.camera
+    assert CameraRecord.of(again, pose) == camera
     assert (again.intrinsics == CAMERA.intrinsics).all()
     wrong = {"intrinsics": [[0.0] * 3] * 3, "pose": [[1.0, 2.0]], "lens": "pinhole"}
     for name, value in (*wrong.items(), ("intrinsics", [[1.0, 2.0]])):
@@ -98,21 +103,43 @@ def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused
 @pytest.mark.parametrize(
     "entry",
     [
-        [],
         {"status": "unknown"},
         {"errors": {"used": {"before": {"mae": 1.0}}}},
         {"inputs": {"sparse": {"path": "s.png", "sampled": {"kind": "none", "count": 1}}}},
-        {"size": "\ud800"},
+        {"inputs": {"sparse": {"path": "s.bin", "kind": "scan"}}},
+        {"inputs": {"sparse": {"path": "s.png", "kind": "of a later version"}}},
+        {"status": "\ud800"},
         {"errors": {"\udfff": "\ud800"}},
     ],
 )
-def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -> None:
+def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=r"a\.json"):
+        FrameRecord.from_json({"schema": SCHEMA} | entry, Path("a.json"))
+
+
+@pytest.mark.parametrize("entry", [[], {}, {"schema": SCHEMA - 1}, {"schema": "2"}])
+def test_a_record_of_another_schema_is_refused_with_what_to_do(entry: object) -> None:
     with pytest.raises(InputError, match=r"a\.json"):
         FrameRecord.from_json(entry, Path("a.json"))
 
 
+def test_a_frame_that_failed_has_no_result() -> None:
+    failed = read_again(FrameRecord(name="a", status="failed", message="it is too dark"))
+    assert failed.result is None
+    with pytest.raises(InputError, match="it is too dark"):
+        failed.refined()
+
+
 @pytest.mark.parametrize(
-    "lost", ["method", "model", "settings propagate", "errors used after points"]
+    "lost",
+    [
+        "result",
+        "result method",
+        "result method networks",
+        "result model",
+        "result settings propagate",
+        "errors used after points",
+    ],
 )
 def test_half_a_record_of_a_batch_is_refused(lost: str) -> None:
     entry = RECORD.to_json()

@@ -58,9 +58,17 @@ def refine(project: Path, output: str = "out", **changes: Any) -> FrameRecord:
 def test_depth_is_in_units_or_in_metres(unit_scale: float | None, unit: str, project: Path) -> None:
     record = refine(project, unit_scale=unit_scale, method="alone", iterations=0)
     metric = unit_scale is not None
-    assert (record.unit, record.settings["align"]) == (unit, "auto" if metric else "scale")
+    assert (record.unit, record.refined().settings["align"]) == (
+        unit,
+        "auto" if metric else "scale",
+    )
     factor = unit_scale or 1.0
-    assert 3.4 < record.points.nearest / factor < record.points.farthest / factor < 4.6
+    assert (
+        3.4
+        < record.refined().points.nearest / factor
+        < record.refined().points.farthest / factor
+        < 4.6
+    )
     scale = read_depth(project / "out/a_depth.png").reading.scale
     assert (scale == 256) == metric
     assert np.log2(scale) % 1 == 0
@@ -70,8 +78,8 @@ def test_depth_is_in_units_or_in_metres(unit_scale: float | None, unit: str, pro
         exif[0x0112] = 6
         opened.save(photo, exif=exif)
     turned = refine(project, "turned", unit_scale=unit_scale)
-    assert turned.size == record.size == (WIDTH, HEIGHT)
-    assert turned.points == record.points
+    assert turned.refined().size == record.refined().size == (WIDTH, HEIGHT)
+    assert turned.refined().points == record.refined().points
 
 
 @pytest.mark.parametrize("name", ["03", "04"])
@@ -179,8 +187,8 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
     calib = frame.folder / "k.txt"
     calib.write_text(f"{CALIB}distortion: [-0.1, 0, 0, 0]\n")
     record = run(frame, scan=ScanOptions(calib=calib))
-    assert record.camera.intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
-    assert record.camera.distortion == [-0.1, 0, 0, 0]
+    assert record.refined().camera.intrinsics == [[50, 0, 30], [0, 50, 20], [0, 0, 1]]
+    assert record.refined().camera.distortion == [-0.1, 0, 0, 0]
     calib.write_text(f"{CALIB}size: [64, 48]\n")
     with pytest.raises(InputError, match=r"\b64×48"):
         run(frame, scan=ScanOptions(calib=calib), overwrite=True)
@@ -192,7 +200,7 @@ def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: Frame
     exif[0x8769] = {0xA405: 26}
     opened.save(photo, exif=exif)
     record = run(replace(frame, image=photo), view_3d=True)
-    assert " 26 mm" in record.camera.source
+    assert " 26 mm" in record.refined().camera.source
     assert any("no distortion (EXIF" in note for note in record.notes)
 
 
@@ -201,7 +209,7 @@ def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
     frame, calib = frame_on_disk(tmp_path, 60, 80), tmp_path / "k.txt"
     calib.write_text(CALIB)
     record = run(frame, part=part, scan=ScanOptions(calib=calib))
-    camera, _ = record.camera.read()
+    camera, _ = record.refined().camera.read()
     whole, _ = camera_of_file(calib, None, (60, 80))
     xy = np.array([[33, 41], [50, 47]], np.float32)
     rays = unproject(whole, xy, np.ones(2))
@@ -217,4 +225,4 @@ def test_a_batch_records_the_cameras_of_its_frames(tmp_path: Path) -> None:
         (root / "calib.txt").write_text(CALIB.replace("50", focal_px))
         assert done(root) == ["a"]
     record = FrameRecord.read(root / "out/a.json")
-    assert record.camera.intrinsics[0][0] == 60
+    assert record.refined().camera.intrinsics[0][0] == 60

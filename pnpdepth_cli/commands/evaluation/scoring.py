@@ -98,7 +98,7 @@ def _score(
     rules = request.rules
     gt, of_gt, notes = _read_truth(files, result, request)
     try:
-        given = _given_points(files, result.record, gt)
+        given = _given_points(files, result, gt)
     except PnpDepthError:
         if rules.exclude_sparse:
             raise
@@ -190,7 +190,7 @@ def _depth_of_distances(
     if files.calib is not None:
         found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
         camera = files.part.camera_in_crop(found, whole)
-    elif result.record.size == size[::-1]:
+    elif result.size == size:
         camera, _ = result.camera_and_pose
     if camera is None:
         fact = f"frame {files.name} has none in the data set or the record beside the prediction"
@@ -249,12 +249,12 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
     return replace(image, reading=image.reading._replace(assumed=assumed))
 
 
-def _given_points(frame: FrameFiles, record: FrameRecord, gt: Depth) -> Mask:
+def _given_points(frame: FrameFiles, result: ResultFrame, gt: Depth) -> Mask:
     """(H, W) true at the network's sparse points. Raises PnpDepthError if they are not known."""
-    size, sparse = (gt.shape[0], gt.shape[1]), record.inputs.get("sparse")
+    size, sparse = (gt.shape[0], gt.shape[1]), result.record.inputs.get("sparse")
     drawn = None if sparse is None else sparse.sampled
     # Points that were drawn from the ground truth are drawn again.
-    if drawn is not None and record.size == size[::-1]:
+    if drawn is not None and result.size == size:
         image = None
         if drawn.kind == "features" and frame.image is not None:
             image = frame.part.apply(read_image(frame.image))

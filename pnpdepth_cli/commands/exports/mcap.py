@@ -191,10 +191,11 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
 
     None, with a note, where their files are gone or give other points.
     """
-    record = frame.result.record
-    sparse, points = record.inputs.get("sparse"), record.points
-    if sparse is None or points is None:
+    record, result = frame.result.record, frame.result.record.result
+    sparse = record.inputs.get("sparse")
+    if sparse is None or result is None:
         return None
+    points = result.points
     source = Path(sparse.path)
     files = FrameFiles(
         name=frame.result.name,
@@ -216,7 +217,7 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
     options = ReadOptions(
         unit_scale=sparse.unit_scale, registration="off", scan=scan, sample=sparse.sampled
     )
-    seed, holdout = record.settings.get("seed") or 0, record.settings.get("holdout") or 0.0
+    seed, holdout = result.settings.get("seed") or 0, result.settings.get("holdout") or 0.0
     try:
         read = read_frame(files, options, seed=int(seed), holdout=float(holdout))
     except (PnpDepthError, ValueError) as error:

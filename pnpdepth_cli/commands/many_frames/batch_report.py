@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pnpdepth_cli.commands.many_frames.records import BatchSummary
+from pnpdepth_cli.commands.many_frames.summary import BatchSummary
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest
 from pnpdepth_cli.commands.shared.tables import (
     bases_of,
@@ -21,7 +21,7 @@ from pnpdepth_cli.commands.shared.tables import (
     means_tables,
     weights_text,
 )
-from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ResultRecord, Scores
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.io import report
 from pnpdepth_cli.measures import (
@@ -79,7 +79,7 @@ def write_batch_report(
         summary: The batch's summary.
         records: The records of the frames.
     """
-    results = [record for record in records if record.outputs]
+    results = [(frame, frame.result) for frame in records if frame.result is not None]
     basis = next(iter(bases_of(summary.errors)), USED)
     columns, notes = _columns(basis, summary.unit), [*summary.notes]
     if summary.unmatched:
@@ -90,10 +90,10 @@ def write_batch_report(
     keys = [measure.key for measure in columns]
     page = {
         "title": summary.output,
-        "facts": _facts(summary, results),
+        "facts": _facts(summary, results[0][1].settings if results else {}),
         "notes": notes,
         "tables": means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
-        "without": [(each.name, each.message or "") for each in records if not each.outputs],
+        "without": [(each.name, each.message or "") for each in records if each.result is None],
     }
     data = {
         "columns": [measure.to_json() for measure in columns],
@@ -103,8 +103,9 @@ def write_batch_report(
     }
 
     def entries(images: Path) -> Iterator[dict[str, object]]:
-        for record in results:
-            yield _entry(record, basis, columns) | _views(record, request, images)
+        for frame, result in results:
+            views = _views(frame.name, result, request, images)
+            yield _entry(frame, basis, columns) | views
 
     source = _source(request, folder)
     report.write_report(folder, source, page, data, entries, viewer=request.html_3d)
@@ -129,22 +130,30 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
     }
 
 
-def _views(record: FrameRecord, request: BatchRequest, images: Path) -> dict[str, object]:
+def _views(
+    name: str, result: ResultRecord, request: BatchRequest, images: Path
+) -> dict[str, object]:
     """Links the images of a frame, unless they were deleted; returns the page's entry of them."""
-    files = {kind: request.output / path for kind, path in record.outputs.items()}
-    views, figures = dict[str, object](), record.figures
+    files = {kind: request.output / path for kind, path in result.outputs.items()}
+    figures = result.figures
     there = all(kind in files and files[kind].exists() for kind in figures)
     if "preview" not in figures or not there:
         return {"key": None}
     # The start of its images' names: fit for a file, and of this frame alone.
-    key = hashlib.sha256(record.name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+    key = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+    # The PNGs, and where each view of the page lies in them.
+    views = dict[str, object]()
     for kind, figure in figures.items():
-        name = f"{key}_{kind}.png"
-        report.link_image(files[kind], images / name)
+        file = f"{key}_{kind}.png"
+        report.link_image(files[kind], images / file)
         for view, title in _LABELS.items():
             if title in figure.panels:
-                box, src = figure.panels[title], f"{report.IMAGES}/{name}"
-                views[view] = {"src": src, "box": box, "size": figure.size}
+                views[view] = {
+                    "src": f"{report.IMAGES}/{file}",
+                    "box": figure.panels[title],
+                    "size": figure.size,
+                }
+    # The 3D view, and the ends of the colours.
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = report.save_view_3d(files["view"], images / f"{key}_view.js")
@@ -184,17 +193,20 @@ def _notes(record: FrameRecord, basis: str) -> list[str]:
         notes.append(f"Errors are {BASES[basis]}, {count}.")
     if basis == USED:
         notes.append("Refinement fits these points, so the change there proves nothing.")
-    if record.weights:
-        notes.append(f"Weights: {weights_text(record.weights)}.")
+    if record.result is not None and record.result.weights:
+        notes.append(f"Weights: {weights_text(record.result.weights)}.")
     return [*notes, *record.warnings]
 
 
-def _facts(summary: BatchSummary, results: Sequence[FrameRecord]) -> list[tuple[str, str]]:
-    """What was refined, and how: the settings that decide the results, by their options."""
+def _facts(summary: BatchSummary, of_first: Mapping[str, object]) -> list[tuple[str, str]]:
+    """What was refined, and how: the settings that decide the results, by their options.
+
+    Args:
+        summary: The batch's summary.
+        of_first: The settings of the first result, with nothing left open.
+    """
     counts = summary.counts
-    settings = dict(summary.settings)
-    if results:
-        settings |= results[0].settings
+    settings = {**summary.settings, **of_first}
     frames = [
         f"{counts[kind]:,} {kind.replace('_', ' ')}"
         for kind in ("done", "diverged", "failed", "pending", "with_warnings")

@@ -29,10 +29,11 @@ from pnpdepth_cli.commands.refinement.write_refined import write_refined
 from pnpdepth_cli.commands.requests.batch_request import LOCAL, BatchRequest, Listener
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order, timed
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.errors import DeviceError, InputError, ModelError, StorageError, UsageError
-from pnpdepth_cli.frames.frame import Frame, Refined
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.file_bytes import one_line
 
@@ -106,7 +107,7 @@ def _open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Itera
         yield method
 
 
-def _readable(request: BatchRequest, frames: Iterable[FrameFiles]) -> Iterator[Frame]:
+def _readable(request: BatchRequest, frames: Iterable[FrameFiles]) -> Iterator[ReadFrame]:
     """The contents of the frames that can be read. UsageError if an option is wrong, for all."""
     for files in frames:
         try:
@@ -124,7 +125,7 @@ class _Work:
     request: RefineRequest
     seconds: dict[str, float] = field(default_factory=dict)
     state: BatchState | None = None
-    frame: Frame | None = None
+    frame: ReadFrame | None = None
     refined: Refined | None = None
     error: Exception | None = None
 

@@ -15,9 +15,10 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest, endings_of
 from pnpdepth_cli.completion.interpolation import in_hull, linear
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.frames.frame import DepthMap, Frame, Refined
+from pnpdepth_cli.frames.frame import DepthMap, Refined
 from pnpdepth_cli.io.atomic import cannot_write
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
@@ -91,7 +92,7 @@ def remove_outdated(outputs: Outputs) -> None:
             raise cannot_write(path, error) from error
 
 
-def output_scale(inputs: Frame) -> float:
+def output_scale(inputs: ReadFrame) -> float:
     """Returns the codes per metre of an integer depth file for this frame.
 
     They are those of the sparse depth file. Without them they are 256, or the largest power of ten
@@ -107,7 +108,7 @@ def output_scale(inputs: Frame) -> float:
     return KITTI_SCALE if is_exact else max(_power_of_ten(finest), KITTI_SCALE)
 
 
-def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Refined:
+def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -> Refined:
     """Returns the frame with 0 where no points support its depth, if that is asked for.
 
     Where it is not, a note tells how much of a scan's image lies outside of its points.
@@ -115,7 +116,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, depth=np.where(frame.valid, frame.depth, np.float32(0)))
     source = inputs.sources["sparse"]
-    is_scan = source.calibration or scan_pattern(frame.used.xy, frame.used.size)
+    is_scan = source.kind == "scan" or scan_pattern(frame.used.xy, frame.used.size)
     if frame.valid is not None or not is_scan:
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
@@ -125,7 +126,7 @@ def without_unknown(request: RefineRequest, inputs: Frame, frame: Refined) -> Re
     return replace(frame, notes=(*frame.notes, note)) if outside > _MUCH else frame
 
 
-def within_range(outputs: Outputs, inputs: Frame, frame: Refined) -> Refined:
+def within_range(outputs: Outputs, inputs: ReadFrame, frame: Refined) -> Refined:
     """Returns the frame with depths that the format can hold, with a note if any is clipped."""
     if not format_of_suffix(outputs["depth"]).integer:
         return frame
@@ -149,7 +150,7 @@ def _power_of_ten(largest: float) -> float:
 
 
 def write_outputs(
-    outputs: Outputs, inputs: Frame, frame: Refined, made_by: tuple[str, str]
+    outputs: Outputs, inputs: ReadFrame, frame: Refined, made_by: tuple[str, str]
 ) -> dict[str, FigureRecord]:
     """Writes the depth and its images; returns the figures by kind.
 
@@ -188,10 +189,10 @@ def write_outputs(
     return figures
 
 
-def _unseen_points(inputs: Frame, frame: Refined) -> PointErrors | None:
+def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     """The held-out points, else the validation points, with the depths there; None without any."""
     held_out, validation = inputs.held_out, frame.validation
-    if held_out is not None and len(held_out):
+    if len(held_out):
         maps = (
             torch.from_numpy(frame.before),
             torch.from_numpy(frame.depth),
@@ -223,7 +224,7 @@ def _write_sigma(path: Path, sigma: DepthMap) -> None:
     write_depth(path, sigma, scale=scale)
 
 
-def _write_view(path: Path, inputs: Frame, frame: Refined) -> None:
+def _write_view(path: Path, inputs: ReadFrame, frame: Refined) -> None:
     """Writes the 3D view for a report: depths, the ground truth if known, colours and camera.
 
     Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.read_frame import read_frame
-from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.frames.resolve import with_input_range
 from pnpdepth_cli.models.network import load_network
 
 
-def read_requested(request: RefineRequest) -> Frame:
+def read_requested(request: RefineRequest) -> ReadFrame:
     """Returns the frame that is asked for, as `read_frame` reads it."""
     return read_frame(
         request.files,
@@ -24,7 +24,7 @@ def read_requested(request: RefineRequest) -> Frame:
 
 
 def load_method(
-    request: RefineRequest, first: Frame, more: Callable[[], Sequence[Frame]] = tuple
+    request: RefineRequest, first: ReadFrame, more: Callable[[], Sequence[ReadFrame]] = tuple
 ) -> Method:
     """Returns the method that is asked for; this first frame decides what networks leave open.
 

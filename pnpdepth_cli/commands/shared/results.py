@@ -15,9 +15,13 @@ from pnpdepth_cli.dataset.frame_files import ImageSource, file_of, find_files, s
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Pose
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
+from pnpdepth_cli.io.file_bytes import read_json
 from pnpdepth_cli.io.rgb import read_rgb
 
-_DEPTH = "_depth"  # end of the stem of a depth file
+_DEPTH = "_depth"
+"""End of the stem of a depth file."""
+_MARKS = {"schema", "versions", "status"}
+"""Entries of which a record of any version of this program has one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +51,20 @@ class ResultFrame:
             return "no image is known"
         return f"{entry.path} is not found from {Path.cwd()}; run this in the folder of `refine`"
 
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """(H, W) of the depth, as the record has it. None: unknown."""
+        result = self.record.result
+        return None if result is None else (result.size[1], result.size[0])
+
     @functools.cached_property
     def camera_and_pose(self) -> tuple[Camera | None, Pose | None]:
         """The camera that the record holds, and its pose. Raises InputError if damaged."""
-        camera = self.record.camera
+        result = self.record.result
+        if result is None or result.camera is None:
+            return None, None
         try:
-            return (None, None) if camera is None else camera.read()
+            return result.camera.read()
         except ValueError as error:
             raise InputError(
                 f"{self.depth}: the camera in the record beside it is damaged; refine it again"
@@ -100,9 +112,20 @@ def _frame(name: str, depth: Path) -> ResultFrame:
         path = depth.with_name(depth.stem.removesuffix(_DEPTH) + endings_of(depth.suffix)[kind])
         return path if path != depth and path.is_file() else None
 
-    path = beside("record")
-    record = FrameRecord() if path is None else FrameRecord.read(path)
-    # Files that the record does not name are of other runs.
-    kinds = [kind for kind in ("sigma", "valid") if path is None or kind in record.outputs]
-    companions = {kind: beside(kind) for kind in kinds}
-    return ResultFrame(name=name, depth=depth, record=record, **companions)
+    record = _record(beside("record"))
+    companions = {kind: beside(kind) for kind in ("sigma", "valid")}
+    if record is not None:
+        # Files that the record does not name are of other runs.
+        named = {} if record.result is None else record.result.outputs
+        companions = {kind: path for kind, path in companions.items() if kind in named}
+    return ResultFrame(name=name, depth=depth, record=record or FrameRecord(), **companions)
+
+
+def _record(path: Path | None) -> FrameRecord | None:
+    """The record in a file beside a depth file, empty if another program wrote it; None without."""
+    if path is None:
+        return None
+    content = read_json(path)
+    if not content.keys() & _MARKS:
+        return FrameRecord()
+    return FrameRecord.from_json(content, path)

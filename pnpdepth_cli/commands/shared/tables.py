@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from pnpdepth_cli.choices import BASELINES
-from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ResultRecord, Scores
 from pnpdepth_cli.io.atomic import atomic_path, make_folder
 from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.measures import (
@@ -175,10 +175,10 @@ def means_tables(
 
 def refinement_tables(record: FrameRecord) -> list[Table]:
     """Returns the errors of a record on each basis."""
-    assert record.method is not None
-    names = " + ".join(record.method.names)
-    title = f"{names}, method {record.method.name}"
-    titles = stage_titles(record)
+    result = record.refined()
+    names = " + ".join(result.method.names)
+    title = f"{names}, method {result.method.name}"
+    titles = stage_titles(result)
     return [
         _table(title, basis, record.errors[basis], record.unit, titles)
         for basis in bases_of(record.errors)
@@ -227,37 +227,36 @@ def _table(
     )
 
 
-def stage_titles(record: FrameRecord) -> dict[str, str]:
+def stage_titles(result: ResultRecord) -> dict[str, str]:
     """Returns what each stage of a frame is, in words.
 
     The result is no stage of its own where it is the network's last stage: then that one is named.
     """
-    assert record.method is not None
-    method = record.method
+    method = result.method
     name = method.networks[0].name
-    updates = len(record.loss) - 1  # fewer than asked if they diverged
+    updates = len(result.loss) - 1  # fewer than asked if they diverged
     # The steps of the user's network.
     steps = {BEFORE: name}
-    if record.alignment is not None:
+    if result.alignment is not None:
         steps[BEFORE] = f"{name}, aligned with the points"
     if updates > 0:
         steps[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
     if method.propagation != "none":
         steps[PROPAGATED] = f"{name}, residual propagated"
     # What becomes of them.
-    weighted = [expert for expert, weight in record.weights.items() if weight > 0]
+    weighted = [expert for expert, weight in result.weights.items() if weight > 0]
     if weighted in ([], [name]):
         _, steps[AFTER] = steps.popitem()
     else:
         steps[ALONE] = f"{method.names[-1]} alone"
-        steps[AFTER] = f"fused ({weights_text(record.weights)})"
+        steps[AFTER] = f"fused ({weights_text(result.weights)})"
     steps[LINEAR] = _LINEAR
     return steps
 
 
-def names_of_depths(record: FrameRecord) -> tuple[str, str]:
-    """Returns what the depth before and the depth after of a record are of, in a few words."""
-    titles = stage_titles(record)
+def names_of_depths(result: ResultRecord) -> tuple[str, str]:
+    """Returns what the depth before and the depth after of a result are of, in a few words."""
+    titles = stage_titles(result)
     return titles.get(BEFORE, titles[AFTER]), titles[AFTER]
 
 

@@ -42,12 +42,15 @@ def test_points_of_neighbours_lower_the_error_at_held_out_points(tmp_path: Path)
     refine = {"iterations": 0, "propagate": "gp", "holdout": 0.2}
     accumulating(root, refine=refine)
     first, second = record_of(root, "drive_000"), record_of(root, "drive_001")
-    assert 40 < first["points"]["moved"] < second["points"]["moved"]
-    assert [Path(each["path"]).stem for each in second["neighbours"]] == ["drive_000", "drive_002"]
+    assert 40 < first["result"]["points"]["moved"] < second["result"]["points"]["moved"]
+    assert [Path(each["path"]).stem for each in second["result"]["neighbours"]] == [
+        "drive_000",
+        "drive_002",
+    ]
     shutil.rmtree(root / "out")
     batch(root, refine=refine)
     alone = record_of(root, "drive_001")
-    assert second["points"]["held_out"] == alone["points"]["held_out"] == 30
+    assert second["result"]["points"]["held_out"] == alone["result"]["points"]["held_out"] == 30
     errors = [each["errors"]["held_out"]["after"]["mae"] for each in (second, alone)]
     assert errors[0] < 0.85 * errors[1]
 
@@ -59,7 +62,7 @@ def test_points_of_neighbours_are_sampled_from_their_ground_truth(tmp_path: Path
     (root / "list.csv").write_text("\n".join(rows))
     sample = {"iterations": 0, "sample": SamplePattern(count=50)}
     accumulating(root, source=root / "list.csv", refine=sample)
-    points = record_of(root, "drive_000")["points"]
+    points = record_of(root, "drive_000")["result"]["points"]
     assert 20 < points["moved"] <= 50
     assert points["used"] == 50 + points["moved"]
 
@@ -118,14 +121,14 @@ def test_poses_are_estimated_or_checked_by_images(turned: float | None, tmp_path
     np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
     accumulating(tmp_path, listener=listener, limit=1, poses=None if turned is None else poses)
     record, messages = record_of(tmp_path, "drive_000"), " ".join(listener.messages)
-    (neighbour,) = record["neighbours"]
+    (neighbour,) = record["result"]["neighbours"]
     assert neighbour.get("contradicts_images", False) == bool(turned)
     assert ("contradict the images" in messages) == bool(turned)
     if turned is None:
         assert "poses: estimated from the images" in messages
         assert neighbour["poses"].startswith("estimated from the images: ")
         assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
-        assert record["points"]["moved"] > 500
+        assert record["result"]["points"]["moved"] > 500
 
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
@@ -146,11 +149,11 @@ def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path
     np.savetxt(root / "away.txt", np.reshape([away, np.eye(3, 4), ahead], (3, 12)))
     sparse = root / "sparse/drive_002.png"
     assert "drive_001" in accumulating(root, poses=root / "away.txt", listener=listener)
-    assert record_of(root, "drive_001")["points"]["moved"] == 0
+    assert record_of(root, "drive_001")["result"]["points"]["moved"] == 0
     # Nor does one without any point.
     cv2.imwrite(str(sparse), np.zeros_like(cv2.imread(str(sparse), cv2.IMREAD_UNCHANGED)))
     assert "drive_001" in accumulating(root, limit=2, listener=listener)
-    assert record_of(root, "drive_001")["points"]["moved"] > 0
+    assert record_of(root, "drive_001")["result"]["points"]["moved"] > 0
     assert any(sparse.name in note for note in record_of(root, "drive_001")["notes"])
 
 
@@ -190,7 +193,7 @@ def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path)
     farthest, both = [], ["drive_000", "drive_001"]
     for poses, redone, z in ((None, both, STEP_M), (other, both[1:], 100)):
         assert done(root, poses=poses, refine={"iterations": 0}) == redone
-        assert record_of(root, "drive_001")["camera"]["pose"][2][3] == z
+        assert record_of(root, "drive_001")["result"]["camera"]["pose"][2][3] == z
         output = tmp_path / f"{z}.ply"
         write_depth_cloud(CloudRequest(depth=root / "out", output=output))
         farthest.append(read_scan(output)[0][:, 2].max())

@@ -36,7 +36,8 @@ def test_weights_are_kept_used_for_every_frame_and_found_again_if_they_are_bette
     assert batch(drive) == 0
     out, weights = drive.parent / "out", drive.parent / "out/adapted/drive.safetensors"
     records = [json.loads(path.read_text()) for path in out.glob("drive_*.json")]
-    assert [record["model"]["checkpoint"] == str(weights) for record in records] == [is_better] * 8
+    used = [record["result"]["model"]["checkpoint"] for record in records]
+    assert [checkpoint == str(weights) for checkpoint in used] == [is_better] * 8
     assert weights.is_file() == is_better
     before = {path: path.stat().st_mtime_ns for path in out.rglob("drive*")}
     assert len(before) > 16

@@ -31,7 +31,7 @@ def test_the_page_links_panels_of_the_records_and_shows_errors(root: Path, repor
     batch(root, html=report)
     frame = frames_of(report)["c"]
     record = json.loads((root / "out/c.json").read_text())
-    figures, errors = record["figures"], record["errors"]["ground_truth"]
+    figures, errors = record["result"]["figures"], record["errors"]["ground_truth"]
     for view, kind, title in (
         ("first", "preview", "Depth before"),
         ("second", "preview", "Depth after"),
@@ -107,7 +107,7 @@ def test_each_frame_has_its_weights_and_the_errors_all_share(root: Path, report:
     assert {*frames["b"]["values"].values()} == {None}
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at validation points")
     assert [name for name, why in data["without"]] == ["d"]
-    weights = FrameRecord.read(root / "out/a.json").weights
+    weights = FrameRecord.read(root / "out/a.json").refined().weights
     assert all(name in dict(data["facts"])["mean weights"] for name in weights)
     largest = max(weights, key=weights.__getitem__)
     assert f"{largest} {weights[largest]:.0%}" in " ".join(frames["a"]["notes"])

@@ -124,7 +124,7 @@ def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path) -> None:
     model.write_text(model.read_text().replace("build=Net", "build=Net, normalisation=None"))
     batch(root)
     record = FrameRecord.read(root / "out" / "a.json")
-    assert record.settings["normalise"] in NORMALISATIONS
+    assert record.refined().settings["normalise"] in NORMALISATIONS
     assert any("mean of 3 frames" in note for note in record.notes)
     assert spread(3) == [0, 1, 2]
     assert spread(37) == [0, 2, 4, 7, 9, 12, 14, 16, 19, 21, 24, 26, 28, 31, 33, 36]

@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.refinement.outputs import output_scale
+from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.points import SparsePoints
@@ -32,7 +32,8 @@ def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points() -> None:
         (0.005, 80.0, None, 256),
     ):
         points = SparsePoints(xy=torch.eye(2), depth=torch.tensor([nearest, farthest]), size=(2, 2))
-        assert output_scale(Frame(rgb=None, points=points, depth_scale=scale)) == expected
+        frame = ReadFrame(rgb=None, points=points, own=points, held_out=points, depth_scale=scale)
+        assert output_scale(frame) == expected
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> None:
@@ -41,7 +42,7 @@ def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> No
     run(frame, iterations=0, output=frame.folder / "d.npy")
     exact = np.load(frame.folder / "d.npy")
     record = run(frame, iterations=0)
-    written = read_depth(Path(record.outputs["depth"])).values
+    written = read_depth(Path(record.refined().outputs["depth"])).values
     assert written == pytest.approx(exact.clip(0.001, 65.534), abs=0.00051)
     beyond = np.count_nonzero((exact > 65.534) | (exact < 0.0005))
     assert any(f" {beyond:,} of {exact.size:,} pixels clipped" in note for note in record.notes)
@@ -93,12 +94,12 @@ def test_without_ground_truth_improvement_is_at_points_that_nothing_used(
     run(frame, gt=frame.gt)  # of an earlier run
     assert path.is_file()
     record = run(frame, overwrite=True, **options)
-    assert path.is_file() == (heading is not None) == ("improvement" in record.outputs)
+    assert path.is_file() == (heading is not None) == ("improvement" in record.refined().outputs)
     if heading is None:
         return
     basis = heading.partition(" ")[0].replace("-", "_")
-    footer = record.figures["improvement"].footer
+    footer = record.refined().figures["improvement"].footer
     assert footer is not None
     assert footer.startswith(f"at {record.errors[basis]['after']['points']:,} {heading}: ")
-    if basis == "held_out" and record.improved_fraction is not None:
-        assert f"{100 * record.improved_fraction:.1f} % better" in footer
+    if basis == "held_out" and record.refined().improved_fraction is not None:
+        assert f"{100 * record.refined().improved_fraction:.1f} % better" in footer

@@ -8,9 +8,11 @@ from typing import Any
 
 from pnpdepth_cli.commands.shared import tables
 from pnpdepth_cli.commands.shared.tables import Table, refinement_tables
-from pnpdepth_cli.dataset.frame_record import FrameRecord, ModelRecord, Scores
+from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.measures import MEASURES
-from tests.builders import method_record
+from tests.builders import method_record, result_record
+
+ALIGNED = {"kind": "affine"}
 
 
 def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
@@ -24,11 +26,9 @@ def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
         assert [*tables.change(before, after)] == cell
 
 
-def record_of(*networks: str, **fields: Any) -> FrameRecord:
-    """A record of these networks, fused and aligned."""
-    model = ModelRecord(name=networks[0], spec=networks[0])
-    aligned = {"alignment": {"kind": "affine"}, "method": method_record(*networks)}
-    return FrameRecord(model=model, **(aligned | fields))
+def record_of(errors: dict[str, dict[str, Scores]], *networks: str, **fields: Any) -> FrameRecord:
+    """A record of these networks, fused and aligned, with these errors."""
+    return FrameRecord(errors=errors, result=result_record(*networks, alignment=ALIGNED, **fields))
 
 
 def at_points(count: int, **maes: float | None) -> dict[str, Scores]:
@@ -42,7 +42,7 @@ def texts(table: Table) -> list[list[str]]:
 
 def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> None:
     at = at_points(12, before=4.0, propagated=1.0, after=1.0, linear=2.0)
-    record = record_of("net", weights={"net": 1.0}, errors={"validation": at})
+    record = record_of({"validation": at}, "net", weights={"net": 1.0})
     (table,) = refinement_tables(record)
     assert table.cells == [
         [("net, aligned with the points", ""), ("4.0000 m", ""), ("+100.0%", "bad")],
@@ -51,7 +51,7 @@ def test_stages_stand_against_linear_interpolation_and_the_last_is_bold() -> Non
     ]
     at |= at_points(12, alone=0.7, after=0.5)
     weights = {"net": 0.15, "other with net": 0.0, "other": 0.85}
-    record = record_of("net", "other", weights=weights, errors={"validation": at})
+    record = record_of({"validation": at}, "net", "other", weights=weights)
     *_, alone, result, _ = (row[0] for row in texts(refinement_tables(record)[0]))
     assert (alone, result) == ("other alone", "fused (net 15%, other 85%)")
 
@@ -64,14 +64,13 @@ def test_errors_are_shown_where_they_are_measured_and_at_other_points_only_witho
         "validation": at_points(12, before=4.0, after=1.0, linear=2.0),
         "used": at_points(2000, before=0.5, after=0.25),
     }
-    record = record_of(
+    result = result_record(
         "net",
         method=method_record("net", name="paper", propagation="none"),
-        alignment=None,
         weights={"net": 1.0},
         loss=[1.0] * 4,  # it diverged after 3
-        errors=errors,
     )
+    record = FrameRecord(errors=errors, result=result)
     truth, held_out = refinement_tables(record)
     pixels = "errors against ground truth, 1,200 pixels (50.0% of those known)"
     assert truth.title == f"net, method paper: {pixels}"
@@ -93,7 +92,7 @@ def test_a_batch_has_its_means_and_every_baseline() -> None:
         "nearest": {"mae": 3.0, "rmse": 4.0, "frames": 3},
     }
     errors = {"ground_truth": stages, "used": stages}
-    titles = tables.stage_titles(record_of("net", weights={"net": 1.0}))
+    titles = tables.stage_titles(result_record("net", alignment=ALIGNED, weights={"net": 1.0}))
     (table,) = tables.means_tables(errors, "m", titles, ("mae", "rmse"))
     assert table.title == "means: errors against ground truth, 3 frames"
     assert table.columns == ["", "MAE", "RMSE", "MAE vs linear"]
@@ -112,7 +111,7 @@ def test_a_mean_over_fewer_frames_says_so_and_is_not_compared() -> None:
         "after": {"mae": 1.0, "frames": 3},
         "linear": {"mae": 4.0, "frames": 3},
     }
-    titles = tables.stage_titles(record_of("net", weights={"net": 1.0}))
+    titles = tables.stage_titles(result_record("net", alignment=ALIGNED, weights={"net": 1.0}))
     (table,) = tables.means_tables({"ground_truth": stages}, "m", titles, ("mae",))
     assert texts(table) == [
         ["net, aligned with the points (over 2 frames)", "2.0000 m", "–"],
@@ -132,8 +131,9 @@ def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
         (0.0, 1.0, "fused (compact 100%)"),
         (0.25, 0.75, "fused (net 25%, compact 75%)"),
     ):
-        record = record_of("net", "compact", weights={"net": net, "compact": compact})
-        assert tables.names_of_depths(record) == ("net, aligned with the points", after)
+        weights = {"net": net, "compact": compact}
+        result = result_record("net", "compact", alignment=ALIGNED, weights=weights)
+        assert tables.names_of_depths(result) == ("net, aligned with the points", after)
 
 
 def test_names_are_shortened_by_what_they_share_and_numbers_stay_whole() -> None:
@@ -146,7 +146,7 @@ def test_names_are_shortened_by_what_they_share_and_numbers_stay_whole() -> None
 
 def test_without_updates_there_is_no_row_of_updates() -> None:
     at = at_points(12, before=4.0, updated=3.0, propagated=1.0, after=1.0, linear=2.0)
-    record = record_of("net", weights={"net": 1.0}, errors={"validation": at}, loss=[1.0])
+    record = record_of({"validation": at}, "net", weights={"net": 1.0}, loss=[1.0])
     assert not any("of z" in row[0] for row in texts(refinement_tables(record)[0]))
-    record = replace(record, loss=[1.0, 0.5])
+    record = record_of({"validation": at}, "net", weights={"net": 1.0}, loss=[1.0, 0.5])
     assert any("1 update of z" in row[0] for row in texts(refinement_tables(record)[0]))
