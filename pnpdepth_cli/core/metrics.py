@@ -52,8 +52,7 @@ def score(
     """
     known = ground_truth.isfinite() & (ground_truth > 0)
     scored = known & predicted.isfinite() & (predicted > 0)
-    p = predicted[scored].double()
-    g = ground_truth[scored].double()
+    p, g = predicted[scored].double(), ground_truth[scored].double()
     return Scores(
         values_by_key={
             measure.key: float(measure.of_pixels(p, g))
