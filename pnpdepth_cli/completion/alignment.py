@@ -50,8 +50,14 @@ _UNTESTED = 0.2
 _GROSS = 0.05
 """Errors of log depth below this are no outliers."""
 
+_GROSS_STDS = 3.0
+"""Errors below so many standard deviations are none either."""
+
 _DISTINCT = 1e-9
 """Range of x over its largest size below which x is the same at all points."""
+
+_LARGEST_LOG = 60.0
+"""Largest |log x| of a bound, so that x and 1/x are float32 numbers."""
 
 
 class Candidate(NamedTuple):
@@ -63,6 +69,8 @@ class Candidate(NamedTuple):
 
 
 class _Reading(NamedTuple):
+    """What a network's numbers can be, and the line that gives depth from them."""
+
     title: str  # in a sentence
     output: str  # of `choices.SPACES`: the scale is that of x, of 1/x or of log x
     space: str  # of `choices.SPACES`: the quantity of depth that the line gives
@@ -118,6 +126,7 @@ class Alignment:
         return float(((x < least) | (line < low) | (line > high)).double().mean())
 
     def _line(self, x: Tensor) -> Tensor:
+        """The line at x, in the reading's space and not clamped."""
         return self.scale * to_space(x, _READINGS[self.reading].output) + self.shift
 
     @property
@@ -133,9 +142,10 @@ class Alignment:
         output = _READINGS[self.reading].output
         if output == "depth":
             return -math.inf
+        # Where the line meets its bounds, as log x or as 1/x.
         ends = [(limit - self.shift) / self.scale for limit in self._limits]
         if output == "log":
-            return math.exp(min(max(min(ends), -60.0), 60.0))
+            return math.exp(min(max(min(ends), -_LARGEST_LOG), _LARGEST_LOG))
         return 1 / max(ends) if max(ends) > 0 else math.inf
 
     def __str__(self) -> str:
@@ -147,11 +157,14 @@ class Alignment:
         elif self.scale < 0:
             title = f"negated {title}"
         farther = (self.scale < 0) == (self.reading == "disparity")
-        fitted = {"none": "not fitted", "affine": "fitted by scale and shift"}.get(
-            self.kind, f"fitted by {self.kind}"
-        )
         if self.reading == "power":
             fitted = f"fitted by factor and exponent {self.scale:.3g}"
+        elif self.kind == "none":
+            fitted = "not fitted"
+        elif self.kind == "affine":
+            fitted = "fitted by scale and shift"
+        else:
+            fitted = f"fitted by {self.kind}"
         sense = "farther" if farther else "nearer"
         return f"the network's output is read as {title} (larger is {sense}), {fitted}"
 
@@ -171,6 +184,7 @@ def candidates(
         output_scale: What a definition states, of `choices.OutputScale`.
     """
     stated = _OF_KIND.get(output_kind)
+    # A reading that contradicts the definition leaves its scale open, too.
     if asked in READINGS and asked != stated:
         output_scale = "unknown"
     reading = asked if asked in READINGS else stated
@@ -180,11 +194,11 @@ def candidates(
             Candidate(name, kind) for name in READINGS for kind in kinds if _has(name, kind)
         )
     sign = 0 if reading == "power" else 1
-    found = tuple(Candidate(reading, kind, sign) for kind in kinds if _has(reading, kind))
+    fits = [Candidate(reading, kind, sign) for kind in kinds if _has(reading, kind)]
     # Networks stretch or compress the range, which a power of what they state shows.
     if asked == "auto" and reading != "log":
-        found += (Candidate("power", "affine", -1 if reading == "disparity" else 1),)
-    return found
+        fits.append(Candidate("power", "affine", -1 if reading == "disparity" else 1))
+    return tuple(fits)
 
 
 def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignment:
@@ -202,26 +216,28 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
         NoPointsError: There are too few points.
         ModelError: The numbers do not vary, or are not finite.
     """
-    x, d = x.detach().cpu().double(), points.depth.detach().cpu().double()
-    good = x.isfinite()
-    if not bool(good.any()):
+    x = x.detach().cpu().double()
+    d = points.depth.detach().cpu().double()
+    finite = x.isfinite()
+    if not bool(finite.any()):
         raise ModelError(
             f"the network's prediction is not finite at any of {len(x):,} sparse points; are its"
             " weights, its input range (`normalise`) and precision right?"
         )
-    x, d = x[good], d[good]
+    x, d = x[finite], d[finite]
     fits = [fit for candidate in tried if (fit := _fit(x, d, candidate)) is not None]
     if fits:
         return min(fits, key=_bic)
-    kind = tried[0].kind
+    stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
-            f"alignment {kind!r} needs 2 sparse points where the network sees them, here is"
+            f"alignment {stated.kind!r} needs 2 sparse points where the network sees them, here is"
             f" {len(x)}; 'scale' needs only one"
         )
     raise ModelError(
-        f"alignment {kind!r} as {tried[0].reading} is not possible: the network's output is the"
-        f" same at all {len(x)} sparse points, or not above 0"
+        f"alignment {stated.kind!r} as {stated.reading} is not possible: the network's output is"
+        f" the same at all {len(x)} sparse points, or not above 0; are its weights and its input"
+        " range (`normalise`) right, and does it give what the alignment says?"
     )
 
 
@@ -256,7 +272,8 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
     seen = points.where(points.sample(torch.where(known, prediction, torch.nan)).isfinite())
     if not len(seen):
         raise NoPointsError(
-            f"none of the {len(points)} sparse points lies where the network has a prediction"
+            f"none of the {len(points)} sparse points lies where the network has a prediction;"
+            " are points and image of the same frame, and in pixels of the same image?"
         )
     return known, seen
 
@@ -274,10 +291,11 @@ def _fit(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment | None:
     line = _scale_and_shift(x, d, candidate.reading, candidate.kind)
     if line is None or not all(map(math.isfinite, line)):
         return None
-    if candidate.sign and line[0] * candidate.sign <= 0:
+    scale, _ = line
+    if candidate.sign and scale * candidate.sign <= 0:
         has_level = candidate.kind == "affine" and len(x) > 1
         return _level(x, d, candidate) if has_level else None
-    return _with_errors(x, d, candidate, line) if line[0] else None
+    return _with_errors(x, d, candidate, line) if scale else None
 
 
 def _level(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment:
@@ -291,23 +309,25 @@ def _level(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment:
 def _with_errors(
     x: Tensor, d: Tensor, candidate: Candidate, line: tuple[float, float]
 ) -> Alignment:
+    """The fit with this line, and how far the points are from it."""
+    scale, shift = line
     nearest, farthest = _bounds(d).tolist()
     fit = Alignment(
         reading=candidate.reading,
         kind=candidate.kind,
-        scale=line[0],
-        shift=line[1],
+        scale=scale,
+        shift=shift,
         bounds=(nearest, farthest),
         points=len(x),
     )
-    off = (fit.depth(x).log() - d.log()).abs()
-    best = off.sort().values[: max(1, round(_BEST * len(off)))]
-    gross = max(3 * MAD_TO_STD * float(off.median()), _GROSS)
+    errors = (fit.depth(x).log() - d.log()).abs()
+    best = errors.sort().values[: max(1, round(_BEST * len(errors)))]
+    gross = max(_GROSS_STDS * MAD_TO_STD * float(errors.median()), _GROSS)
     return replace(
         fit,
         error=float(best.mean()),
-        misfit=mean_error(off),
-        outliers=float((off > gross).double().mean()),
+        misfit=mean_error(errors),
+        outliers=float((errors > gross).double().mean()),
     )
 
 
@@ -317,7 +337,8 @@ def _scale_and_shift(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[flo
         return 1.0, 0.0
     if kind != "affine":
         return _factor(x, d, reading, kind)
-    output, space = _READINGS[reading][1:]
+    output = _READINGS[reading].output
+    space = _READINGS[reading].space
     if output != "depth" and not bool((x > 0).all()):
         return None
     x = to_space(x, output)
@@ -329,20 +350,23 @@ def _scale_and_shift(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[flo
 
 def _factor(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
     """Scale and shift of a reading whose one parameter is a factor of depth."""
-    if reading == "log":
-        addends = d.log() - x
-    else:
-        # Numbers of the rarer sign, or 0, give no depth at any factor.
-        sign = 1.0 if float(x.median()) >= 0 else -1.0
-        used = sign * x > 0
-        if not bool(used.any()):
-            return None
-        log_x = (sign * x[used]).log()
-        addends = d[used].log() - (log_x if reading == "depth" else -log_x)
-    addend = float(addends.median()) if kind == "median" else fit_location(addends)
-    if reading == "log":
-        return 1.0, addend
-    return sign * math.exp(addend if reading == "depth" else -addend), 0.0
+    if reading == "log":  # a factor of depth is an addend of its logarithm
+        return 1.0, _location(d.log() - x, kind)
+    # Numbers of the rarer sign, or 0, give no depth at any factor.
+    sign = 1.0 if float(x.median()) >= 0 else -1.0
+    used = sign * x > 0
+    if not bool(used.any()):
+        return None
+    log_x = (sign * x[used]).log()
+    log_d = d[used].log()
+    if reading == "depth":
+        return sign * math.exp(_location(log_d - log_x, kind)), 0.0
+    return sign * math.exp(-_location(log_d + log_x, kind)), 0.0
+
+
+def _location(addends: Tensor, kind: str) -> float:
+    """The addend of all points, from the one that each would need."""
+    return float(addends.median()) if kind == "median" else fit_location(addends)
 
 
 def _bic(fit: Alignment) -> float:
@@ -366,9 +390,25 @@ def _held(value: Tensor, low: float, high: float = math.inf) -> Tensor:
 
 def to_space(depth: Tensor, space: str) -> Tensor:
     """Returns depth as one of `choices.SPACES`."""
-    return {"depth": lambda: depth, "inverse": depth.reciprocal, "log": depth.log}[space]()
+    match space:
+        case "depth":
+            return depth
+        case "inverse":
+            return depth.reciprocal()
+        case "log":
+            return depth.log()
+        case _:
+            raise KeyError(space)
 
 
 def from_space(value: Tensor, space: str) -> Tensor:
     """Returns the depth of a value in one of `choices.SPACES`."""
-    return {"depth": lambda: value, "inverse": value.reciprocal, "log": value.exp}[space]()
+    match space:
+        case "depth":
+            return value
+        case "inverse":
+            return value.reciprocal()
+        case "log":
+            return value.exp()
+        case _:
+            raise KeyError(space)

@@ -13,13 +13,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.completion import interpolation
 from pnpdepth_cli.completion.alignment import (
     Candidate,
     align,
     align_prediction,
     where_predicted,
 )
-from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
 from pnpdepth_cli.points import SparsePoints
@@ -27,6 +27,9 @@ from pnpdepth_cli.points import SparsePoints
 Baseline = Callable[[SparsePoints, Tensor], Tensor]
 """Gives depth (H, W) metres, 0 = unknown, from points and a prediction (H, W), which is up to scale
 and shift, 0 = unknown."""
+
+
+_LEAST_STD = 1e-9  # of the aligned depth at the points, over its mean: it may be level
 
 
 def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
@@ -39,20 +42,27 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     Raises:
         NoPointsError: No point has a prediction.
     """
-    device, prediction, points = prediction.device, prediction.detach().cpu(), points.tensors()
-    known, points = where_predicted(prediction, points)
-    points = distinct(points)
+    device = prediction.device
+    prediction = prediction.detach().cpu()
+    known, points = where_predicted(prediction, points.tensors())
+    points = interpolation.distinct(points)
+    # The global alignment, as metres and as what keeps metres within its bounds.
     x = torch.where(known, prediction, 1.0).double()
     kinds = ("none", "scale", "affine")
     aligned = align(points.sample(x), points, [Candidate("depth", kind) for kind in kinds])
-    start, reading = aligned.scale * x + aligned.shift, replace(aligned, scale=1.0, shift=0.0)
+    start = aligned.scale * x + aligned.shift
+    bounded = replace(aligned, scale=1.0, shift=0.0)
+    # It in standard deviations over the points, which lines are over.
     at_points = points.sample(start)
-    std = at_points.std(correction=0) + 1e-9 * at_points.abs().mean()
-    z, z_at_points = ((y - at_points.mean()) / std for y in (start, at_points))
+    mean = at_points.mean()
+    std = at_points.std(correction=0) + _LEAST_STD * at_points.abs().mean()
+    z = (start - mean) / std
+    z_at_points = (at_points - mean) / std
+    # The residual of depth by lines around every pixel, outliers counting less.
     residual = points.depth.double() - at_points
-    weights = inlier_weights(points, points.depth.double().log() - reading.depth(at_points).log())
+    weights = inlier_weights(points, points.depth.double().log() - bounded.depth(at_points).log())
     shift, slope = local_lines(points, None, residual, z_at_points, weights)
-    depth = reading.depth(start + shift + slope * z)
+    depth = bounded.depth(start + shift + slope * z)
     return torch.where(known, depth, 0.0).float().to(device)
 
 
@@ -64,9 +74,9 @@ def _aligned(kind: str, reading: str = "depth") -> Baseline:
 
 
 TABLE: dict[str, Baseline] = {
-    "nearest": lambda points, _: nearest(points),
-    "linear": lambda points, _: linear(points),
-    "linear-log": lambda points, _: linear(points, space="log"),
+    "nearest": lambda points, _: interpolation.nearest(points),
+    "linear": lambda points, _: interpolation.linear(points),
+    "linear-log": lambda points, _: interpolation.linear(points, space="log"),
     "median": _aligned("median"),
     "scale": _aligned("scale"),
     "affine": _aligned("affine"),
@@ -74,3 +84,4 @@ TABLE: dict[str, Baseline] = {
     "affine-disparity": _aligned("affine", "disparity"),
     "local": align_locally,
 }
+"""The baselines by name."""

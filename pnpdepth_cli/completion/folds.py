@@ -28,6 +28,8 @@ from pnpdepth_cli.scan_pattern import scan_lines
 _GROWTH = 1.5  # of a cell's side from trial to trial
 _MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
 _SAMPLED = 2000  # pixels and points whose distances are measured
+_BOX_FROM = 0.02  # quantiles of the points' coordinates, between which pixels are sampled
+_BOX_TO = 0.98
 _SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
 _CELLS = 2.0  # a point, at most, of a depth map: of its pixels at least half are known
 _SQUARE = 1.5  # height of a map's pixel over its width, at most; lines are farther apart
@@ -47,8 +49,10 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
     if line is not None:
         first = torch.randint(folds, (1,), generator=generator)
         return (torch.from_numpy(line) + first) % folds
+    # Cells grow until held-out points are as far from the others as pixels are from all.
     target = _distance_of_pixels(points, generator)
-    side, best = 0.0, _folds_of_cells(points, 0.0, folds, generator)
+    side = 0.0
+    best = _folds_of_cells(points, side, folds, generator)
     while _distance_held_out(points, best, generator) * _SLACK < target:
         side = side * _GROWTH if side else max(1.0, target)
         if side > _MAX_SIDE * min(points.size):
@@ -84,8 +88,8 @@ def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | 
     hidden = np.zeros_like(known)
     room = int(known.sum()) // folds
     for _ in range(_COPIES):
-        copy = np.roll(~known, rng.integers(grid.shape), axis=(0, 1)) & known & ~hidden
-        copy = _some_holes(copy, room, rng)
+        moved = np.roll(~known, rng.integers(grid.shape), axis=(0, 1))
+        copy = _some_holes(moved & known & ~hidden, room, rng)
         hidden |= copy
         room -= int(copy.sum())
     if not hidden.any():
@@ -106,21 +110,38 @@ class _PixelGrid(NamedTuple):
     @classmethod
     def of(cls, points: SparsePoints) -> _PixelGrid | None:
         """Returns the grid of points; None if they are no depth map, or most of it is unknown."""
-        shape = list[int]()
-        spacings = list[float]()
-        index = list[NDArray[np.intp]]()
-        for at, length in zip(points.xy.cpu().double().numpy().T[::-1], points.size, strict=True):
-            steps = np.diff(np.unique(at))
-            if not len(steps):
-                return None
-            # Areas of pixels scale with the image, as `SparsePoints.resized` moves them.
-            spacing = float(np.median(steps))
-            spacings.append(spacing)
-            shape.append(max(1, round(length / spacing)))
-            index.append(((at + 0.5) / spacing).astype(np.intp).clip(0, shape[-1] - 1))
-        if max(spacings) > _SQUARE * min(spacings) or shape[0] * shape[1] > _CELLS * len(points):
+        x, y = points.xy.cpu().double().numpy().T
+        height, width = points.size
+        rows = _PixelAxis.of(y, height)
+        columns = _PixelAxis.of(x, width)
+        if rows is None or columns is None:
             return None
-        return cls((shape[0], shape[1]), *index)
+        spacings = sorted([rows.spacing, columns.spacing])
+        if spacings[1] > _SQUARE * spacings[0]:
+            return None
+        if rows.pixels * columns.pixels > _CELLS * len(points):
+            return None
+        return cls((rows.pixels, columns.pixels), rows.number, columns.number)
+
+
+class _PixelAxis(NamedTuple):
+    """The rows or the columns of pixels that points are of."""
+
+    spacing: float  # of two pixels, in pixels of the image
+    pixels: int  # how many there are along the axis
+    number: NDArray[np.intp]  # (N,) of each point's pixel
+
+    @classmethod
+    def of(cls, coordinate: NDArray[np.float64], length: int) -> _PixelAxis | None:
+        """Returns the axis for the points' coordinate (N,) in an image of this length, or None."""
+        steps = np.diff(np.unique(coordinate))
+        if not len(steps):  # all points are on one line
+            return None
+        # Areas of pixels scale with the image, as `SparsePoints.resized` moves them.
+        spacing = float(np.median(steps))
+        pixels = max(1, round(length / spacing))
+        number = ((coordinate + 0.5) / spacing).astype(np.intp).clip(0, pixels - 1)
+        return cls(spacing, pixels, number)
 
 
 def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -131,12 +152,12 @@ def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -
         return holes
     label, count = ndimage.label(holes, _AROUND)
     sizes = np.bincount(label.ravel(), minlength=count + 1)
-    taken = np.zeros(count + 1, np.bool_)
+    is_chosen = np.zeros(count + 1, np.bool_)  # by label, of which 0 is no hole
     for number in 1 + rng.permutation(count):
         if sizes[number] <= room:
-            taken[number] = True
+            is_chosen[number] = True
             room -= sizes[number]
-    chosen: NDArray[np.bool_] = taken[label]
+    chosen: NDArray[np.bool_] = is_chosen[label]
     return chosen
 
 
@@ -150,10 +171,11 @@ def _folds_of_cells(
         _, cell = torch.unique(cells, dim=0, return_inverse=True)
     else:
         cell = torch.arange(count)
+    # The points' positions in a list that has cell after cell, the cells in random order.
     order = torch.randperm(int(cell.max()) + 1, generator=generator)
-    # cells one after the other in random order, cut where a fold is full
     position = torch.empty(count, dtype=torch.long)
     position[order[cell].argsort(stable=True)] = torch.arange(count)
+    # The list is cut where a fold is full; a cell is in the fold of its first point.
     first = torch.full((len(order),), count).scatter_reduce(0, cell, position, "amin")
     return (first[cell] * folds // count).clamp_max(folds - 1)
 
@@ -164,21 +186,22 @@ def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> flo
     The pixels are in the box around the middle 96 % of the points: a LiDAR has no points in the
     sky.
     """
-    low, high = (torch.quantile(_some(points.xy.cpu(), generator), q, dim=0) for q in (0.02, 0.98))
+    low = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_FROM, dim=0)
+    high = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_TO, dim=0)
     xy = low + (high - low) * torch.rand(_SAMPLED, 2, generator=generator)
     return float(nearest_points(points, xy.double(), 1)[0].median())
 
 
 def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Generator) -> float:
     """The median distance from points of the first fold to the nearest of another."""
-    held = fold == 0
-    if bool(held.all()):
+    held_out = fold == 0
+    if bool(held_out.all()):
         return math.inf
-    xy = _some(points.xy[held].cpu(), generator)
-    return float(nearest_points(points.select(~held), xy.double(), 1)[0].median())
+    xy = _sample(points.xy[held_out].cpu(), generator)
+    return float(nearest_points(points.select(~held_out), xy.double(), 1)[0].median())
 
 
-def _some(xy: Tensor, generator: torch.Generator) -> Tensor:
+def _sample(xy: Tensor, generator: torch.Generator) -> Tensor:
     """At most `_SAMPLED` of the coordinates."""
     if len(xy) <= _SAMPLED:
         return xy

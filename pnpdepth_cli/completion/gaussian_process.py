@@ -27,6 +27,7 @@ import functools
 import math
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -37,36 +38,53 @@ from pnpdepth_cli.completion.interpolation import distinct, nearest_points
 from pnpdepth_cli.points import SparsePoints, in_frame
 from pnpdepth_cli.scan_pattern import scan_pattern
 
-CONSTANT, SLOPE = 100.0, 1.0
-"""Variances of β₀ and β₁, in units of the variance of f."""
+CONSTANT = 100.0
+"""Variance of β₀, in units of the variance of f."""
+SLOPE = 1.0
+"""Variance of β₁, in the same units."""
+
+# What is compared was chosen on rendered frames with predictions of three networks; the longest
+# lengths and the least and most noise are there for frames unlike those. The length scale of the
+# position is 1 longer side of the image.
 LENGTHS_DEPTH = (1.0, 2.5, 8.0, 25.0)
+"""Length scales of u, in standard deviations over the image."""
 LENGTHS_COLOUR = (2.5, 8.0, 25.0)
+"""Length scales of the colour, in standard deviations over the image."""
 NOISES = (1e-4, 1e-3, 1e-2, 1.0)
-"""Length scales in standard deviations over the image (of the position, in longer sides: 1), and
-variance of the noise. Chosen on rendered frames with predictions of three networks; the longest
-lengths and the least and most noise are there for frames unlike those."""
+"""Variances of the noise, in units of the variance of f."""
 NEIGHBOURS = 48
 """Points that predict a block, or a single pixel, where there are many points."""
 MIN_POINTS = 5
 """Fewer points do not determine the length scales."""
 
-_MAX_EXACT = 128  # points up to which all of them predict every pixel,
-_MAX_EXACT_SMALL = 256  # and up to which they do where the image is small:
-_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels
+# All points predict every pixel
+_MAX_EXACT = 128  # of so many points at most,
+_MAX_EXACT_SMALL = 256  # or so many where the image is small:
+_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels, at most
 _AT_ONCE = 1 << 19  # covariances computed at once: what bounds the memory
-_NEIGHBOURHOODS = 24  # in which the length scales are tried, when there are many points,
-_INNER = 16  # and points of each that are left out: the middle ones
-_IN_BLOCK = 3  # a block contains at most 1/3 of the points that predict it,
-_MIN_BLOCK = 8  # pixels, a block's side
-_WORTH_A_GRID = 1 << 16  # pixels; for fewer, every pixel is predicted
+
+# The kernel of many points is chosen
+_NEIGHBOURHOODS = 24  # in so many neighbourhoods,
+_INNER = 16  # by the points in the middle of each, left out one by one
+_MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+
+# A block of pixels
+_IN_BLOCK = 3  # contains at most 1/3 of the points that predict it,
+_CROWDED = 0.05  # except for blocks with this fraction of all points,
+_MIN_BLOCK_PX = 8  # and has at least this side
+_BLOCK_SHRINKS = 1.4  # factor between sides that are tried
+
+# The grid on which the residual is predicted
+_WORTH_A_GRID = 1 << 16  # pixels; of fewer, every pixel is predicted
 _NODES_BETWEEN = 6  # nodes of the grid between two points,
 _NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
-_MAX_STEP = 4  # and most pixels between two nodes: on real frames as good as every pixel
-_CROWDED = 0.05  # except for this fraction of all points
-_MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+_MAX_STEP_PX = 4  # most between two nodes: on real frames as good as every pixel
+
 DEPTH = 2
 """Position of the predicted log depth among the features."""
-_FLAT_DEPTH, _FLAT_COLOUR = 1e-3, 1.0  # added to standard deviations: a flat image has no edges
+_FLAT_DEPTH = 1e-3  # added to the standard deviation of log depth: a flat one has no edges
+_FLAT_COLOUR = 1.0  # added to that of CIELAB, likewise
+_LEAST_XYZ = 1e-6  # of which the cube root is taken: below it is not used, and below 0 is NaN
 _XYZ_OF_RGB = (
     (0.4124564, 0.3575761, 0.1804375),
     (0.2126729, 0.7151522, 0.0721750),
@@ -106,8 +124,12 @@ class Residuals:
 
     def select(self, mask: Tensor) -> Residuals:
         """Returns the field with only the points where mask (N,) is true."""
-        points, at, residual = self.points.select(mask), self.at[mask], self.residual[mask]
-        return replace(self, points=points, at=at, residual=residual)
+        return replace(
+            self,
+            points=self.points.select(mask),
+            at=self.at[mask],
+            residual=self.residual[mask],
+        )
 
 
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
@@ -122,13 +144,15 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
     Raises:
         NoPointsError: No point has a prediction.
     """
-    prediction, points = prediction.detach().cpu(), points.tensors()
+    prediction = prediction.detach().cpu()
+    # The points that count.
+    points = points.tensors()
     inside = in_frame(points.xy, points.size, closed=True)
     known, points = where_predicted(prediction, points.where(inside))
     points = distinct(points)
-    features = features_of(
-        torch.where(known, prediction, torch.nan).log(), None if rgb is None else rgb.cpu()
-    )
+    # The features, and the residual at the points.
+    log_depth = torch.where(known, prediction, torch.nan).log()
+    features = features_of(log_depth, None if rgb is None else rgb.cpu())
     predicted = points.sample(torch.where(known, prediction, 1.0)).double()
     return Residuals(
         features=features,
@@ -148,20 +172,23 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
         rgb: (3, H, W) in 0…1, or None.
     """
     height, width = log_depth.shape
-    y, x = (torch.arange(float(n)) / max(height, width) for n in (height, width))
+    y, x = (torch.arange(float(side)) / max(height, width) for side in (height, width))
+    # u: known log depth, of mean 0 and standard deviation 1; 0 where it is unknown.
     known = log_depth.isfinite()
     values = log_depth if bool(known.all()) else log_depth[known]  # picking them is slow
     values = values.double().flatten()
     mean = values.mean()
     std = (values.dot(values) / len(values) - mean.square()).clamp_min(0).sqrt()
     u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
-    maps = x.expand(height, width), y[:, None].expand(height, width), u.float()
-    return torch.stack(maps if rgb is None else (*maps, *_colour(rgb)))
+    maps = [x.expand(height, width), y[:, None].expand(height, width), u.float()]
+    if rgb is not None:
+        maps.extend(_colour(rgb))
+    return torch.stack(maps)
 
 
 def _sample(features: Tensor, points: SparsePoints) -> Tensor:
     """The features (N, 3 or 6) at the coordinates of the points."""
-    return torch.stack([points.sample(one) for one in features], dim=1)
+    return torch.stack([points.sample(feature) for feature in features], dim=1)
 
 
 @functools.lru_cache(maxsize=2)
@@ -177,10 +204,12 @@ def _colour(rgb: Tensor) -> Tensor:
 
 def cielab(rgb: Tensor) -> Tensor:
     """Returns (3, H, W) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
+    # The numbers are those of sRGB (IEC 61966-2-1) and of CIELAB.
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055).clamp_min(0) ** 2.4)
     matrix = rgb.new_tensor(_XYZ_OF_RGB)
+    # Each row's sum is the white point's, of which XYZ is a fraction here.
     xyz = torch.einsum("ij,jhw->ihw", matrix / matrix.sum(dim=1, keepdim=True), linear)
-    root = xyz.clamp_min(1e-6).pow(1 / 3)
+    root = xyz.clamp_min(_LEAST_XYZ).pow(1 / 3)
     x, y, z = torch.where(xyz > 216 / 24389, root, xyz * (24389 / 27 / 116) + 16 / 116)
     return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
@@ -240,13 +269,16 @@ def leave_one_out(
         near: (B, k) numbers of points of each neighbourhood.
         weight: (N,) 0…1 of each point as a predictor; one of 0 predicts nothing.
     """
-    _, _, system = _systems(field, near)
+    # A point counts less by more noise of its own.
+    covariance = _systems(field, near).covariance
     weight = torch.ones_like(field.residual) if weight is None else weight
     extra_noise = field.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
-    system.diagonal(dim1=1, dim2=2).add_(extra_noise)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
+    covariance.diagonal(dim1=1, dim2=2).add_(extra_noise)
+    # Errors of all points at once, from the inverse.
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
     error = (inverse @ field.residual[near][..., None])[..., 0] * variance
+    # The points at the edge of a neighbourhood have others outside of it.
     inner = _INNER if near.shape[0] > 1 else None
     return error[:, :inner], (variance - extra_noise)[:, :inner]
 
@@ -271,10 +303,11 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
     """
     if points.size[0] * points.size[1] < _WORTH_A_GRID:
         return 1, 1
-    spacing = math.sqrt(points.size[0] * points.size[1] / len(points))
-    step = min(_MAX_STEP, max(1, int(spacing / _NODES_BETWEEN)))
+    spacing_px = math.sqrt(points.size[0] * points.size[1] / len(points))
+    columns = min(_MAX_STEP_PX, max(1, int(spacing_px / _NODES_BETWEEN)))
     _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
-    return min(_MAX_STEP, max(step, int(across_px / _NODES_BETWEEN_LINES))), step
+    rows = min(_MAX_STEP_PX, max(columns, int(across_px / _NODES_BETWEEN_LINES)))
+    return rows, columns
 
 
 def _predict_grid(field: Residuals) -> Tensor:
@@ -283,46 +316,68 @@ def _predict_grid(field: Residuals) -> Tensor:
     if _is_exact(field):
         queries = field.features.flatten(1).T.contiguous()[None]
         return _solve(field, _all_points(field), queries).reshape(height, width)
+    # Two layers of blocks, each of which counts where the other one has its seams.
     side = _block_side(field.points)
-    layers = [_predict_blocks(field, side, shift) for shift in (0, side // 2)]
-    total = layers[0][1] + layers[1][1]
-    return sum((values * (weight / total) for values, weight in layers), torch.zeros(()))
+    values, weight = _predict_blocks(field, side, 0)
+    shifted_values, shifted_weight = _predict_blocks(field, side, side // 2)
+    total = weight + shifted_weight
+    return values * (weight / total) + shifted_values * (shifted_weight / total)
 
 
 def _solve(field: Residuals, near: Tensor, queries: Tensor) -> Tensor:
     """(B, Q) float32: the mean at B × Q features, from points near (B, k)."""
-    (blocks, count), per_block = near.shape, queries.shape[1]
+    blocks, count = near.shape
+    per_block = queries.shape[1]
     result = queries.new_empty(blocks, per_block)
-    many = max(1, _AT_ONCE // (per_block * count))
-    step = max(1, _AT_ONCE // (many * count))
-    for first in range(0, blocks, many):
-        some = slice(first, first + many)
-        at, u, system = _systems(field, near[some])
-        factor = torch.linalg.cholesky(system)
-        alpha = torch.cholesky_solve(field.residual[near[some]][..., None], factor)
-        beta = torch.stack([CONSTANT * alpha[..., 0].sum(1), SLOPE * (u * alpha[..., 0]).sum(1)])
-        for start in range(0, per_block, step):
-            part = queries[some, start : start + step]
-            k = _covariance(field.scaled(part), at.float())
-            mean = (k @ alpha.float())[..., 0] + beta.float()[0, :, None]
-            result[some, start : start + step] = mean + beta.float()[1, :, None] * part[..., 2]
+    # Some blocks at once, or some queries of one block, so that the memory is bounded.
+    blocks_at_once = max(1, _AT_ONCE // (per_block * count))
+    queries_at_once = max(1, _AT_ONCE // (blocks_at_once * count))
+    for first in range(0, blocks, blocks_at_once):
+        some_blocks = slice(first, first + blocks_at_once)
+        # α of these blocks, and from it the mean of β₀ and β₁.
+        systems = _systems(field, near[some_blocks])
+        factor = torch.linalg.cholesky(systems.covariance)
+        alpha = torch.cholesky_solve(field.residual[near[some_blocks]][..., None], factor)
+        constant = (CONSTANT * alpha[..., 0].sum(1)).float()[:, None]
+        slope = (SLOPE * (systems.u * alpha[..., 0]).sum(1)).float()[:, None]
+        # mean = k·α + β₀ + β₁·u
+        for start in range(0, per_block, queries_at_once):
+            some_queries = slice(start, start + queries_at_once)
+            features = queries[some_blocks, some_queries]
+            k = _covariance(field.scaled(features), systems.at.float())
+            mean = (k @ alpha.float())[..., 0] + constant
+            result[some_blocks, some_queries] = mean + slope * features[..., DEPTH]
     return result
 
 
-def _systems(field: Residuals, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Scaled features, u, and the covariances of r, of points near (B, k)."""
-    at = field.at[near].double()
-    scaled, u = field.scaled(at), at[..., 2]
-    system = _covariance(scaled, scaled).double()
-    system.baddbmm_(u[:, :, None], u[:, None, :], alpha=SLOPE).add_(CONSTANT)
-    system.diagonal(dim1=1, dim2=2).add_(field.noise)
-    return scaled, u, system
+class _Systems(NamedTuple):
+    """The equations of B blocks with k points each."""
+
+    at: Tensor
+    """(B, k, F) features of the points over their length scales."""
+    u: Tensor
+    """(B, k) predicted log depth."""
+    covariance: Tensor
+    """(B, k, k) covariances of r, with β₀, β₁ and the noise."""
+
+
+def _systems(field: Residuals, near: Tensor) -> _Systems:
+    """The equations of blocks whose points are near (B, k)."""
+    features = field.at[near].double()
+    at = field.scaled(features)
+    u = features[..., DEPTH]
+    covariance = _covariance(at, at).double()
+    covariance.baddbmm_(u[:, :, None], u[:, None, :], alpha=SLOPE).add_(CONSTANT)
+    covariance.diagonal(dim1=1, dim2=2).add_(field.noise)
+    return _Systems(at, u, covariance)
 
 
 def _covariance(a: Tensor, b: Tensor) -> Tensor:
     """exp(−|a − b|) (B, Q, k) float32 of a (B, Q, F) and b (B, k, F), in B blocks."""
-    middle = b.mean(dim=1, keepdim=True)  # small numbers, so that the squares cancel well
-    a, b = a - middle, b - middle
+    # Small numbers, so that the squares cancel well in |a|² + |b|² − 2a·b.
+    middle = b.mean(dim=1, keepdim=True)
+    a = a - middle
+    b = b - middle
     squares = torch.baddbmm(b.square().sum(dim=2)[:, None, :], a, b.transpose(1, 2), alpha=-2)
     squares += a.square().sum(dim=2)[:, :, None]
     closeness: Tensor = squares.float().clamp_min_(0).sqrt_().neg_().exp_()
@@ -330,12 +385,14 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _all_points(field: Residuals) -> Tensor:
+    """(1, N): one block, which has all points."""
     return torch.arange(len(field.points))[None]
 
 
 def _is_exact(field: Residuals) -> bool:
     """Whether every pixel is predicted from all points."""
-    count, (height, width) = len(field.points), field.points.size
+    count = len(field.points)
+    height, width = field.points.size
     small = count <= _MAX_EXACT_SMALL and count * height * width <= _MAX_EXACT_PRODUCT
     return small or count <= _MAX_EXACT
 
@@ -347,18 +404,23 @@ def _predict_blocks(field: Residuals, side: int, shift: int) -> tuple[Tensor, Te
     pixel's weight is its distance to the edge of its block.
     """
     height, width = field.points.size
-    rows, columns = (math.ceil((n + shift) / side) for n in (height, width))
+    rows = math.ceil((height + shift) / side)
+    columns = math.ceil((width + shift) / side)
+    # The features, block by block.
     padding = (shift, columns * side - shift - width, shift, rows * side - shift - height)
     padded = F.pad(field.features[None], padding, mode="replicate")[0]
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
+    # Each from the points nearest to its middle; then the blocks are put together.
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)
     values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1))
     values = values.reshape(rows, columns, side, side).permute(0, 2, 1, 3)
     values = values.reshape(rows * side, columns * side)
+    # How far pixels are inside their blocks.
     position = torch.arange(float(side)) + 0.5
     inside = torch.minimum(position, side - position)
-    y, x = (inside.repeat(n)[shift:] for n in (rows, columns))
+    y = inside.repeat(rows)[shift:]
+    x = inside.repeat(columns)[shift:]
     weight = torch.minimum(y[:height, None], x[None, :width])
     return values[shift : shift + height, shift : shift + width], weight
 
@@ -367,11 +429,11 @@ def _block_side(points: SparsePoints) -> int:
     """The largest side in pixels for which nearly no block has too many points."""
     side = max(points.size)
     x, y = points.xy.unbind(1)
-    while side > _MIN_BLOCK:
+    while side > _MIN_BLOCK_PX:
         cell = (y / side).floor().clamp_min(0) * points.size[1] + (x / side).floor().clamp_min(0)
         count = torch.bincount(cell.long())
         crowded = count[count > NEIGHBOURS / _IN_BLOCK].sum()
         if float(crowded) <= _CROWDED * len(points):
             break
-        side = max(_MIN_BLOCK, round(side / 1.4))
+        side = max(_MIN_BLOCK_PX, round(side / _BLOCK_SHRINKS))
     return side

@@ -33,21 +33,33 @@ It is the log of the Bayes factor over an image that is registered already. The 
 chosen on rendered frames. Of registered ones with 500 to 5,000 points 1 % exceed it, with 100
 none."""
 
-REGISTERED, CHANCE = 3.0, 3.0
-"""Evidence that an image belongs to its points: the log of the Bayes factor over an unrelated one.
+REGISTERED = 3.0
+"""Evidence from which on an image is not moved.
 
-From `REGISTERED` on, an image is not moved. An unrelated image reaches `CHANCE` by
-chance somewhere. So the best of all registrations must have it for one frame, and twice it for
-more."""
+It is the evidence that an image belongs to its points: the log of the Bayes factor over an
+unrelated one."""
 
-_TURNED, _TURNED_MORE = 4.0, 5.0
-"""Evidence for another orientation, alone and above that for the image as it is."""
+CHANCE = 3.0
+"""Evidence, likewise, that an unrelated image reaches by chance somewhere.
 
+So the best of all registrations must have it for one frame, and twice it for more."""
+
+_TURNED = 4.0
+"""Evidence for another orientation, at least."""
+
+_TURNED_MORE = 5.0
+"""By how much it must exceed the evidence for the image as it is."""
+
+# What is searched, and the prior of it.
 _ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
 _LARGEST_SHIFT = 0.05  # of the image's sides
-_ZOOM_SCALE, _SHIFT_SIGMA = 0.07, 0.025  # of the prior; log zoom, and of the image's sides
+_ZOOM_SCALE = 0.07  # of Laplace's prior of the log zoom
+_SHIFT_SIGMA = 0.025  # standard deviation of the prior of the shift, of the image's sides
+
+# The points and the image that are used.
 _LONGEST_PX = 320  # the image is reduced to this size
-_MIN_POINTS, _MOST_POINTS = 10, 2000
+_MIN_POINTS = 10  # fewer tell nothing
+_MOST_POINTS = 2000  # of more, so many evenly spaced ones are used
 _LEAST_HULL = 0.5  # of the image's area; points of one part say little of the zoom
 _MOST_AT_EDGES = 4.0  # standard errors; points on edges of the image were found in the image
 _LONGEST_PAIR = 0.95  # quantile of the distances between neighbouring points
@@ -60,13 +72,21 @@ It is 0.39 to 0.58 in the maps of five RGB-D sets. It is 0 to 0.28 where points 
 jumps are missing, as of phones whose depth of low confidence is dropped. The points that are left
 tell nothing of where in between the jump is."""
 _SMALLEST_CHANGE = 0.03  # of log depth; smaller ones are noise
+_LENGTH_OFFSET = 0.1  # pixels of the reduced image, so that a length has a logarithm
 _LEAST_SPREAD = 0.4  # standard deviation of the log of that change; a noisy wall has 0.4, rooms 0.6
 _LARGEST_EVIDENCE = 2.5  # standard deviations
 _LEAST_CONTRAST = 0.02  # of an image with edges
-_EDGE_SIGMA, _EDGE_REACH, _EDGE_BAND = 1.0, 8.0, 6.0  # pixels of the reduced image
-_WEIGHT = 0.1  # log likelihood per unit of correlation of edges and change of depth
+
+# Edges of the image: standard deviations of Gaussians in pixels of the reduced image.
+_EDGE_SIGMA = 1.0  # before the gradient is taken
+_EDGE_REACH = 8.0  # of the surroundings that an edge's strength is relative to
+_EDGE_BAND = 6.0  # of the mean that is taken off
+
+# What the correlation of edges and changes of depth tells.
+_WEIGHT = 0.1  # log likelihood per unit of it
 _INDEPENDENT = 37.0  # norm of the evidence from which pairs are no longer independent
-_NO_EVIDENCE, _EVIDENCE = 25, 0.85  # points that tell nothing, and what each e-fold of more tells
+_NO_EVIDENCE = 25  # points that tell nothing
+_EVIDENCE = 0.85  # standard deviations that each e-fold of more points tells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +106,7 @@ class ImageRegistration:
     def apply_to(self, rgb: Image) -> Image:
         """Returns the image (H, W, 3) at the pixels of the depth camera, its border repeated."""
         height, width = rgb.shape[:2]
+        # The matrix leads from a pixel of the result to where its colour is.
         x, y = (1 - self.zoom) * np.array([width - 1, height - 1]) / 2 + (self.right, self.down)
         matrix = np.array([[self.zoom, 0, x], [0, self.zoom, y]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -101,7 +122,8 @@ class Evidence:
 
     edges: Image  # (h, w) strength of the image's edges
     between: Floats  # (S, 2) x and y of samples between neighbouring points
-    weight: Floats  # (S,) log likelihood per unit of edge strength, by how much depth changes there
+    weight: Floats
+    """(S,) log likelihood per unit of edge strength, by how much depth changes there."""
     size: tuple[int, int]  # (H, W) of the image
     points: int  # number of points
     jumps: int  # number of pairs of neighbouring points across a jump of depth
@@ -118,7 +140,8 @@ class Evidence:
         rows, columns = self.edges.shape + 2 * reach
         # The weights at their pixels of a map that has the image in its middle.
         x, y = np.floor((self.between - centre) * zoom + centre).astype(np.intp).T
-        x, y = x + reach[1], y + reach[0]
+        x = x + reach[1]
+        y = y + reach[0]
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
         drawn = np.bincount((y * columns + x)[inside], self.weight[inside], rows * columns)
         template = drawn.reshape(rows, columns).astype(np.float32)
@@ -138,7 +161,8 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
         The evidence. None where the points tell nothing: they are too few, in a part of the image
         only, scan lines of a LiDAR, or were matched in the image, as SfM points are.
     """
-    xy, depth = points.xy.double().numpy(), points.depth.double().numpy()
+    xy = points.xy.double().numpy()
+    depth = points.depth.double().numpy()
     if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size):
         return None
     if len(xy) > _MOST_POINTS:
@@ -164,28 +188,45 @@ def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     # Pairs of neighbouring points, and by how much log depth changes between the two.
     pairs, length = _neighbours(at)
     change = np.abs(np.diff(np.log(depth)[pairs], axis=1)[:, 0])
-    # By how many standard deviations it changes more than at other pairs of that length.
-    terms = np.stack([np.ones_like(length), np.log(length + 0.1)], axis=1)
-    log_change = np.log(change + _SMALLEST_CHANGE)
-    rest = log_change - terms @ np.linalg.lstsq(terms, log_change, rcond=None)[0]
-    if rest.std() < _LEAST_SPREAD:  # such as of a wall
+    weight = _weights_of_pairs(change, length)
+    if weight is None:
         return None
-    weight = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
-    weight -= weight.mean()
-    weight *= _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight)))
-    # Samples of each pair; jumps of depth, and how many of them lie between close points.
+    # Samples between the two points of each pair, and jumps of depth.
     step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
-    ordered = np.sort(length)
-    half = ordered[np.searchsorted(ordered.cumsum(), ordered.sum() / 2)]
+    jumps = change > _JUMP
     return Evidence(
         edges=edges,
         between=(at[pairs][:, :1] * (1 - step) + at[pairs][:, 1:] * step).reshape(-1, 2),
         weight=np.repeat(weight / _STEPS, _STEPS),
         size=points.size,
         points=len(xy),
-        jumps=int((change > _JUMP).sum()),
-        short_jumps=int(((change > _JUMP) & (length < half)).sum()),
+        jumps=int(jumps.sum()),
+        short_jumps=int((jumps & (length < _length_of_half(length))).sum()),
     )
+
+
+def _weights_of_pairs(change: Floats, length: Floats) -> Floats | None:
+    """(M,) log likelihood per unit of edge strength between pairs of points, whose mean is 0.
+
+    It follows by how many standard deviations log depth changes more than at other pairs of that
+    length. None where that is about the same everywhere, such as of a wall.
+    """
+    # The change that is usual at a length, by least squares in logarithms.
+    terms = np.stack([np.ones_like(length), np.log(length + _LENGTH_OFFSET)], axis=1)
+    log_change = np.log(change + _SMALLEST_CHANGE)
+    rest = log_change - terms @ np.linalg.lstsq(terms, log_change, rcond=None)[0]
+    if rest.std() < _LEAST_SPREAD:
+        return None
+    weight = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
+    weight -= weight.mean()
+    weight *= _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight)))
+    return np.asarray(weight)
+
+
+def _length_of_half(length: Floats) -> float:
+    """The length up to which pairs have half of the length of all pairs (M,)."""
+    ordered = np.sort(length)
+    return float(ordered[np.searchsorted(ordered.cumsum(), ordered.sum() / 2)])
 
 
 def better_orientation(frames: Sequence[Evidence]) -> str | None:
@@ -196,9 +237,11 @@ def better_orientation(frames: Sequence[Evidence]) -> str | None:
     """
     height, width = frames[0].size
     scale = min(1.0, _LONGEST_PX / max(height, width))
-    right, bottom = width * scale, height * scale  # of the reduced image
+    right = width * scale  # edges of the reduced image
+    bottom = height * scale
 
     def factor(orient: Callable[[Floats], Floats]) -> float:
+        """Evidence that the depth belongs to the image when its positions are turned like this."""
         turned = [replace(frame, between=orient(frame.between)) for frame in frames]
         maps = [frame.log_likelihood(1.0) for frame in turned]
         return _bayes_factor(frames, maps, tuple(count // 2 for count in maps[0].shape))
@@ -206,7 +249,9 @@ def better_orientation(frames: Sequence[Evidence]) -> str | None:
     as_it_is = factor(lambda at: at)
     if as_it_is > REGISTERED:
         return None
-    across, down = np.array([right, 0.0]), np.array([0.0, bottom])
+    # What else it can be; sides are exchanged only where they are equal.
+    across = np.array([right, 0.0])
+    down = np.array([0.0, bottom])
     orientations: dict[str, Callable[[Floats], Floats]] = {
         "mirrored left to right": lambda at: np.abs(across - at),
         "upside down, its rows from the bottom up": lambda at: np.abs(down - at),
@@ -234,12 +279,13 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
         frames: Evidence of the frames; None of a frame that tells nothing. The first decides the
             size.
     """
-    known = [frame for frame in frames if frame is not None]
-    usable = [frame for frame in known if frame.size == known[0].size]
+    telling = [frame for frame in frames if frame is not None]
+    usable = [frame for frame in telling if frame.size == telling[0].size]
+    if not usable:
+        return None
     # Beside jumps of depth there must be points.
-    if not usable or (
-        sum(e.short_jumps for e in usable) < _LEAST_SHORT * sum(e.jumps for e in usable)
-    ):
+    jumps = sum(frame.jumps for frame in usable)
+    if sum(frame.short_jumps for frame in usable) < _LEAST_SHORT * jumps:
         return None
     # An image that belongs to its points as it is stays.
     unmoved = [frame.log_likelihood(1.0) for frame in usable]
@@ -250,7 +296,9 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     if better_orientation(usable) is not None:
         return None
     # The posterior over zoom, down and right: likelihood of all frames, and prior.
-    total = np.stack([np.sum([e.log_likelihood(zoom) for e in usable], axis=0) for zoom in _ZOOMS])
+    total = np.stack(
+        [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
+    )
     height, width = usable[0].size
     scale = min(1.0, _LONGEST_PX / max(height, width))
     down, right = ((np.arange(count) - count // 2) / scale for count in total.shape[1:])
@@ -261,7 +309,7 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     )
     logits = total - prior - logsumexp(-prior)
     # It must be far better than no registration.
-    if logsumexp(logits) - sum(float(each[middle]) for each in unmoved) < FOUND:
+    if logsumexp(logits) - sum(float(by_shift[middle]) for by_shift in unmoved) < FOUND:
         return None
     # The best registration must be better than chance.
     number, *place = np.unravel_index(logits.argmax(), logits.shape)
@@ -286,7 +334,9 @@ def _bayes_factor(
     unrelated image these are 0 ± 1. For one that belongs there they grow with the logarithm of the
     number of points (even frames of 7-Scenes and ICL-NUIM).
     """
-    standing = np.array([(each[place] - each.mean()) / (each.std() + 1e-9) for each in maps])
+    standing = np.array(
+        [(by_shift[place] - by_shift.mean()) / (by_shift.std() + 1e-9) for by_shift in maps]
+    )
     points = np.array([frame.points for frame in frames])
     expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
     return float(np.sum(expected * (standing - expected / 2)))
@@ -299,8 +349,8 @@ def _edges(rgb: Image) -> Image:
     lab = np.ascontiguousarray(cielab(channels).permute(1, 2, 0)) / 100
     blurred = cv2.GaussianBlur(lab, (0, 0), _EDGE_SIGMA)
     gradients = [
-        cv2.Sobel(blurred, cv2.CV_32F, *order, scale=0.125, borderType=cv2.BORDER_REFLECT)
-        for order in ((1, 0), (0, 1))
+        cv2.Sobel(blurred, cv2.CV_32F, dx, dy, scale=0.125, borderType=cv2.BORDER_REFLECT)
+        for dx, dy in ((1, 0), (0, 1))
     ]
     strength = np.sqrt(np.square(gradients).sum((0, 3)))
     relative = strength / (cv2.GaussianBlur(strength, (0, 0), _EDGE_REACH) + 0.01)
@@ -311,7 +361,8 @@ def _edges(rgb: Image) -> Image:
 def _neighbours(at: Floats) -> tuple[NDArray[np.intp], Floats]:
     """(M, 2) pairs of neighbouring points and (M,) their distances: triangles' sides, not long."""
     triangles = Delaunay(at, qhull_options="QJ").simplices
-    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
+    sides = np.sort(sides)
     pairs = np.unique(sides, axis=0).astype(np.intp)
     length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
     near = length <= np.quantile(length, _LONGEST_PAIR)

@@ -36,7 +36,12 @@ _AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
 _NODES = 2  # a point, at most, of a grid that squares are sought in
 _FEW = 50  # points a position, at least, where only the triangles at the positions are made
 _CHUNK = 1 << 18  # positions that are interpolated at once: bounds the memory
-_OUTSIDE, _IN_SQUARE = -1, -2  # instead of a triangle's number
+
+# Instead of a triangle's number:
+_OUTSIDE = -1
+_IN_SQUARE = -2
+
+# What is found of points, as long as these points are in use.
 _TRIANGULATIONS = WeakKeyDictionary[SparsePoints, "Triangulation"]()
 _DISTINCT = WeakKeyDictionary[SparsePoints, SparsePoints]()
 _NEIGHBOURS = WeakKeyDictionary[SparsePoints, Tensor]()
@@ -65,10 +70,10 @@ def triangulation_of(points: SparsePoints) -> Triangulation:
 
     An expert, its validation, the baseline and the standard deviation interpolate in it.
     """
-    known = _TRIANGULATIONS.get(points)
-    if known is None:
-        known = _TRIANGULATIONS[points] = Triangulation(points)
-    return known
+    triangulation = _TRIANGULATIONS.get(points)
+    if triangulation is None:
+        triangulation = _TRIANGULATIONS[points] = Triangulation(points)
+    return triangulation
 
 
 class Triangulation:
@@ -96,7 +101,7 @@ class Triangulation:
         """Returns depth (H, W) float32 metres at every pixel, computed once."""
         if space not in self._dense:
             pixels = pixels_of(self._points.size).numpy()
-            depth = self._depth(pixels, self._pixels(), space)
+            depth = self._depth(pixels, self._locate_pixels(), space)
             self._dense[space] = depth.reshape(self._points.size)
         return self._dense[space]
 
@@ -106,13 +111,14 @@ class Triangulation:
         Where the last coordinates lie is remembered: an expert, the baseline and the standard
         deviation ask for the same validation points.
         """
-        here = xy.cpu().double().numpy()
+        coordinates = xy.cpu().double().numpy()
         if self._asked is None or self._asked[0] is not xy:
-            positions, number = Positions.of(here)
-            few = len(self._rim) > _FEW * len(here)
-            triangles = self._triangles_at(here) if few else self._triangles
-            self._asked = xy, self._located(here, triangles, positions, number)
-        return self._depth(here, self._asked[1], space)
+            positions, number = Positions.of(coordinates)
+            is_few = len(self._rim) > _FEW * len(coordinates)
+            triangles = self._triangles_at(coordinates) if is_few else self._triangles
+            self._asked = (xy, self._locate(coordinates, triangles, positions, number))
+        _, located = self._asked
+        return self._depth(coordinates, located, space)
 
     @functools.cached_property
     def _rim(self) -> Numbers:
@@ -127,17 +133,16 @@ class Triangulation:
     def _triangles_at(self, xy: Floats) -> Numbers:
         """Those of the same triangles that hold any of the positions (M, 2)."""
         if self._grid is not None:
-            inside, _, _ = self._grid.squares(xy)
-            xy = xy[~inside]
+            xy = xy[~self._grid.squares(xy).inside]
         return self._rim[delaunay_at(self._xy[self._rim], xy)]
 
-    def _pixels(self) -> _Located:
+    def _locate_pixels(self) -> _Located:
         """Where each pixel lies, row after row."""
         rows, columns = (np.arange(float(count)) for count in self._points.size)
         pixels = pixels_of(self._points.size).numpy()
-        return self._located(pixels, self._triangles, Positions(columns=columns, rows=rows))
+        return self._locate(pixels, self._triangles, Positions(columns=columns, rows=rows))
 
-    def _located(
+    def _locate(
         self,
         xy: Floats,
         triangles: Numbers,
@@ -145,29 +150,34 @@ class Triangulation:
         number: Numbers | slice = slice(None),  # of the position of each of xy
     ) -> _Located:
         """In which triangle or square, or near which point, each position (M, 2) lies."""
-        held = cover(self._xy[triangles], positions)[number]
+        triangle = cover(self._xy[triangles], positions)[number]
         if self._grid is not None:
-            held = np.where(self._grid.squares(xy)[0], _IN_SQUARE, held)
-        outside = torch.from_numpy(xy[held == _OUTSIDE])
+            triangle = np.where(self._grid.squares(xy).inside, _IN_SQUARE, triangle)
+        outside = torch.from_numpy(xy[triangle == _OUTSIDE])
         nearest = np.empty(0, np.intp)
         if len(outside):
-            nearest = nearest_points(self._points, outside, 1)[1][:, 0].numpy()
-        return _Located(triangles, held.astype(np.int32), nearest)
+            _, near = nearest_points(self._points, outside, 1)
+            nearest = near[:, 0].numpy()
+        return _Located(triangles, triangle.astype(np.int32), nearest)
 
     def _depth(self, xy: Floats, where: _Located, space: str) -> Tensor:
         """(M,) metres at positions (M, 2) that are located."""
         depth = self._points.depth.cpu().double()
-        value, result = to_space(depth, space).numpy(), np.empty(len(xy))
+        value = to_space(depth, space).numpy()
+        # Means of the values at the corners of triangles and squares.
+        result = np.empty(len(xy))
         for first in range(0, len(result), _CHUNK):
-            some = slice(first, first + _CHUNK)
-            at, number, part = xy[some], where.number[some], result[some]
+            chunk = slice(first, first + _CHUNK)
+            mean = result[chunk]  # a view, to be filled
+            number = where.number[chunk]
             in_triangle = number >= 0
             corners = where.triangles[number[in_triangle]]
-            shares = barycentric(self._xy[corners], at[in_triangle])
-            part[in_triangle] = (shares * value[corners]).sum(axis=1)
+            shares = barycentric(self._xy[corners], xy[chunk][in_triangle])
+            mean[in_triangle] = (shares * value[corners]).sum(axis=1)
             if self._grid is not None:
-                in_square, corners, shares = self._grid.squares(at)
-                part[in_square] = (shares * value[corners]).sum(axis=1)
+                squares = self._grid.squares(xy[chunk])
+                mean[squares.inside] = (squares.shares * value[squares.corners]).sum(axis=1)
+        # As depth, which outside is that of the nearest point.
         dense = from_space(torch.from_numpy(result), space)
         dense[torch.from_numpy(where.number == _OUTSIDE)] = depth[torch.from_numpy(where.nearest)]
         return dense.float().to(self._points.depth.device)
@@ -182,6 +192,17 @@ class _Located(NamedTuple):
     """(M,) of the triangle that holds the position, or `_IN_SQUARE`, or `_OUTSIDE`."""
     nearest: Numbers
     """Number of the point nearest to each position outside."""
+
+
+class _Squares(NamedTuple):
+    """Which of M positions are in full squares of a grid, and what is interpolated in these."""
+
+    inside: NDArray[np.bool_]
+    """(M,) true for K positions."""
+    corners: Numbers
+    """(K, 4) numbers of the points at the corners."""
+    shares: Floats
+    """(K, 4) weights of bilinear interpolation."""
 
 
 class _Grid(NamedTuple):
@@ -207,7 +228,9 @@ class _Grid(NamedTuple):
         number[row, column] = np.arange(len(xy))
         known = number >= 0
         full = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
-        return cls(columns=columns, rows=rows, number=number, full=full) if full.any() else None
+        if not full.any():
+            return None
+        return cls(columns=columns, rows=rows, number=number, full=full)
 
     def rim(self) -> Numbers:
         """Returns the numbers of the points that are not surrounded by four full squares."""
@@ -215,19 +238,16 @@ class _Grid(NamedTuple):
         inner = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
         return self.number[(self.number >= 0) & ~inner]
 
-    def squares(self, xy: Floats) -> tuple[NDArray[np.bool_], Numbers, Floats]:
-        """Returns which positions (M, 2) are in full squares; the corners of these, and weights.
-
-        The corners are points' numbers (K, 4), the weights (K, 4) those of bilinear interpolation.
-        """
-        (column, right), (row, down) = (
-            _between(nodes, at) for nodes, at in zip((self.columns, self.rows), xy.T, strict=True)
-        )
+    def squares(self, xy: Floats) -> _Squares:
+        """Returns which positions (M, 2) are in full squares, with corners and weights."""
+        column, right = _between(self.columns, xy[:, 0])
+        row, down = _between(self.rows, xy[:, 1])
         inside = self.full[row, column] & ~np.isnan(right + down)
         row, column, right, down = row[inside], column[inside], right[inside], down[inside]
+        # Upper left, upper right, lower left, lower right.
         corners = [self.number[row + i, column + j] for i in (0, 1) for j in (0, 1)]
         shares = [y * x for y in (1 - down, down) for x in (1 - right, right)]
-        return inside, np.stack(corners, axis=1), np.stack(shares, axis=1)
+        return _Squares(inside, np.stack(corners, axis=1), np.stack(shares, axis=1))
 
 
 def _between(nodes: Floats, at: Floats) -> tuple[Numbers, Floats]:
@@ -236,8 +256,8 @@ def _between(nodes: Floats, at: Floats) -> tuple[Numbers, Floats]:
     NaN before the first and behind the last node.
     """
     number = np.searchsorted(nodes, at, "right").clip(1, len(nodes) - 1) - 1
-    part = (at - nodes[number]) / (nodes[number + 1] - nodes[number])
-    return number, np.where((part >= 0) & (part <= 1), part, np.nan)
+    fraction = (at - nodes[number]) / (nodes[number + 1] - nodes[number])
+    return number, np.where((fraction >= 0) & (fraction <= 1), fraction, np.nan)
 
 
 def in_hull(points: SparsePoints) -> Tensor:
@@ -262,10 +282,10 @@ def distinct(points: SparsePoints) -> SparsePoints:
     Raises:
         NoPointsError: There is no point.
     """
-    known = _DISTINCT.get(points)
-    if known is None:
-        known = _DISTINCT[points] = _ordered(points)
-    return known
+    ordered = _DISTINCT.get(points)
+    if ordered is None:
+        ordered = _DISTINCT[points] = _order(points)
+    return ordered
 
 
 def neighbours_of(points: SparsePoints, count: int) -> Tensor:
@@ -273,22 +293,24 @@ def neighbours_of(points: SparsePoints, count: int) -> Tensor:
 
     The largest count is remembered as long as the points are in use.
     """
-    known = _NEIGHBOURS.get(points)
-    if known is None or known.shape[1] < count:
+    neighbours = _NEIGHBOURS.get(points)
+    if neighbours is None or neighbours.shape[1] < count:
         _, near = nearest_points(points, points.xy.double(), count + 1)
-        known = _NEIGHBOURS[points] = near[:, 1:]
-    return known[:, :count]
+        neighbours = _NEIGHBOURS[points] = near[:, 1:]  # the nearest is the point itself
+    return neighbours[:, :count]
 
 
-def _ordered(points: SparsePoints) -> SparsePoints:
+def _order(points: SparsePoints) -> SparsePoints:
     """The points ordered by coordinates, the nearest of several at the same ones."""
     if not len(points):
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
-    xy, depth = points.xy.cpu().numpy(), points.depth.cpu().numpy()
+    xy = points.xy.cpu().numpy()
+    depth = points.depth.cpu().numpy()
     order = np.lexsort(xy.T[::-1])  # faster than torch.unique
     xy, depth = xy[order], depth[order]
-    new = np.append(True, (xy[1:] != xy[:-1]).any(axis=1))
-    (first,) = new.nonzero()
+    # The first of each run of equal coordinates, and the least depth of the run.
+    is_first = np.append(True, (xy[1:] != xy[:-1]).any(axis=1))
+    (first,) = is_first.nonzero()
     return SparsePoints(
         xy=torch.from_numpy(xy[first]).to(points.xy.device),
         depth=torch.from_numpy(np.minimum.reduceat(depth, first)).to(points.depth.device),

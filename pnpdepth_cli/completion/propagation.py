@@ -26,9 +26,11 @@ from pnpdepth_cli.completion.gaussian_process import DEPTH, Residuals
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 
-# Of the lines; chosen on rendered frames, with predictions of three networks and a synthetic one.
+# The lines were chosen on rendered frames, with predictions of three networks and a synthetic one.
 NEIGHBOURS = 12
+"""Points that a line is fitted to."""
 POWER = 3.0
+"""Power of the distance by which a point counts less."""
 RIDGE = 0.03
 """Against the variance of x among the points of a pixel, in units of its variance among all."""
 _LINES = 400_000  # that are fitted; with more pixels, lines are interpolated
@@ -49,11 +51,12 @@ def local_lines(
     """
     if xy is not None:
         return _lines_at(xy.cpu().double(), points, residual, z, inlier_weight)
+    # Lines around the nodes of a grid, which are interpolated where it has fewer than pixels.
     height, width = points.size
     step = math.ceil(math.sqrt(height * width / _LINES))
     rows, columns = (
-        torch.linspace(0, n - 1, math.ceil((n - 1) / step) + 1, dtype=torch.float64)
-        for n in points.size
+        torch.linspace(0, side - 1, math.ceil((side - 1) / step) + 1, dtype=torch.float64)
+        for side in (height, width)
     )
     nodes = torch.cartesian_prod(rows, columns).flip(1)
     lines = torch.stack(_lines_at(nodes, points, residual, z, inlier_weight))
@@ -70,12 +73,14 @@ def _lines_at(
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
     weight = distance.clamp_min(_AT_A_POINT).pow(-POWER) * (inlier_weight[near] + _OUTLIER_WEIGHT)
     weight = weight / weight.sum(dim=1, keepdim=True)
+    # Weighted least squares with a ridge, of all nodes at once.
     z, residual = z[near], residual[near]
-    mean_z, mean = ((weight * v).sum(dim=1, keepdim=True) for v in (z, residual))
-    slope = (weight * (z - mean_z) * (residual - mean)).sum(dim=1, keepdim=True) / (
-        (weight * (z - mean_z).square()).sum(dim=1, keepdim=True) + RIDGE
-    )
-    return (mean - slope * mean_z)[:, 0], slope[:, 0]
+    mean_z = (weight * z).sum(dim=1, keepdim=True)
+    mean_residual = (weight * residual).sum(dim=1, keepdim=True)
+    covariance = (weight * (z - mean_z) * (residual - mean_residual)).sum(dim=1, keepdim=True)
+    variance = (weight * (z - mean_z).square()).sum(dim=1, keepdim=True)
+    slope = covariance / (variance + RIDGE)
+    return (mean_residual - slope * mean_z)[:, 0], slope[:, 0]
 
 
 def _by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:

@@ -59,8 +59,9 @@ class ResidualField:
         keys = _coordinate_keys(self.at_points.points)
         inliers = _coordinate_keys(self.at_inliers.points)
         outlying = keys[~torch.isin(keys, inliers)]
-        own = _coordinate_keys(self.points.tensors())
-        return torch.isin(own, outlying).to(self.points.xy.device)
+        # Of points at the same coordinates one has a residual, which speaks for all of them.
+        all_keys = _coordinate_keys(self.points.tensors())
+        return torch.isin(all_keys, outlying).to(self.points.xy.device)
 
     def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
         """Returns the residual (H, W), or (M,) at the coordinates of M points.

@@ -50,7 +50,8 @@ def fit_location(values: Tensor) -> float:
     for _ in range(_STEPS):
         errors = values - location
         weights = _weights(errors, _width(errors))
-        before, location = location, (weights @ values) / weights.sum()
+        before = location
+        location = (weights @ values) / weights.sum()
         if abs(float(location - before)) <= _CONVERGED:
             break
     return float(location)
@@ -74,7 +75,7 @@ def fit_line(x: Tensor, y: Tensor, space: str, limits: tuple[float, float]) -> t
     through_two = task.least_median()
     if through_two is not None:
         starts.append(through_two)
-    ends = [task.minimised(*start) for start in starts]
+    ends = [task.minimise(*start) for start in starts]
     return min(ends, key=lambda line: mean_error(task.errors(*line)))
 
 
@@ -82,8 +83,10 @@ class _Line:
     """A line to be fitted; the arguments are those of `fit_line`."""
 
     def __init__(self, x: Tensor, y: Tensor, space: str, limits: tuple[float, float]) -> None:
-        self._x, self._y = x, y
-        self._space, self._limits = space, limits
+        self._x = x
+        self._y = y
+        self._space = space
+        self._limits = limits
         self._log_y = self._log(y)
 
     def errors(self, scale: float, shift: float) -> Tensor:
@@ -106,6 +109,7 @@ class _Line:
         if len(x) > _SCORED:
             kept = torch.randperm(len(x), generator=generator)[:_SCORED]
             x, y, log_y = x[kept], y[kept], log_y[kept]
+        # Pairs of points, and the lines through them.
         first, second = torch.triu_indices(len(x), len(x), 1)
         if len(first) > _PAIRS:
             drawn = torch.randperm(len(first), generator=generator)[:_PAIRS]
@@ -116,11 +120,12 @@ class _Line:
             return None
         scale = (y[first] - y[second]) / (x[first] - x[second])
         shift = y[first] - scale * x[first]
+        # The line that half of the points are nearest to.
         errors = self._log(scale[:, None] * x + shift[:, None]) - log_y
         best = errors.abs().median(dim=1).values.argmin()
         return float(scale[best]), float(shift[best])
 
-    def minimised(self, scale: float, shift: float) -> tuple[float, float]:
+    def minimise(self, scale: float, shift: float) -> tuple[float, float]:
         """Returns the minimum of the loss that Gauss-Newton steps reach from a line."""
         errors = self.errors(scale, shift)
         for _ in range(_STEPS):
@@ -145,12 +150,15 @@ class _Line:
                     break
             else:
                 break
-            scale, shift, errors = scale + size * more_scale, shift + size * more_shift, nearer
+            scale += size * more_scale
+            shift += size * more_shift
+            errors = nearer
             if loss - lower < _CONVERGED * loss:
                 break
         return scale, shift
 
     def _log(self, line: Tensor) -> Tensor:
+        """The logarithm of values of y, clamped to the limits."""
         line = line.clamp(*self._limits)
         return line if self._space == "log" else line.log()
 
@@ -158,7 +166,8 @@ class _Line:
 def _weighted(x: Tensor, y: Tensor, weights: Tensor) -> tuple[float, float]:
     """Weighted least squares of y = scale·x + shift; the scale is 0 where x is the same."""
     total = weights.sum()
-    mean_x, mean_y = (weights @ x) / total, (weights @ y) / total
+    mean_x = (weights @ x) / total
+    mean_y = (weights @ y) / total
     spread = weights @ (x - mean_x).square()
     if not float(spread) > 0:
         return 0.0, float(mean_y)
@@ -177,4 +186,5 @@ def _weights(errors: Tensor, width: float) -> Tensor:
 
 
 def _loss(errors: Tensor, width: float) -> float:
+    """Cauchy's loss of the errors, up to a factor."""
     return float((errors / width).square().log1p().sum())

@@ -27,6 +27,11 @@ _NEAREST = 16  # points around a position whose triangles are tried,
 _TRIALS = 8  # with as many more, so often; then all points are triangulated
 _EMPTY = 1e-10  # of a circle's radius, that a point may be within it by rounding
 
+# Odd factors that mix bits well, as hash functions have them (SplitMix64, xxHash).
+_FACTOR_OF_X = np.uint64(0x9E3779B97F4A7C15)
+_FACTOR_OF_Y = np.uint64(0xC2B2AE3D27D4EB4F)
+_FACTOR_OF_STATE = np.uint64(0xBF58476D1CE4E5B9)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Positions:
@@ -83,15 +88,14 @@ def delaunay(xy: Floats) -> Numbers:
         triangles: Numbers = Delaunay(moved(xy)).simplices.astype(np.intp)
     except QhullError:
         return np.empty((0, 3), np.intp)
+    # Their heights over their longest sides.
     a, b, c = np.moveaxis(xy[triangles], 1, 0)
-    longest = np.sqrt(np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], 0))
+    squared_sides = [((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))]
+    longest = np.sqrt(np.max(squared_sides, axis=0))
     height = np.abs(_cross(b - a, c - a)) / longest
-    return np.concatenate(
-        [
-            triangles[(height > _SLIVER_PX) & (height <= _THIN_PX)],
-            triangles[height > _THIN_PX],
-        ]
-    )
+    # Slivers are left out.
+    thin = triangles[(height > _SLIVER_PX) & (height <= _THIN_PX)]
+    return np.concatenate([thin, triangles[height > _THIN_PX]])
 
 
 def delaunay_at(xy: Floats, positions: Floats) -> Numbers:
@@ -107,13 +111,16 @@ def delaunay_at(xy: Floats, positions: Floats) -> Numbers:
     except QhullError:
         return np.empty((0, 3), np.intp)
     places = positions
-    where, _ = Positions.of(positions)
+    sought, _ = Positions.of(positions)
     for trial in range(1, _TRIALS + 1):
-        near = tree.query(places, np.arange(1, min(trial * _NEAREST, len(xy)) + 1), workers=-1)[1]
+        # The triangles of points around these places that hold a position.
+        ranks = np.arange(1, min(trial * _NEAREST, len(xy)) + 1)
+        _, near = tree.query(places, ranks, workers=-1)
         chosen = np.union1d(chosen, near)
         triangles = chosen[delaunay(xy[chosen])]
-        number = cover(xy[triangles], where)
+        number = cover(xy[triangles], sought)
         triangles = triangles[np.unique(number[number >= 0])]
+        # They are Delaunay's of all points if no point is inside their circles.
         centre, radius = circles(shifted[triangles])
         distance, _ = tree.query(centre, workers=-1)
         is_empty = distance >= radius * (1 - _EMPTY)
@@ -125,12 +132,14 @@ def delaunay_at(xy: Floats, positions: Floats) -> Numbers:
 
 def moved(xy: Floats) -> Floats:
     """Returns the coordinates (N, 2), each moved by a number made of both, at random to the eye."""
+    # The bits of x and y, mixed by multiplications; 0 is added so that −0 has the bits of 0.
     bits = (xy.astype(np.float32) + np.float32(0)).view(np.uint32).astype(np.uint64)
-    state = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) + bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
+    state = bits[:, 0] * _FACTOR_OF_X + bits[:, 1] * _FACTOR_OF_Y
     for _ in range(2):
-        state = (state ^ (state >> np.uint64(31))) * np.uint64(0xBF58476D1CE4E5B9)
-    both = np.stack([state >> np.uint64(32), state & np.uint64(0xFFFFFFFF)], axis=1)
-    return xy + _MOVED_PX * (both.astype(np.float64) / 2**32 - 0.5)
+        state = (state ^ (state >> np.uint64(31))) * _FACTOR_OF_STATE
+    # The upper and the lower half as two numbers from −½ to ½.
+    halves = np.stack([state >> np.uint64(32), state & np.uint64(0xFFFFFFFF)], axis=1)
+    return xy + _MOVED_PX * (halves.astype(np.float64) / 2**32 - 0.5)
 
 
 def cover(corners: Floats, positions: Positions) -> Numbers:
@@ -160,9 +169,12 @@ def barycentric(corners: Floats, xy: Floats) -> Floats:
 
 def circles(corners: Floats) -> tuple[Floats, Floats]:
     """Returns the centre (T, 2) and the radius (T,) of the circles through triangles (T, 3, 2)."""
+    # In coordinates in which the first corner is 0.
     a = corners[:, 0]
-    b, c = corners[:, 1] - a, corners[:, 2] - a
-    square_b, square_c = (b**2).sum(axis=1), (c**2).sum(axis=1)
+    b = corners[:, 1] - a
+    c = corners[:, 2] - a
+    square_b = (b**2).sum(axis=1)
+    square_c = (c**2).sum(axis=1)
     x = c[:, 1] * square_b - b[:, 1] * square_c
     y = b[:, 0] * square_c - c[:, 0] * square_b
     centre = np.stack([x, y], axis=1) / (2 * _cross(b, c))[:, None]
@@ -171,40 +183,43 @@ def circles(corners: Floats) -> tuple[Floats, Floats]:
 
 def _spans(corners: Floats, positions: Positions) -> Iterator[Spans]:
     """The positions in triangles (T, 3, 2), larger by `_SLIVER_PX` on each side; some at once."""
-    # The corners of each, from the top.
+    # The corners of each triangle, from the top.
     order = corners[:, :, 1].argsort(axis=1)
     (x0, y0), (x1, y1), (x2, y2) = np.moveaxis(
         np.take_along_axis(corners, order[:, :, None], axis=1), 0, 2
     )
-    # How far its edges go to the right from row to row.
-    whole, upper, lower = (
-        np.divide(dx, dy, out=np.zeros_like(dx), where=dy > 0)
-        for dx, dy in ((x2 - x0, y2 - y0), (x1 - x0, y1 - y0), (x2 - x1, y2 - y1))
-    )
-    # Which rows of positions it reaches.
+    # How far its edges go to the right from row to row: the long one, and the two on its side.
+    long_slope = _slope(x2 - x0, y2 - y0)
+    upper_slope = _slope(x1 - x0, y1 - y0)
+    lower_slope = _slope(x2 - x1, y2 - y1)
+    # Which rows of positions it reaches, and triangles for about so many rows at once.
     top = np.searchsorted(positions.rows, y0 - _SLIVER_PX)
     rows = np.searchsorted(positions.rows, y2 + _SLIVER_PX, "right") - top
     total = rows.cumsum()
-    parts = np.searchsorted(total, np.arange(_SPANS, total[-1] if len(total) else 0, _SPANS))
-    for some in np.split(np.arange(len(corners)), parts):
-        # In each row, from where to where its edges cross it.
+    cuts = np.searchsorted(total, np.arange(_SPANS, total[-1] if len(total) else 0, _SPANS))
+    for some in np.split(np.arange(len(corners)), cuts):
+        # A span for each triangle and each of its rows.
         t = np.repeat(some, rows[some])
-        row = np.arange(len(t)) + np.repeat(
-            top[some] - rows[some].cumsum() + rows[some], rows[some]
-        )
+        first_span = rows[some].cumsum() - rows[some]
+        row = np.arange(len(t)) + np.repeat(top[some] - first_span, rows[some])
+        # From where to where the triangle's edges cross the row.
         y = positions.rows[row].clip(y0[t], y2[t])
-        on_upper = x0[t] + (y - y0[t]) * upper[t]
-        on_lower = x1[t] + (y - y1[t]) * lower[t]
-        of_two, of_one = np.where(y < y1[t], on_upper, on_lower), x0[t] + (y - y0[t]) * whole[t]
-        left, right = (
-            np.minimum(of_one, of_two) - _SLIVER_PX,
-            np.maximum(of_one, of_two) + _SLIVER_PX,
-        )
+        on_long = x0[t] + (y - y0[t]) * long_slope[t]
+        on_upper = x0[t] + (y - y0[t]) * upper_slope[t]
+        on_lower = x1[t] + (y - y1[t]) * lower_slope[t]
+        on_short = np.where(y < y1[t], on_upper, on_lower)
+        left = np.minimum(on_long, on_short) - _SLIVER_PX
+        right = np.maximum(on_long, on_short) + _SLIVER_PX
         # Which positions are between.
         first = positions.first_after(row, np.searchsorted(positions.columns, left))
         behind = positions.first_after(row, np.searchsorted(positions.columns, right, "right"))
-        found = behind > first
-        yield Spans(t[found], first[found], (behind - first)[found])
+        has_any = behind > first
+        yield Spans(t[has_any], first[has_any], (behind - first)[has_any])
+
+
+def _slope(dx: Floats, dy: Floats) -> Floats:
+    """dx / dy; 0 for edges along a row."""
+    return np.divide(dx, dy, out=np.zeros_like(dx), where=dy > 0)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:

@@ -59,10 +59,12 @@ def influential_fields(
         layers: Layers as `Split` takes them.
         prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
     """
-    follower, cuts = _Follower(), dict[str, CutPoint]()
+    cuts: dict[str, CutPoint] = {}
     for layer in layers:
         with suppress(ModelError):
             cuts[layer] = CutPoint.find(module, layer)
+    # One pass, which follows the output of every layer from the hook of that layer on.
+    follower = _Follower()
     with ExitStack() as hooks, torch.no_grad(), wrap_user_errors("the network's forward"):
         for cut in cuts.values():
             if not isinstance(cut.module, torch.jit.ScriptModule):
@@ -79,42 +81,53 @@ def influential_fields(
 def _field(spreads: list[Spread], shape: torch.Size, prediction: Tensor) -> Field:
     """The field of a layer whose output has this shape."""
     patches = [_patches(spreads, prediction, position) for position in _POSITIONS]
-    in_z, in_output = (_largest(patch) for patch in zip(*patches, strict=True))
-    has_map = len(shape) == 4
-    stride = prediction.shape[-2] / max(1, shape[-2]) if has_map else 0.0
-    return Field(in_z if has_map else None, in_output, stride)
+    in_z = _largest([patch.in_z for patch in patches])
+    in_output = _largest([patch.in_output for patch in patches])
+    if len(shape) != 4:  # z has no rows and columns
+        return Field(None, in_output, stride=0.0)
+    return Field(in_z, in_output, stride=prediction.shape[-2] / max(1, shape[-2]))
 
 
-def _patches(
-    spreads: list[Spread], prediction: Tensor, position: tuple[float, float]
-) -> tuple[Patch, Patch]:
-    """The patch of z that one point of the prediction depends on, and that of the output."""
-    in_z, in_output = [0, 0], [0, 0]
+class _Patches(NamedTuple):
+    """What one point influences: a patch of z in elements, and of the output in pixels."""
+
+    in_z: Patch
+    in_output: Patch
+
+
+def _patches(spreads: list[Spread], prediction: Tensor, position: tuple[float, float]) -> _Patches:
+    """The patches of a point at this position of the prediction, from its gradient and back."""
+    in_z = [0, 0]
+    in_output = [0, 0]
     for side, fraction in enumerate(position):
         # The spreads are those of the rows of z and of its columns, or of z as a whole.
         axis = prediction.ndim - 2 + side
         for spread in spreads[side : side + 1] or spreads:
             first, last = spread.first[:, axis], spread.last[:, axis]
             point = int(prediction.shape[axis] * fraction)
+            # The rows of z on which the point depends, then what depends on those rows.
             reached = ((first <= point) & (point <= last)).nonzero()
             if len(reached):
                 in_z[side] = int(reached[-1] - reached[0]) + 1
                 in_output[side] = int(last[reached].max() - first[reached].min()) + 1
     if not all(in_z):
-        return (0, 0), (0, 0)
-    return (in_z[0], in_z[1]), (in_output[0], in_output[1])
+        return _Patches((0, 0), (0, 0))
+    return _Patches((in_z[0], in_z[1]), (in_output[0], in_output[1]))
 
 
-def _largest(patches: Iterable[Patch]) -> Patch:
-    heights, widths = zip(*patches, strict=True)
-    return max(heights), max(widths)
+def _largest(patches: Sequence[Patch]) -> Patch:
+    """The largest height and the largest width, which may be of two patches."""
+    return max(height for height, _ in patches), max(width for _, width in patches)
 
 
 _Geometry = tuple[int, torch.Size, tuple[int, ...]]
 """Offset, shape and strides of a tensor in its storage."""
 
+_ROWS = 0
+_COLUMNS = 1
+
 _Source = tuple[str, int]
-"""A layer, and 0 for the rows of its output or 1 for the columns."""
+"""A layer, and `_ROWS` of its output, also for all of an output without rows, or `_COLUMNS`."""
 
 
 class _Follower(TorchDispatchMode):
@@ -133,7 +146,8 @@ class _Follower(TorchDispatchMode):
         """Shapes of the outputs of the layers that ran."""
         self.calls: Counter[str] = Counter()
         """How often each layer ran."""
-        self._known: dict[int, dict[_Geometry, dict[_Source, Spread]]] = {}
+        self._followed: dict[int, dict[_Geometry, dict[_Source, Spread]]] = {}
+        """Spreads of tensors by storage, place in it, and source."""
 
     def begin(self, cut: CutPoint, _module: nn.Module, _inputs: object, output: object) -> None:
         """Follows a layer's output from here on, if this is the call that is cut at; a hook."""
@@ -142,17 +156,21 @@ class _Follower(TorchDispatchMode):
             return
         with suppress(ModelError):
             _, z = cut.choose(output)
-            spreads = [Spread.whole(z.shape or (1,), 1)]
-            if z.ndim == 4:
-                spreads = [Spread.of_axis(z.shape, 2), Spread.of_axis(z.shape, 3)]
             self.shapes[cut.layer] = z.shape
-            known = self._spreads_of(z)
-            known.update({(cut.layer, side): each for side, each in enumerate(spreads)})
+            spreads = self._spreads_of(z)
+            if z.ndim == 4:
+                spreads[cut.layer, _ROWS] = Spread.of_axis(z.shape, 2)
+                spreads[cut.layer, _COLUMNS] = Spread.of_axis(z.shape, 3)
+            else:
+                spreads[cut.layer, _ROWS] = Spread.whole(z.shape or (1,), 1)
 
     def followed(self, layer: str, tensor: Tensor) -> list[Spread]:
-        """Returns where a tensor depends on the rows and the columns of a layer's output."""
-        known = self._spreads_of(tensor)
-        return [known[layer, side] for side in range(2) if (layer, side) in known]
+        """Returns where a tensor depends on the rows and the columns of a layer's output.
+
+        One spread if the output has no rows and columns; none if the tensor does not depend on it.
+        """
+        spreads = self._spreads_of(tensor)
+        return [spreads[layer, side] for side in (_ROWS, _COLUMNS) if (layer, side) in spreads]
 
     def __torch_dispatch__(
         self,
@@ -167,35 +185,39 @@ class _Follower(TorchDispatchMode):
             (int(path[0]) if len(path) == 1 else None, tensor) for path, tensor in tensors_in(args)
         ]
         inputs += [(None, tensor) for _, tensor in tensors_in(kwargs)]
+        # Their spreads are copied first, as the operation may change an input in place.
         before = [(index, tensor, dict(self._spreads_of(tensor))) for index, tensor in inputs]
         result = func(*args, **kwargs)
         storages = {_storage(tensor) for _, tensor in inputs}
         for position, (_, output) in enumerate(tensors_in(result)):
-            found = dict[_Source, Spread]()
-            for index, tensor, known in before:
-                for source, spread in known.items():
+            # Where the output depends on each source, through any of the inputs.
+            output_spreads: dict[_Source, Spread] = {}
+            for index, tensor, input_spreads in before:
+                for source, spread in input_spreads.items():
                     moved = spread_of(func, args, index, tensor, spread, output, position)
                     if moved is not None:
-                        found[source] = moved.joined(found.get(source))
+                        output_spreads[source] = moved.joined(output_spreads.get(source))
             if _storage(output) not in storages:
-                self._known[_storage(output)] = {}  # new memory, where nothing else is known
+                self._followed[_storage(output)] = {}  # new memory; what was there before is gone
             elif func._schema.is_mutable:
-                self._spoil(output, found)
-            self._known.setdefault(_storage(output), {})[_geometry(output)] = found
+                self._spoil(output, output_spreads)
+            self._followed.setdefault(_storage(output), {})[_geometry(output)] = output_spreads
         return result
 
     def _spreads_of(self, tensor: Tensor) -> dict[_Source, Spread]:
-        places = self._known.setdefault(_storage(tensor), {})
+        """The spreads of a tensor by source, to read and to change; empty where it has none."""
+        places = self._followed.setdefault(_storage(tensor), {})
         return places.setdefault(_geometry(tensor), {})
 
     def _spoil(self, written: Tensor, spreads: dict[_Source, Spread]) -> None:
         """Notes a change in place: other views of the same memory may depend on all of it."""
-        for (_, shape, _), known in self._known.get(_storage(written), {}).items():
+        for (_, shape, _), view_spreads in self._followed.get(_storage(written), {}).items():
             for source, spread in spreads.items():
-                known[source] = Spread.whole(shape or (1,), len(spread.first))
+                view_spreads[source] = Spread.whole(shape or (1,), len(spread.first))
 
 
 def _storage(tensor: Tensor) -> int:
+    """A number that tensors in the same memory share."""
     try:
         return int(tensor.untyped_storage()._cdata)
     except NotImplementedError:  # a sparse tensor has none
@@ -203,7 +225,7 @@ def _storage(tensor: Tensor) -> int:
 
 
 def _geometry(tensor: Tensor) -> _Geometry:
-    strided = tensor.layout == torch.strided
-    if not strided:
+    """Where in its storage a tensor lies; a sparse tensor is told by its shape alone."""
+    if tensor.layout != torch.strided:
         return 0, tensor.shape, ()
     return int(tensor.storage_offset()), tensor.shape, tensor.stride()

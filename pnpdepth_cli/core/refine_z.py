@@ -72,12 +72,15 @@ def refine(
     # z_0 = f_front(x)
     with torch.no_grad():
         z = split.front(*arguments) if z0 is None else z0
-    step, loss_of = step_size(settings.lr, z), checked_loss(settings.loss)
+    step = step_size(settings.lr, z)
+    loss_of = checked_loss(settings.loss)
     rule: Update = UPDATES[settings.update]()
     scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
-    so_far: Refinement | None = None
+    before: Tensor | None = None
     losses: tuple[float, ...] = ()
-    for updates in range(settings.iterations + 1):
+    so_far: Refinement | None = None
+    updates = 0
+    while True:
         is_last = updates == settings.iterations
         # The depth f_rear(z_k) and its loss L at the points.
         z = z.detach() if is_last else z.detach().requires_grad_(True)
@@ -92,15 +95,17 @@ def refine(
                         " points, before any update of z; are its weights, its input range"
                         " (`normalise`) and precision right?"
                     )
-                points, at_points = points.select(known), at_points[known]
+                points = points.select(known)
+                at_points = at_points[known]
             loss = loss_of(at_points, points.depth)
         if settings.iterations and not bool(loss.isfinite()):
             raise _diverged("loss", updates, step, so_far)
-        after, losses = depth.detach(), (*losses, float(loss.detach()))
-        before = after if so_far is None else so_far.before
+        after = depth.detach()
+        before = after if before is None else before
+        losses = (*losses, float(loss.detach()))
         so_far = Refinement(before=before, after=after, losses=losses, step=step)
         if is_last:
-            break
+            return so_far
         # Its gradient at z_k.
         with torch.enable_grad():
             gradient = gradient_at(z, loss * scale)
@@ -120,13 +125,14 @@ def refine(
                 direction = rule(gradient).reshape(gradient.shape)
             alpha = step * SCHEDULES[settings.schedule](updates / settings.iterations)
             z = z - alpha * direction
-    assert so_far is not None
-    return so_far
+        updates += 1
 
 
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:
+    """The error of a loss or a gradient that is not finite; `so_far` is its `last_good`."""
+    plural = "" if updates == 1 else "s"
     return DivergedError(
-        f"the {quantity} is not finite after {updates} update{'s' if updates != 1 else ''} of z"
-        f" (step {step:.3g}); try a smaller lr or fewer iterations",
+        f"the {quantity} is not finite after {updates} update{plural} of z (step {step:.3g});"
+        " try a smaller lr or fewer iterations",
         so_far,
     )

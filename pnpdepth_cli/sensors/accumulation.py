@@ -33,16 +33,21 @@ from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.sensors.lens import rays_of, unproject
 from pnpdepth_cli.sensors.projection import Mask, Points, points_in_image
 
-# Differences of log depth to a measured point that agree and that contradict. The first was chosen
-# on frames 2 and 4 of a KITTI drive, the second and `_CLOSE` on its frames 0, 2, 4 and 6.
-_TOLERANCE, _CONTRADICTION = 0.05, 0.1
+# Which moved points agree with the measured ones around them.
+_TOLERANCE = 0.05
+"""Difference of log depth to a measured point that agrees; chosen on frames 2 and 4 of a KITTI
+drive."""
+_CONTRADICTION = 0.1
+"""Difference of log depth to a measured point that contradicts; chosen on frames 0, 2, 4 and 6 of
+the drive."""
 _CLOSE = (0.55, 0.37)
-"""Distance across and down within which a measured point contradicts, in mean spacings. Down it is
-less, as the next scan line of a LiDAR lies at another depth."""
+"""Distance across and down within which a measured point contradicts, in mean spacings; chosen on
+the same frames. Down it is less, as the next scan line of a LiDAR lies at another depth."""
+_COMPARED = 4  # nearest measured points that may agree with a moved one
+_AGREEING = 2  # that agree, of those, where the nearest one does not
+_CONTRADICTING = 12  # nearest measured points, of which none may contradict
 
-_COMPARED, _AGREEING = 4, 2  # measured points beside a moved one, of which so many agree
-_CONTRADICTING = 12  # nearest measured points, of which none contradicts
-
+# The registration of a scan to the planes of the frame's own.
 _MIN_PLANES = 200  # pairs of a point and a plane; with fewer the motion is not corrected
 _STEPS = 8
 _NEIGHBOURS = 8  # points that a plane is fitted to,
@@ -52,12 +57,16 @@ _REACH = 1.2  # mean spacings of the points, between a point and the one it is c
 _LEAST_ERROR = 2e-4  # typical distance, fraction of the depth
 _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 
-# Matches that agree with an estimated motion, and their fraction of all; fewer support none.
-_MIN_INLIERS, _MIN_FRACTION = 30, 0.25
+# The motion of images, estimated where no pose is known.
+_MIN_INLIERS = 30  # matches that agree with it; fewer support none
+_MIN_FRACTION = 0.25  # of the matches that agree with it
 _KEYPOINTS = 3000
-_RATIO = 0.8  # Lowe's, of the distances to the nearest and the next descriptor
+_RATIO = 0.8  # of the distances to the nearest and the next descriptor, as Lowe has it
+_ITERATIONS = 1000  # of RANSAC
+_CONFIDENCE = 0.9999  # that RANSAC tried a set of inliers
 _REPROJECTION_PX = 2.0
 _JUMP = 1.1  # ratio of depths of the points around a keypoint
+_LEAST_DISTANCE_PX = 1e-3  # between a keypoint and a point, so that its weight is finite
 
 
 Scan = tuple[Points, Floats]
@@ -78,15 +87,17 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
     """
     result = points
     for apart, scans in sorted(neighbours.items()):
+        # The points of the neighbours that are so many frames away, where this frame has them.
         moved = []
-        for other, motion in scans:
-            xyz = unproject(camera, other.xy, other.depth)
+        for neighbour, motion in scans:
+            xyz = unproject(camera, neighbour.xy, neighbour.depth)
             refined = refine_motion(points, xyz, motion, camera)
             moved.append(xyz @ refined[:, :3].T + refined[:, 3])
         # Those join that agree with measured points, where none is known so far.
         xyz, xy = points_in_image(np.concatenate(moved), camera, points.size)
         agrees = _agrees(xy, xyz[:, 2], points)
-        xy, depth = xy[agrees], xyz[agrees, 2]
+        xy = xy[agrees]
+        depth = xyz[agrees, 2]
         free = cKDTree(result.xy).query(xy)[0] >= apart
         result = replace(
             result,
@@ -99,11 +110,15 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
 def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
     """(M,) true where a moved point agrees with the measured points around it."""
     near = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
-    apart = np.abs(np.log(depth[:, None] / measured.depth[near]))
-    alike = apart[:, :_COMPARED] <= _TOLERANCE
+    difference = np.abs(np.log(depth[:, None] / measured.depth[near]))
+    # The nearest one agrees with it, or several of the nearest do.
+    alike = difference[:, :_COMPARED] <= _TOLERANCE
+    supported = alike[:, 0] | (alike.sum(axis=1) >= _AGREEING)
+    # None that is close in the image has quite another depth.
     offset = np.abs(measured.xy[near] - xy[:, None]) / _spacing_px(measured)
-    contradicted = ((offset <= _CLOSE).all(axis=2) & (apart > _CONTRADICTION)).any(axis=1)
-    agrees: Mask = (alike[:, 0] | (alike.sum(axis=1) >= _AGREEING)) & ~contradicted
+    is_close = (offset <= _CLOSE).all(axis=2)
+    contradicted = (is_close & (difference > _CONTRADICTION)).any(axis=1)
+    agrees: Mask = supported & ~contradicted
     return agrees
 
 
@@ -123,6 +138,7 @@ def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
     The points are `xyz` (N, 3) in the camera's coordinates; the tree is of their pixels.
     """
     near = _nearest(tree, points.xy, _NEIGHBOURS)
+    # The normal is the direction in which the neighbours vary least.
     around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
@@ -136,20 +152,23 @@ def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera)
     The points (M, 3) are in the other camera's coordinates. The motion leads from there to the
     camera that measured the surfaces.
     """
-    given, reach = motion, _REACH * _spacing_px(measured)
-    tree, surface = cKDTree(measured.xy), unproject(camera, measured.xy, measured.depth)
+    reach = _REACH * _spacing_px(measured)
+    tree = cKDTree(measured.xy)
+    surface = unproject(camera, measured.xy, measured.depth)
     normals, flat = _planes(measured, surface, tree)
+    refined = motion
     for _ in range(_STEPS):
         # Pairs of a moved point and a plane, and how far apart they are.
-        moved = xyz @ motion[:, :3].T + motion[:, 3]
+        moved = xyz @ refined[:, :3].T + refined[:, 3]
         moved, xy = points_in_image(moved, camera, measured.size)
-        distance, index = tree.query(xy, distance_upper_bound=reach)
-        near = np.isfinite(distance)
+        distance_px, index = tree.query(xy, distance_upper_bound=reach)
+        near = np.isfinite(distance_px)
         near[near] &= flat[index[near]]
         moved, index = moved[near], index[near]
         if len(index) < _MIN_PLANES:
-            return given
-        normal, depth = normals[index], surface[index, 2]
+            return motion
+        normal = normals[index]
+        depth = surface[index, 2]
         distance = np.einsum("ij,ij->i", moved - surface[index], normal) / depth
         # A step of weighted least squares towards the planes.
         typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
@@ -157,9 +176,9 @@ def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera)
         slope = np.column_stack([np.cross(moved, normal), normal]) / depth[:, None]
         weighted = slope * weight[:, None]
         step = -np.linalg.lstsq(weighted.T @ slope, weighted.T @ distance, rcond=None)[0]
-        motion = Rotation.from_rotvec(step[:3]).as_matrix() @ motion
-        motion[:, 3] += step[3:]
-    return motion
+        refined = Rotation.from_rotvec(step[:3]).as_matrix() @ refined
+        refined[:, 3] += step[3:]
+    return refined
 
 
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
@@ -169,7 +188,8 @@ def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
     keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
     if descriptors is None:
         descriptors = np.empty((0, 128), np.float32)
-    return np.array([each.pt for each in keypoints], np.float64).reshape(-1, 2), descriptors
+    xy = np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
+    return xy, descriptors
 
 
 def motion_of_images(
@@ -180,39 +200,52 @@ def motion_of_images(
     The points are the sparse depth of the other frame; both have the same camera. The motion is
     (3, 4) in metres, and None if it is refused. The text says what supports it, or why it is.
     """
-    at, to = _matches(here, there)
-    depth, known = _depth_at(points, at)
-    at, to, depth = at[known], to[known], depth[known]
-    if len(at) < _MIN_INLIERS:
-        return None, f"{len(at)} matches with depth, at least {_MIN_INLIERS} needed"
-    focal_px = float(camera.intrinsics[0, 0])
-    rays = rays_of(camera, to)
-    solved, turn, shift, index = cv2.solvePnPRansac(
-        unproject(camera, at, depth), rays, np.eye(3), None, iterationsCount=1000,
-        reprojectionError=_REPROJECTION_PX / focal_px, confidence=0.9999,
+    # Keypoints of the other frame, which have its depth, and the rays on which this one sees them.
+    xy_there, xy_here = _matches(here, there)
+    depth, known = _depth_at(points, xy_there)
+    xyz = unproject(camera, xy_there[known], depth[known])
+    rays = rays_of(camera, xy_here[known])
+    if len(xyz) < _MIN_INLIERS:
+        return None, f"{len(xyz)} matches with depth, at least {_MIN_INLIERS} needed"
+    # The motion with most matches; rays are pixels of a camera of focal length 1.
+    solved, rotation, translation, index = cv2.solvePnPRansac(
+        xyz,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=_ITERATIONS,
+        reprojectionError=_REPROJECTION_PX / float(camera.intrinsics[0, 0]),
+        confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+    )
     inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
-    basis = f"{len(inliers)} of {len(at)} matches of the images"
-    if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(at)):
+    basis = f"{len(inliers)} of {len(xyz)} matches of the images"
+    if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(xyz)):
         return None, f"{basis} agree"
-    xyz = unproject(camera, at[inliers], depth[inliers])
-    turn, shift = cv2.solvePnPRefineLM(xyz, rays[inliers], np.eye(3), None, turn, shift)
-    motion = np.column_stack([cv2.Rodrigues(turn)[0], shift])
-    length, median = float(np.linalg.norm(motion[:, 3])), float(np.median(points.depth))
-    if not length <= median:
-        return None, f"{length:.1f} m of motion at a median depth of {median:.1f} m"
+    # Refined with those that agree.
+    rotation, translation = cv2.solvePnPRefineLM(
+        xyz[inliers], rays[inliers], np.eye(3), None, rotation, translation
+    )
+    motion = np.column_stack([cv2.Rodrigues(rotation)[0], translation])
+    # A frame that moved farther than what it sees shares no view with this one.
+    length = float(np.linalg.norm(motion[:, 3]))
+    median_depth = float(np.median(points.depth))
+    if not length <= median_depth:
+        return None, f"{length:.1f} m of motion at a median depth of {median_depth:.1f} m"
     return motion, basis
 
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
     """(M, 2) keypoints of the other image, and (M, 2) their partners in this one."""
-    (to, of_here), (at, of_there) = here, there
-    if min(len(to), len(at)) < 2:
+    xy_here, descriptors_here = here
+    xy_there, descriptors_there = there
+    if min(len(xy_here), len(xy_there)) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(of_there, of_here, k=2)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_there, descriptors_here, k=2)
     clear = [best for best, second in pairs if best.distance < _RATIO * second.distance]
-    return at[[match.queryIdx for match in clear]], to[[match.trainIdx for match in clear]]
+    matched_there = xy_there[[match.queryIdx for match in clear]]
+    matched_here = xy_here[[match.trainIdx for match in clear]]
+    return matched_there, matched_here
 
 
 def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
@@ -222,6 +255,6 @@ def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
     distance, near = cKDTree(points.xy).query(xy, k=4)
     around = points.depth[near].astype(np.float64)
     smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
-    weights = 1 / np.maximum(distance, 1e-3)
+    weights = 1 / np.maximum(distance, _LEAST_DISTANCE_PX)
     depth = weights.sum(axis=1) / (weights / around).sum(axis=1)
     return depth, smooth & (distance[:, 0] < _REACH * _spacing_px(points))

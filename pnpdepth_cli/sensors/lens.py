@@ -18,14 +18,18 @@ from pnpdepth_cli.points import Size
 
 Coefficients = tuple[float, ...]
 
-_WIDEST_PLANE, _WIDEST_ANGLE = 10.0, 1.569
-"""Where a lens is checked: the tangent of the angle to the axis, and that of a fisheye, radians."""
 _RADIAL = (0, 1, 4, 5, 6, 7)  # which coefficients of a radial-tangential lens are radial
 
+# Where a lens is looked at for the angle at which its distortion turns back.
+_WIDEST_PLANE = 10.0  # of a radial-tangential lens: tangent of the angle to the axis
+_WIDEST_ANGLE_RAD = 1.569  # of a fisheye
 _SAMPLES = 8192
+
+# Newton's method for the inverse of a distortion, on the plane z = 1.
 _NEWTON_STEPS = 12
-_NEWTON_STEP = 1e-7
+_NEWTON_DIFFERENCE = 1e-7  # step of the central differences
 _NEWTON_END = 1e-9  # a smaller step leaves an error that is smaller than rounding
+_SHOWN_ERROR = 1e-6  # largest error of a direction that was found
 
 
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
@@ -65,9 +69,10 @@ def _rays_of_image(
     """The rays of a camera that is given by what can be a key."""
     camera = Camera(intrinsics=np.reshape(intrinsics, (3, 3)), lens=lens, distortion=distortion)
     height, width = size
-    column, rays = np.arange(width), np.empty((height, width, 2))
-    for row in range(height):  # little more than the result is in memory
-        rays[row] = rays_of(camera, np.column_stack([column, np.full(width, row)]))
+    columns = np.arange(width)
+    rays = np.empty((height, width, 2))
+    for row in range(height):  # one by one, so that little more than the result is in memory
+        rays[row] = rays_of(camera, np.column_stack([columns, np.full(width, row)]))
     rays.flags.writeable = False
     return rays
 
@@ -95,35 +100,43 @@ def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
 
     Newton's method from the inverse of the radial part; NaN where the lens shows nothing.
     """
-    radius, seen = _radial_curve(lens, coefficients)
-    last = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
+    radius, shown_radius = _radial_curve(lens, coefficients)
+    rising = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
     distance = np.hypot(shown[:, 0], shown[:, 1])
     with np.errstate(all="ignore"):
-        inverse = np.interp(distance, seen[:last], radius[:last])
+        # The start, of a lens without its tangential parts.
+        inverse = np.interp(distance, shown_radius[:rising], radius[:rising])
         plane = shown * np.where(distance > 0, inverse / distance, 1.0)[:, None]
+        # Steps of those directions that still move.
         moving = np.arange(len(plane))
         for _ in range(_NEWTON_STEPS):
             step = _newton_step(plane[moving], shown[moving], lens, coefficients)
             plane[moving] -= step
             moving = moving[np.abs(step).max(axis=1) > _NEWTON_END]
-        plane[~(np.hypot(*(distort(plane, lens, coefficients) - shown).T) < 1e-6)] = np.nan
+        # A direction that the lens does not show there is none.
+        error = np.hypot(*(distort(plane, lens, coefficients) - shown).T)
+        plane[~(error < _SHOWN_ERROR)] = np.nan
     return plane
 
 
 def largest_radius(lens: str, coefficients: Coefficients) -> float:
     """Returns the tangent of the angle to the axis up to which the distortion is monotonic."""
-    radius, seen = _radial_curve(lens, coefficients)
-    turning = np.flatnonzero(~(np.diff(seen) > 0))
+    radius, shown_radius = _radial_curve(lens, coefficients)
+    turning = np.flatnonzero(~(np.diff(shown_radius) > 0))
     return float(radius[turning[0]]) if turning.size else np.inf
 
 
 def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """How far (N, 2) the directions are from those shown there, by central differences."""
+    # The derivatives [[a, b], [c, d]] of what is shown, a column for each axis of the plane.
     columns = []
-    for axis in np.eye(2) * _NEWTON_STEP:
-        ahead, behind = (_distorted(plane + sign * axis, lens, coefficients) for sign in (1, -1))
-        columns.append((ahead - behind) / (2 * _NEWTON_STEP))
-    (a, c), (b, d) = columns[0].T, columns[1].T
+    for axis in np.eye(2) * _NEWTON_DIFFERENCE:
+        ahead = _distorted(plane + axis, lens, coefficients)
+        behind = _distorted(plane - axis, lens, coefficients)
+        columns.append((ahead - behind) / (2 * _NEWTON_DIFFERENCE))
+    a, c = columns[0].T
+    b, d = columns[1].T
+    # Their inverse, applied to the error.
     x, y = (_distorted(plane, lens, coefficients) - shown).T
     return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
 
@@ -132,19 +145,22 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
     """Radius before and after the lens, without its tangential parts."""
     if lens == "fisheye":
-        radius = np.tan(np.linspace(0, _WIDEST_ANGLE, _SAMPLES))
+        radius = np.tan(np.linspace(0, _WIDEST_ANGLE_RAD, _SAMPLES))
     else:
         radius = np.linspace(0, _WIDEST_PLANE, _SAMPLES)
         coefficients = tuple(c if i in _RADIAL else 0.0 for i, c in enumerate(coefficients))
     with np.errstate(all="ignore"):
-        seen = _distorted(np.column_stack([radius, 0 * radius]), lens, coefficients)
-    return radius, seen[:, 0]
+        shown = _distorted(np.column_stack([radius, 0 * radius]), lens, coefficients)
+    return radius, shown[:, 0]
 
 
 def _distorted(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """The points (N, 2) by the lens model, also beyond where it turns back."""
-    shown = _fisheye if lens == "fisheye" else _radial_tangential
-    return shown(plane, coefficients) if len(plane) else plane.copy()
+    if not len(plane):  # which OpenCV refuses
+        return plane.copy()
+    if lens == "fisheye":
+        return _fisheye(plane, coefficients)
+    return _radial_tangential(plane, coefficients)
 
 
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
@@ -152,8 +168,8 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
     padded = (*coefficients, *[0.0] * 14)[:14]
     if any(padded[12:]):  # the sensor is tilted; OpenCV takes 6 times as long
         points = np.column_stack([plane, np.ones(len(plane))])
-        still = np.zeros(3)
-        shown, _ = cv2.projectPoints(points, still, still, np.eye(3), np.array(padded))
+        no_motion = np.zeros(3)
+        shown, _ = cv2.projectPoints(points, no_motion, no_motion, np.eye(3), np.array(padded))
         return np.asarray(shown[:, 0], np.float64)
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = padded[:12]
     x, y = plane.T

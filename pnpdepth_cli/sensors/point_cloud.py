@@ -22,10 +22,11 @@ _EDGE = 0.05
 """Jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps floors
 down to a grazing angle of about 5 degrees."""
 
-_NEIGHBOURS = 8
+_NEIGHBOURS = 8  # views that a view is compared with at most
 _WIDEST_DEG = 60.0  # widest angle between the axes of two cameras that see the same surfaces
-_RETURN_PX, _RETURN_DEPTH = 2.0, 0.03  # differences of a pixel and, as a fraction, of its depth
-_PART_PIXELS = 1 << 20  # whose points and normals are in memory at once
+_RETURN_PX = 2.0  # farthest from its pixel that a point comes back
+_RETURN_DEPTH = 0.03  # largest difference of the depth that comes back, a fraction
+_STRIP_PIXELS = 1 << 20  # whose points and normals are in memory at once
 
 
 class PointCloud(NamedTuple):
@@ -39,7 +40,8 @@ class PointCloud(NamedTuple):
 
     def transform(self, pose: Floats) -> PointCloud:
         """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to."""
-        xyz, normals = _apply(self.xyz, pose[:3]), self.normals @ pose[:3, :3].T
+        xyz = _apply(self.xyz, pose[:3])
+        normals = self.normals @ pose[:3, :3].T
         return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)
 
 
@@ -63,19 +65,23 @@ def cloud_from_depth(
     known = kept_pixels(depth)
     height, width = depth.shape
     rays = rays_of_image(camera, (height, width))
-    rows = max(1, _PART_PIXELS // width)
+    rows = max(1, _STRIP_PIXELS // width)
     for top in range(0, height, rows):
-        part = slice(top, top + rows)
-        around = slice(max(0, top - 1), part.stop + 1)  # the normals take neighbours
+        # A strip of rows, and one more on each side, as normals take neighbours.
+        strip = slice(top, top + rows)
+        around = slice(max(0, top - 1), strip.stop + 1)
         points = _points(depth[around], known[around], rays[around])
         normals = _normals(points, known[around])
-        inner = slice(top - around.start, part.stop - around.start)
-        kept = known[part]
-        colours = None if rgb is None else np.clip(rgb[part][kept], 0, 1) * 255
+        # What of these belongs to the strip.
+        inner = slice(top - around.start, strip.stop - around.start)
+        kept = known[strip]
+        colours: NDArray[np.uint8] | None = None
+        if rgb is not None:
+            colours = np.rint(np.clip(rgb[strip][kept], 0, 1) * 255).astype(np.uint8)
         yield PointCloud(
             xyz=points[inner][kept].astype(np.float32),
             normals=normals[inner][kept].astype(np.float32),
-            rgb=None if colours is None else np.rint(colours).astype(np.uint8),
+            rgb=colours,
         )
 
 
@@ -140,8 +146,11 @@ def _normals(points: Floats, known: Mask) -> Floats:
 
 def _difference(points: Floats, known: Mask, axis: int) -> Floats:
     """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none."""
-    points, known = np.moveaxis(points, axis, 0), np.moveaxis(known, axis, 0)
-    before, after = points.copy(), points.copy()
+    points = np.moveaxis(points, axis, 0)
+    known = np.moveaxis(known, axis, 0)
+    # A point without a known neighbour on a side stands for it, so that the difference is smaller.
+    before = points.copy()
+    after = points.copy()
     both = known[1:] & known[:-1]
     before[1:][both] = points[:-1][both]
     after[:-1][both] = points[1:][both]
@@ -153,22 +162,28 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
 
     Points are sorted by cube; they have colours if all clouds do.
     """
-    cells, sums, coloured = np.zeros((0, 3), np.int64), np.zeros((0, 10)), True
+    cubes = np.zeros((0, 3), np.int64)
+    sums = np.zeros((0, 10))  # of each cube: x y z, red green blue, the normal's, and how many
+    has_colours = True
     for cloud in clouds:
-        coloured &= cloud.rgb is not None
+        has_colours &= cloud.rgb is not None
         rgb = np.zeros(cloud.xyz.shape) if cloud.rgb is None else cloud.rgb
         ones = np.ones((len(cloud.xyz), 1))
+        # The sums so far are added up again with the points of this cloud.
         values = np.concatenate([sums, np.hstack([cloud.xyz, rgb, cloud.normals, ones])])
-        own = np.floor(cloud.xyz / side).astype(np.int64)
-        cells, index = np.unique(np.concatenate([cells, own]), axis=0, return_inverse=True)
-        sums = np.zeros((len(cells), 10))
+        cube_of_point = np.floor(cloud.xyz / side).astype(np.int64)
+        cubes, index = np.unique(
+            np.concatenate([cubes, cube_of_point]), axis=0, return_inverse=True
+        )
+        sums = np.zeros((len(cubes), 10))
         np.add.at(sums, index.reshape(-1), values)
+    # Means; those of normals are made unit vectors.
     xyz, rgb, normals = np.split(sums[:, :9] / sums[:, 9:], 3, axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return PointCloud(
         xyz=xyz.astype(np.float32),
         normals=(normals / np.where(length > 0, length, 1)).astype(np.float32),
-        rgb=np.rint(rgb).astype(np.uint8) if coloured else None,
+        rgb=np.rint(rgb).astype(np.uint8) if has_colours else None,
     )
 
 
@@ -178,7 +193,8 @@ def neighbouring_views(poses: Floats, index: int) -> list[int]:
     alike = poses[:, :, 2] @ poses[index, :, 2] > np.cos(np.radians(_WIDEST_DEG))
     alike[index] = False
     nearest = np.argsort(np.where(alike, distance, np.inf), kind="stable")
-    return [int(each) for each in nearest[: min(_NEIGHBOURS, np.count_nonzero(alike))]]
+    count = min(_NEIGHBOURS, np.count_nonzero(alike))
+    return [int(view) for view in nearest[:count]]
 
 
 def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDArray[np.float32]:
@@ -189,14 +205,17 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
     points, camera, pose = here
     known = points[:, :, 2] > 0
     rows, columns = np.nonzero(known)
-    xy, depth = np.column_stack([columns, rows]), points[known][:, 2].astype(float)
+    xy = np.column_stack([columns, rows])
+    depth = points[known][:, 2].astype(float)
     world = _apply(points[known], pose)
-    total, count = depth.copy(), np.ones(len(depth))
-    for other in others:
-        index, back = _project_back(world, pose, other)
-        away = np.linalg.norm(pixels_of(camera, back) - xy[index], axis=1)
-        same = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
-        agrees = (away <= _RETURN_PX) & same
+    # Depths that agree are added up, this view's own first.
+    total = depth.copy()
+    count = np.ones(len(depth))
+    for view in others:
+        index, back = _project_back(world, pose, view)
+        away_px = np.linalg.norm(pixels_of(camera, back) - xy[index], axis=1)
+        same_depth = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
+        agrees = (away_px <= _RETURN_PX) & same_depth
         total[index[agrees]] += back[agrees, 2]
         count[index[agrees]] += 1
     result = np.zeros(known.shape, np.float32)
@@ -207,20 +226,25 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
 def _project_back(world: Floats, here: Floats, other: View) -> tuple[NDArray[np.intp], Floats]:
     """Indices of points that another view has depth of, and its points there, seen from a pose."""
     points, camera, pose = other
+    # Where the other view sees the points.
     seen = _apply_inverse(world, pose)
     index = np.flatnonzero(seen[:, 2] > 0)
     xy = pixels_of(camera, seen[index])
     size = (points.shape[0], points.shape[1])
     inside = in_frame(xy, size)
-    index, met = index[inside], points.reshape(-1, 3)[pixel_index(xy[inside], size)]
+    index = index[inside]
+    # What its own depth map has there, back in the coordinates of the pose.
+    met = points.reshape(-1, 3)[pixel_index(xy[inside], size)]
     back = _apply_inverse(_apply(met, pose), here)
     usable = (met[:, 2] > 0) & (back[:, 2] > 0)
     return index[usable], back[usable]
 
 
 def _apply(points: NDArray[np.floating], pose: Floats) -> Floats:
+    """The points (N, 3) of a camera in the world, by the camera's pose (3, 4)."""
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
 def _apply_inverse(points: Floats, pose: Floats) -> Floats:
+    """The points (N, 3) of the world in a camera's coordinates, by the camera's pose (3, 4)."""
     return np.asarray((points - pose[:, 3]) @ pose[:, :3])

@@ -49,7 +49,8 @@ _MARGIN_IN_LINES = 0.57
 
 _LINE_SPACING_PX = (3.0, 8.0)  # farther apart, lines say little of what is between them
 _INTERLEAVED = 0.003  # least fraction of points that lie between points of a nearer surface
-_INTERLEAVED_REACH = (4, 2)  # pixels to each side, and half the width, of the area compared
+_INTERLEAVED_REACH_PX = 4  # to each side, in which points of a nearer surface are searched
+_INTERLEAVED_HALF_WIDTH_PX = 2  # half the width of that area
 
 
 def as_depth_image(points: Points) -> NDArray[np.float32]:
@@ -91,8 +92,12 @@ class DropCounter:
 
     def points(self, xyz: Floats, xy: Floats, size: Size) -> Points:
         """Returns what is left, `xyz` in the camera's coordinates, as points of an image (H, W)."""
-        pixels, depth = xy.astype(np.float32), xyz[:, 2].astype(np.float32)
-        return Points(xy=pixels, depth=depth, size=size, dropped=self.dropped)
+        return Points(
+            xy=xy.astype(np.float32),
+            depth=xyz[:, 2].astype(np.float32),
+            size=size,
+            dropped=self.dropped,
+        )
 
     def __str__(self) -> str:
         return describe_dropped(self.dropped)
@@ -128,13 +133,15 @@ def project_velodyne(
     """
     xyz = np.asarray(points)[:, :3]
     drops = DropCounter()
+    # Points in front of the camera, inside the image, the nearest of their pixel.
     seen = scanner.apply(xyz)
     seen = seen[drops.keep(seen[:, 2] > 0, "behind the camera")]
     seen, xy = drops.keep_seen(seen, camera, size)
+    # Of these, what the camera sees past nearer points.
     if not keep_occluded:
-        focal_px = float(camera.intrinsics[0, 0])
-        origin = np.asarray(camera.intrinsics @ scanner.translation)
         if has_scanner:
+            focal_px = float(camera.intrinsics[0, 0])
+            origin = np.asarray(camera.intrinsics @ scanner.translation)
             hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
         else:
             hidden = hidden_among(xy, seen[:, 2], size)
@@ -188,16 +195,17 @@ def hidden_points(
     farthest = margin + 0.5 * (1 + _STRETCH) * np.hypot(*beam.T)
     sides = np.minimum(np.ceil(farthest), reach)
     around = cKDTree(cells).query_ball_point(cells[suspects], sides, p=np.inf)
-    point = np.repeat(suspects, [len(each) for each in around])
-    other = np.fromiter(itertools.chain.from_iterable(around), np.intp, len(point))
-    near = grid[rows[other], columns[other]].astype(np.float64)
-    nearer = near < limit[point]
-    point, other, near = point[nearer], other[nearer], near[nearer]
-    # A suspect is hidden if the other is near the middle of its parallax segment.
-    beam = _beam_at(near, xy[point], depth[point], scanner) - xy[point]
-    away = np.hypot(*(cells[other] - cells[point] - 0.5 * beam).T)
+    suspect = np.repeat(suspects, [len(neighbours) for neighbours in around])
+    neighbour = np.fromiter(itertools.chain.from_iterable(around), np.intp, len(suspect))
+    near = grid[rows[neighbour], columns[neighbour]].astype(np.float64)
+    nearer = near < limit[suspect]
+    suspect, neighbour, near = suspect[nearer], neighbour[nearer], near[nearer]
+    # A suspect is hidden if the neighbour is near the middle of its parallax segment.
+    beam = _beam_at(near, xy[suspect], depth[suspect], scanner) - xy[suspect]
+    away_px = np.hypot(*(cells[neighbour] - cells[suspect] - 0.5 * beam).T)
+    hides = away_px <= margin + _STRETCH * 0.5 * np.hypot(*beam.T)
     hidden = np.zeros(len(depth), bool)
-    hidden[point[away <= margin + _STRETCH * 0.5 * np.hypot(*beam.T)]] = True
+    hidden[suspect[hides]] = True
     return hidden
 
 
@@ -245,10 +253,14 @@ def occluded_in_map(points: Points) -> Mask | None:
         return None
     if interleaved(as_depth_image(points)).sum() < _INTERLEAVED * len(points):
         return None
-    xy, depth = points.xy.astype(np.float64), points.depth.astype(np.float64)
-    focal_px = _MARGIN_IN_LINES * across_px / np.radians(_MARGIN_DEG)
-    # no parallax is known; the margin stands for it
-    return hidden_points(xy, depth, points.size, focal_px=focal_px, scanner=np.zeros(3))
+    # No parallax is known; the margin stands for it. The focal length is the one that gives it.
+    return hidden_points(
+        points.xy.astype(np.float64),
+        points.depth.astype(np.float64),
+        points.size,
+        focal_px=_MARGIN_IN_LINES * across_px / np.radians(_MARGIN_DEG),
+        scanner=np.zeros(3),
+    )
 
 
 def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
@@ -263,7 +275,8 @@ def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
         window_px: Side of the square window, odd.
         metres: Distance by which points may be farther.
     """
-    depth, window = as_depth_image(points), np.ones((window_px, window_px), np.uint8)
+    depth = as_depth_image(points)
+    window = np.ones((window_px, window_px), np.uint8)
     known = depth > 0
     nearest = np.where(known, depth, np.float32(np.inf))
     for _ in range(2):  # of the window of a point, and of all windows that a point lies in
@@ -277,9 +290,12 @@ def interleaved(depth: NDArray[np.float32]) -> Mask:
     """Returns (H, W) true for points of a map, 0 = unknown, between nearer ones on two sides."""
     known = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
-    reach, half = _INTERLEAVED_REACH
+    # The nearest point in an area above each pixel, and in the same area turned to the other sides.
+    reach, half = _INTERLEAVED_REACH_PX, _INTERLEAVED_HALF_WIDTH_PX
     above = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
     above[:reach, reach - half : reach + half + 1] = 1
-    up, left, down, right = (cv2.erode(known, np.rot90(above, k)) < limit for k in range(4))
+    up, left, down, right = (
+        cv2.erode(known, np.rot90(above, quarter_turns)) < limit for quarter_turns in range(4)
+    )
     opposite: Mask = (up & down) | (left & right)
     return opposite

@@ -67,34 +67,47 @@ _VLP_32C_DEG = (
     -7.254, -8.843, -11.31, -15.639, -25.0,
 )  # fmt: skip
 _HDL_64E_DEG = evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32)
-_SHEETS = {
-    "vlp-16": (evenly_spaced(15, 2, 16), 0.2, 100, 0.03, 0.0),
-    "vlp-32c": (_VLP_32C_DEG, 0.2, 200, 0.03, 0.0),
-    "hdl-32e": (evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02, 0.0),
-    "hdl-64e": (_HDL_64E_DEG, 0.1728, 120, 0.02, 0.0),
-    # Wang et al. 2019, table on LiDAR types: fields of view of 30, 40, 41 and 27 degrees, with
-    # beams evenly spaced by the vertical resolution. The table gives no elevation of the top beam,
-    # which is the data sheet's here. It gives no azimuth step and no size of its "random noise on
-    # rotation" either: these two are ours, chosen once for all four so that their fractions of
-    # sampled pixels are about those printed there, in SYNTHIA's view of 100° by 71° at 512×304.
-    "paper-vlp-16": (evenly_spaced(15, 2, 16), 0.19, np.inf, 0.0, 0.4),
-    "paper-vlp-32c": (evenly_spaced(15, 0.3, 134), 0.19, np.inf, 0.0, 0.4),
-    "paper-hdl-32e": (evenly_spaced(10.67, 1.3, 32), 0.19, np.inf, 0.0, 0.4),
-    "paper-hdl-64e": (evenly_spaced(2, 0.4, 68), 0.19, np.inf, 0.0, 0.4),
-}
-"""Elevations and azimuth step, degrees; range and its noise, metres; noise of angles, degrees."""
 
-LIDARS = {
-    name: Lidar(
+
+def _from_sheet(
+    name: str, elevations_deg: tuple[float, ...], step_deg: float, reach: float, noise: float
+) -> Lidar:
+    """The scanner of a data sheet: range and its noise in metres, no noise of angles."""
+    return Lidar(
         name=name,
-        elevations_deg=beams,
-        azimuth_step_deg=step,
+        elevations_deg=elevations_deg,
+        azimuth_step_deg=step_deg,
         max_range=reach,
-        range_noise=range_noise,
-        angle_noise_deg=angle_noise,
+        range_noise=noise,
     )
-    for name, (beams, step, reach, range_noise, angle_noise) in _SHEETS.items()
-}
+
+
+def _from_paper(name: str, elevations_deg: tuple[float, ...]) -> Lidar:
+    """A scanner of Wang et al. 2019, table on LiDAR types.
+
+    It has fields of view of 30, 40, 41 and 27 degrees, with beams evenly spaced by the vertical
+    resolution. The table gives no elevation of the top beam, which is the data sheet's here. It
+    gives no azimuth step and no size of its "random noise on rotation" either: these two are ours,
+    chosen once for all four so that their fractions of sampled pixels are about those printed
+    there, in SYNTHIA's view of 100° by 71° at 512×304.
+    """
+    return Lidar(
+        name=name, elevations_deg=elevations_deg, azimuth_step_deg=0.19, angle_noise_deg=0.4
+    )
+
+
+_NAMED = (
+    _from_sheet("vlp-16", evenly_spaced(15, 2, 16), 0.2, 100, 0.03),
+    _from_sheet("vlp-32c", _VLP_32C_DEG, 0.2, 200, 0.03),
+    _from_sheet("hdl-32e", evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02),
+    _from_sheet("hdl-64e", _HDL_64E_DEG, 0.1728, 120, 0.02),
+    _from_paper("paper-vlp-16", evenly_spaced(15, 2, 16)),
+    _from_paper("paper-vlp-32c", evenly_spaced(15, 0.3, 134)),
+    _from_paper("paper-hdl-32e", evenly_spaced(10.67, 1.3, 32)),
+    _from_paper("paper-hdl-64e", evenly_spaced(2, 0.4, 68)),
+)
+
+LIDARS = {lidar.name: lidar for lidar in _NAMED}
 """The scanners that can be named, as `choices.SENSORS` lists them."""
 
 
@@ -144,9 +157,11 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     beams, xy = drops.keep_seen(beams, camera, size)
     z = np.asarray(depth, np.float64).ravel()[pixel_index(xy, size)]
     met = drops.keep(z > 0, "meets nothing that the camera sees")
-    distance, beams = z[met] / beams[met, 2], beams[met]
-    kept = drops.keep(distance <= sensor.max_range, "out of range")
-    distance, beams = distance[kept], beams[kept]
+    z, beams = z[met], beams[met]
+    # How far it is, as the scanner measures it.
+    distance = z / beams[:, 2]
+    in_range = drops.keep(distance <= sensor.max_range, "out of range")
+    distance, beams = distance[in_range], beams[in_range]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
     # The points, as noise moves them, of which the image shows the nearest of each pixel.
@@ -155,8 +170,10 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     points = points[ahead]
     points, xy = drops.keep_seen(points, camera, size)
     if not len(xy):
-        fact = f"no beam of {sensor.name} gives a point in the image ({drops})"
-        raise NoPointsError(f"{fact}; check depth and intrinsics")
+        raise NoPointsError(
+            f"no beam of {sensor.name} gives a point in the image ({drops}); check depth and"
+            " intrinsics"
+        )
     return drops.points(points, xy, size)
 
 
@@ -244,4 +261,5 @@ def _corners(image: NDArray[np.float32] | None, wanted: int) -> Pixels:
     corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
     xy = np.array([c.pt for c in sorted(corners, key=lambda corner: -corner.response)])
     column, row = np.rint(xy.reshape(-1, 2)).astype(np.intp).T
-    return np.array([*dict.fromkeys((row * image.shape[1] + column).tolist())], np.intp)
+    pixels = (row * image.shape[1] + column).tolist()
+    return np.array(list(dict.fromkeys(pixels)), np.intp)

@@ -58,7 +58,8 @@ class Split:
 
     def __init__(self, network: nn.Module, layer: str, *, static_graph: bool = False) -> None:
         self.layer = layer
-        self._network, self._promised_static = network, static_graph
+        self._network = network
+        self._promised_static = static_graph
         self._cut = CutPoint.find(network, layer)
         self._uncacheable: set[nn.Module] = set()
         self._replay: Replay | None = None
@@ -97,15 +98,12 @@ class Split:
 
         In float32 if the layer gives a shorter type, in which small steps would be rounded away.
         """
-        replay = self._replay
-        if replay is not None and replay.holds_for(arguments):
-            replay.next_frame(arguments)
-            self._run_front(replay)
+        if self._replay is not None and self._replay.holds_for(arguments):
+            self._replay.next_frame(arguments)
+            z0 = self._run_front(self._replay)
         else:
-            self._replay = replay = None  # frees the tensors of the last frame
-            replay = self._record_front(arguments)
-        z0 = replay.z0
-        assert z0 is not None
+            self._replay = None  # frees the tensors of the last frame
+            z0 = self._record_front(arguments)
         # A copy, because the network may go on to change the memory of z_0.
         return z0.to(torch.float32 if z0.dtype in _LOW_PRECISION else z0.dtype, copy=True)
 
@@ -122,33 +120,43 @@ class Split:
         recorder.finish_rear()
         return output
 
-    def _record_front(self, arguments: tuple[object, ...]) -> Replay:
+    def _record_front(self, arguments: tuple[object, ...]) -> Tensor:
+        """Runs the network up to the cut until its calls are known; returns z_0."""
         while True:
             self._replay = replay = Replay(self._cut, arguments)
-            recorder, uncacheable = self._recorder(replay), len(self._uncacheable)
-            self._run_front(replay, recorder)
+            uncacheable_before = len(self._uncacheable)
+            recorder = self._recorder(replay)
+            z0 = self._run_front(replay, recorder)
             # Once more, if the network set hooks in its first pass, as those of transformers do.
             cut = CutPoint.find(self._network, self.layer)
             if cut.hooked != self._cut.hooked:
                 self._cut = cut
                 continue
-            if len(self._uncacheable) == uncacheable:  # else once more, to cache what is in those
+            # Once more, if submodules cannot be cached as a whole: to cache what is in those.
+            if len(self._uncacheable) == uncacheable_before:
                 recorder.finish(complete=False)
-                return replay
+                return z0
 
-    def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> None:
-        """Runs the network up to the cut. Raises ModelError if it does not come there."""
+    def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> Tensor:
+        """Runs the network up to the cut; returns z_0.
+
+        Raises:
+            ModelError: The network does not come to the cut.
+        """
         try:
             self._run(replay, recorder)
         except PnpDepthError:
+            # The replay itself ends the pass at the cut.
             if not replay.has_front:
                 raise
-        if not replay.has_front:
+        if replay.z0 is None or replay.z is not None:
             ran = {module for module, _ in replay.outputs}
             ran = ran if recorder is None else recorder.ran
             raise self._cut.never_ran(ran, replay.calls[self._cut.module])
+        return replay.z0
 
     def _recorder(self, replay: Replay) -> Recorder:
+        """What learns from the next pass; it protects every saved tensor."""
         saved = [output for output in replay.outputs.values() if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, escapes=not self._promised_static)
@@ -161,7 +169,8 @@ class Split:
         """One pass of the network, learning if there is a recorder."""
         self._state.restore()
         replay.calls.clear()
-        replay.in_pass, replay.recorder = True, recorder
+        replay.in_pass = True
+        replay.recorder = recorder
         arguments = replay.arguments.fresh()
         assert isinstance(arguments, tuple)
         try:
@@ -171,7 +180,8 @@ class Split:
                 with recorder.watch, recorder.watch.seeing_escapes_of(self._network):
                     return self._network(*arguments)
         finally:
-            replay.in_pass, replay.recorder = False, None
+            replay.in_pass = False
+            replay.recorder = None
 
 
 def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:

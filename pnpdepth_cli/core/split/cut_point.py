@@ -49,6 +49,7 @@ class CutPoint:
             raise ModelError(f"layer {name!r} is not in this network; {hint}")
         module = modules[name]
         hooked = [n for n, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
+        names = [n for n, m in modules.items() if m is module]  # several where it is shared
         return cls(
             layer=layer,
             name=name,
@@ -56,7 +57,7 @@ class CutPoint:
             key=tuple(re.findall(r"\[([^\[\]]+)\]", match["keys"])),
             module=module,
             modules=modules,
-            containers=_around([n for n, m in modules.items() if m is module], modules) | {module},
+            containers=_around(names, modules) | {module},
             hooked=frozenset(hooked),
             around_hooks=_around(hooked, modules),
         )
@@ -99,11 +100,11 @@ class CutPoint:
         return ModelError(f"layer {self.layer!r} never runs in this network's forward; {hint}")
 
 
-def _around(inner: list[str], modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
+def _around(inner_names: list[str], modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
     """The submodules that contain another one with one of these names."""
     return frozenset(
         module
         for name, module in modules.items()
-        for part in inner
-        if name != part and (not name or part.startswith(f"{name}."))
+        for inner in inner_names
+        if name != inner and (not name or inner.startswith(f"{name}."))
     )

@@ -31,13 +31,14 @@ Handler = Callable[[nn.Module, object, Run], object]
 @contextmanager
 def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None]:
     """Inside, calls of the submodules go to the handler; afterwards to their own `forward`."""
-    own = {module: module.__dict__.get("forward") for module in modules}
+    # Few modules have a `forward` of their own; that of the others is their class's.
+    own_forwards = {module: module.__dict__.get("forward") for module in modules}
     try:
-        for module in own:
+        for module in own_forwards:
             module.__dict__["forward"] = _stand_in(module, module.forward, handler)
         yield
     finally:
-        for module, own_forward in own.items():
+        for module, own_forward in own_forwards.items():
             module.__dict__["forward"] = own_forward
             if own_forward is None:
                 del module.__dict__["forward"]
@@ -46,6 +47,8 @@ def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None
 def _stand_in(
     module: nn.Module, original: Callable[..., object], handler: Handler
 ) -> Callable[..., object]:
+    """A `forward` that leaves the call to the handler."""
+
     @functools.wraps(original)
     def forward(*args: object, **kwargs: object) -> object:
         return handler(module, (args, kwargs), lambda: original(*args, **kwargs))
@@ -155,9 +158,9 @@ class Replay:
         return output
 
     def _output_with_z(self, run: Run) -> object:
-        assert self.z is not None
-        assert self.z0 is not None
-        assert self.cut_call is not None
+        """The output of the cut, with z in place of z_0."""
+        if self.z is None or self.z0 is None or self.cut_call is None:
+            raise RuntimeError("the cut layer runs again before front() and rear()")
         # A copy, because the network may go on in place and z may be a leaf.
         z = self.z.to(self.z0.dtype, copy=True)
         saved = self.outputs[self.cut_call]
@@ -187,8 +190,12 @@ class Recorder:
     def __init__(
         self, cut: CutPoint, watch: Watch, replay: Replay, uncacheable: set[nn.Module]
     ) -> None:
-        self.watch, self.ran = watch, set[nn.Module]()
-        self._cut, self._replay, self._uncacheable = cut, replay, uncacheable
+        self.watch = watch
+        self.ran: set[nn.Module] = set()
+        """Submodules that ran in this pass, but for those inside one that is cached as a whole."""
+        self._cut = cut
+        self._replay = replay
+        self._uncacheable = uncacheable
         self._saved = dict(replay.outputs)
         self._known = len(self._saved)  # before this pass; in the rear's, those up to the cut
         self._inside_one = False  # in a submodule that is to be cached as a whole
@@ -203,18 +210,24 @@ class Recorder:
         if self._inside_one and module is not self._cut.module:
             return run()
         self.ran.add(module)
+        # The call is noted before it runs, so that calls are in the order in which they begin.
         number = next(n for n in range(len(self._saved) + 1) if (module, n) not in self._saved)
-        call, since = (module, number), self.watch.now()
+        call = (module, number)
         self._saved[call] = None
         first_inside = len(self._saved)
+        # It runs, and what is inside is recorded too, unless it may be cached as a whole.
+        since = self.watch.now()
         before = list(tensors_in(inputs))
-        outer, self._inside_one = self._inside_one, self._may_be_one(module)
+        outside_one = self._inside_one
+        may_be_one = self._may_be_one(module)
+        self._inside_one = may_be_one
         try:
             output = run()
         finally:
-            tried, self._inside_one = self._inside_one, outer
+            self._inside_one = outside_one
         if self._replay.has_front:  # the network has caught the end of the front
             return output
+        # Its output is saved if that is all that it did; this drops what was recorded inside.
         if (
             self.watch.can_stand_for(since, inputs, output)
             and module not in self._cut.around_hooks
@@ -225,8 +238,9 @@ class Recorder:
             self._drop_from(first_inside)
             self._saved[call] = saved = SavedTensors.of(output)
             self.watch.protect(saved)
-        elif tried and next(module.children(), None) is not None:
+        elif may_be_one and next(module.children(), None) is not None:
             self._uncacheable.add(module)
+        # The front ends at the cut.
         if self._is_cut(module):
             self._replay.path, self._replay.z0 = self._cut.choose(output)
             self._replay.cut_call = call
@@ -239,7 +253,8 @@ class Recorder:
         Raises:
             ModelError: The cut is ambiguous, or its output cannot be replaced.
         """
-        layer, calls = self._cut.layer, self._replay.calls[self._cut.module]
+        layer = self._cut.layer
+        calls = self._replay.calls[self._cut.module]
         if self._cut.call is None and calls > 1:
             choices = ", ".join(f"{layer}#{call}" for call in range(1, calls + 1))
             raise ModelError(f"layer {layer!r} is called {calls} times; say which call: {choices}")
@@ -259,7 +274,8 @@ class Recorder:
 
     def finish(self, *, complete: bool) -> None:
         """Gives the replay the recorded calls, up to the cut or all."""
-        self._replay.outputs, self._replay.complete = self._saved, complete
+        self._replay.outputs = self._saved
+        self._replay.complete = complete
         # No value may reach Python in front of the cut or behind it.
         self._replay.static_graph &= not self.watch.escaped
 
@@ -274,6 +290,7 @@ class Recorder:
         return self._replay.cut_call is None and not any(module in group for group in apart)
 
     def _drop_from(self, first: int) -> None:
+        """Forgets the calls from this one on, in the order in which they began."""
         while len(self._saved) > first:
             _, saved = self._saved.popitem()
             if saved is not None:

@@ -96,7 +96,8 @@ class NetworkState:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        modules, parameters = list(network.modules()), list(network.parameters())
+        modules = list(network.modules())
+        parameters = list(network.parameters())
         # Frozen torch scripts have neither a mode nor buffers that can be set.
         plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
         self._originals = [*parameters, *network.buffers()]

@@ -61,8 +61,11 @@ class Watch(TorchDispatchMode):
             escapes: Whether values that reach Python are noted.
         """
         super().__init__()  # type: ignore[no-untyped-call]
-        self.data_dependent = self.escaped = self.torn = False
-        self._operations = self._touches = 0
+        self.data_dependent = False
+        self.escaped = False
+        self.torn = False
+        self._operations = 0
+        self._touches = 0
         self._writes: list[int] = []  # per change in place, the storage's creator; 0: none
         self._created: dict[int, int] = {}  # operation that created a storage
         self._marked: set[int] = set()  # storages that depend on z
@@ -70,7 +73,8 @@ class Watch(TorchDispatchMode):
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
-        self._sees_escapes, self._notes_escapes = False, escapes
+        self._notes_escapes = escapes
+        self._sees_escapes = False
         for tensors in saved:
             self.protect(tensors)
 
@@ -114,19 +118,21 @@ class Watch(TorchDispatchMode):
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
         """Watches the methods that give values to Python, too, but not in torch's fused layers."""
-        outer, fused = self._sees_escapes, getattr(type(module), "forward", None) in _FUSED
-        self._sees_escapes = self._notes_escapes and not fused
+        seen_outside = self._sees_escapes
+        is_fused = getattr(type(module), "forward", None) in _FUSED
+        self._sees_escapes = self._notes_escapes and not is_fused
+        # The function mode is entered, or left for a while, where that differs from outside.
         innermost = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
         change: AbstractContextManager[object] = nullcontext()
-        if self._sees_escapes and not outer:
+        if self._sees_escapes and not seen_outside:
             change = self._function_mode
-        elif outer and not self._sees_escapes and innermost is self._function_mode:
+        elif seen_outside and not self._sees_escapes and innermost is self._function_mode:
             change = overrides._pop_mode_temporarily()
         try:
             with change:
                 yield
         finally:
-            self._sees_escapes = outer
+            self._sees_escapes = seen_outside
 
     def note_escape(self, tensor: Tensor) -> None:
         """Notes that values of the tensor reach Python."""
@@ -146,6 +152,7 @@ class Watch(TorchDispatchMode):
         self._operations += 1
         inputs = [tensor for _, tensor in tensors_in((*args, *kwargs.values()))]
         self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
+        # Saved tensors are cloned before the operation changes them.
         written = [
             tensor
             for index, name in writes
@@ -155,11 +162,13 @@ class Watch(TorchDispatchMode):
             self._before_write(tensor)
         marked = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
+        # New memory among its results belongs to this operation.
         results = {_storage(tensor) for _, tensor in tensors_in(result)}
         created = results - {_storage(tensor) for tensor in inputs} - {_NO_STORAGE}
         self._created.update(dict.fromkeys(created, self._operations))
         # An address seen before may have been freed and reused.
         self._marked -= created
+        # What an operation makes of z, or writes, depends on z.
         if marked:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
@@ -168,6 +177,7 @@ class Watch(TorchDispatchMode):
         return result
 
     def _before_write(self, tensor: Tensor) -> None:
+        """Notes a change in place, and clones the saved tensors that it would change."""
         storage = _storage(tensor)
         self._writes.append(self._created.get(storage, 0))
         twins = {_storage(twin) for twin in self._twins}
@@ -205,6 +215,7 @@ _NO_STORAGE = 0  # the mark of sparse tensors, which have no storage
 
 
 def _storage(tensor: Tensor) -> int:
+    """A number that tensors in the same memory share."""
     try:
         return int(tensor.untyped_storage()._cdata)
     except NotImplementedError:
@@ -217,7 +228,10 @@ def _facts(func: OpOverload) -> tuple[list[tuple[int, str]], bool]:
 
     They do where it gives them, or shapes that depend on them, to Python.
     """
-    arguments = enumerate(func._schema.arguments)
-    writes = [(i, a.name) for i, a in arguments if a.alias_info and a.alias_info.is_write]
-    tags = torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape
+    writes = [
+        (index, argument.name)
+        for index, argument in enumerate(func._schema.arguments)
+        if argument.alias_info and argument.alias_info.is_write
+    ]
+    tags = (torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape)
     return writes, any(tag in func.tags for tag in tags)

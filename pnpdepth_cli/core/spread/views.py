@@ -1,0 +1,222 @@
+"""Rules of operations that arrange the same numbers in other axes, or leave some out."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pnpdepth_cli.core.spread.boxes import (
+    NOWHERE,
+    AxisRange,
+    Call,
+    Spread,
+    everywhere,
+    full_range,
+    rule,
+)
+
+PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split", "unsafe_chunk")
+"""Operations whose results are parts of their input."""
+
+
+def part_of(call: Call, position: int) -> Spread:
+    """Returns the boxes of one of the parts that a tensor is split into."""
+    if call.name == "unbind":
+        axis = call.args[1] if len(call.args) > 1 else 0
+        return select(call._replace(args=(call.source, axis, position)))
+    axis = (call.args[2] if len(call.args) > 2 else 0) % call.source.ndim
+    sizes = call.args[1]  # one size of all parts, or the size of each
+    start = position * sizes if isinstance(sizes, int) else sum(sizes[:position])
+    return Spread.from_axes(_cropped(call, axis, start, 1, call.shape[axis]))
+
+
+@rule("cat")
+def concatenate(call: Call) -> Spread:
+    """Returns boxes shifted to where the input lies; joined, if it is given several times."""
+    axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
+    offset = 0
+    spread: Spread | None = None
+    for tensor in call.args[0]:
+        if tensor is call.source:
+            axes = call.spread.axes()
+            first, last = axes[axis]
+            last = torch.where(call.spread.empty(), last, last + offset)
+            axes[axis] = (first + offset, last)
+            spread = Spread.from_axes(axes).joined(spread)
+        # torch skips an empty tensor of another number of axes.
+        offset += tensor.shape[axis] if tensor.ndim == len(call.shape) else 0
+    return everywhere(call) if spread is None else spread
+
+
+@rule("stack")
+def stack(call: Call) -> Spread:
+    """Returns boxes with a new axis, from the first to the last place of the input along it."""
+    axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
+    places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
+    if not places:
+        return everywhere(call)
+    empty = call.spread.empty()
+    first = torch.full((len(empty),), places[0]).masked_fill(empty, NOWHERE)
+    last = torch.full((len(empty),), places[-1]).masked_fill(empty, -1)
+    axes = call.spread.axes()
+    axes.insert(axis, (first, last))
+    return Spread.from_axes(axes)
+
+
+def _cropped(call: Call, axis: int, start: int, step: int, count: int) -> list[AxisRange]:
+    """The ranges of boxes where every step-th index from the start is kept along one axis."""
+    axes = call.spread.axes()
+    empty = call.spread.empty()
+    first, last = axes[axis]
+    # The first index that is kept at or behind `first`, and the last one up to `last`.
+    first = (first - start + step - 1).div(step, rounding_mode="floor").clamp(min=0)
+    last = (last - start).div(step, rounding_mode="floor").clamp(max=count - 1)
+    axes[axis] = (first.masked_fill(empty, NOWHERE), last.masked_fill(empty, -1))
+    return axes
+
+
+@rule("slice")
+def slice_(call: Call) -> Spread:
+    """Returns boxes of `tensor[start:end:step]` along an axis, arguments as torch has them."""
+    defaults = [0, None, None, 1]
+    stated = [*call.args[1:], *defaults[len(call.args) - 1 :]]
+    axis = stated[0] % call.source.ndim
+    start = stated[1]
+    step = stated[3]
+    size = call.source.shape[axis]
+    if start is None:
+        start = 0
+    elif start < 0:  # counted from the end
+        start += size
+    start = min(max(start, 0), size)
+    return Spread.from_axes(_cropped(call, axis, start, step, call.shape[axis]))
+
+
+@rule("select")
+def select(call: Call) -> Spread:
+    """Returns boxes of `tensor[index]` along an axis, which goes."""
+    axis = call.args[1] % call.source.ndim
+    axes = _cropped(call, axis, call.args[2] % call.source.shape[axis], 1, 1)
+    # A box that the index misses is empty, which another axis has to say.
+    first, last = axes.pop(axis)
+    missed = first > last
+    first, last = axes[0]
+    axes[0] = (first.masked_fill(missed, NOWHERE), last.masked_fill(missed, -1))
+    return Spread.from_axes(axes)
+
+
+@rule("permute")
+def permute(call: Call) -> Spread:
+    """Returns boxes with their axes in the stated order."""
+    axes = call.spread.axes()
+    return Spread.from_axes([axes[axis % call.source.ndim] for axis in call.args[1]])
+
+
+@rule("transpose")
+def transpose(call: Call) -> Spread:
+    """Returns boxes with two axes exchanged."""
+    axes = call.spread.axes()
+    here, there = (axis % call.source.ndim for axis in call.args[1:3])
+    axes[here], axes[there] = axes[there], axes[here]
+    return Spread.from_axes(axes)
+
+
+@rule("t", "numpy_T")
+def reverse_axes(call: Call) -> Spread:
+    """Returns boxes with their axes in reverse order."""
+    return Spread.from_axes(call.spread.axes()[::-1])
+
+
+@rule("flip")
+def flip(call: Call) -> Spread:
+    """Returns boxes mirrored along the stated axes."""
+    axes = call.spread.axes()
+    empty = call.spread.empty()
+    for stated_axis in call.args[1]:
+        axis = stated_axis % call.source.ndim
+        first, last = axes[axis]
+        end = call.shape[axis] - 1
+        axes[axis] = (
+            (end - last).masked_fill(empty, NOWHERE),
+            (end - first).masked_fill(empty, -1),
+        )
+    return Spread.from_axes(axes)
+
+
+@rule("repeat")
+def repeat(call: Call) -> Spread:
+    """Returns boxes that are full along the axes that are repeated or new."""
+    repeats = call.args[1]
+    source_axes = call.spread.axes()
+    new_axes = len(repeats) - len(source_axes)
+    axes = [full_range(call, axis) for axis in range(new_axes)]
+    for axis, axis_range in enumerate(source_axes, start=new_axes):
+        axes.append(axis_range if repeats[axis] == 1 else full_range(call, axis))
+    return Spread.from_axes(axes)
+
+
+@rule("view", "_unsafe_view", "reshape", "_reshape_alias", "squeeze", "unsqueeze", "flatten")
+def reshape(call: Call) -> Spread:
+    """Returns boxes whose axes are kept, merged or cut, group by group of as many elements."""
+    old_sizes = list(call.source.shape)
+    new_sizes = list(call.shape)
+    elements = math.prod(old_sizes)
+    if not elements or elements != math.prod(new_sizes):  # such as of another type
+        return everywhere(call)
+    old_axes = call.spread.axes()
+    new_axes: list[AxisRange] = []
+    while old_sizes or new_sizes:
+        group = _first_group(old_sizes, new_sizes)
+        new_axes += _regrouped(old_axes[: len(group.old)], group, call.spread.empty())
+        old_sizes = old_sizes[len(group.old) :]
+        new_sizes = new_sizes[len(group.new) :]
+        old_axes = old_axes[len(group.old) :]
+    return Spread.from_axes(new_axes)
+
+
+class _Group(NamedTuple):
+    """Sizes of neighbouring axes of two shapes with equally many elements."""
+
+    old: list[int]
+    new: list[int]
+
+
+def _first_group(old_sizes: list[int], new_sizes: list[int]) -> _Group:
+    """The shortest group that both shapes begin with."""
+    old = old_sizes[:1]
+    new = new_sizes[:1]
+    while math.prod(old) != math.prod(new):
+        if math.prod(old) < math.prod(new):
+            old = old_sizes[: len(old) + 1]
+        else:
+            new = new_sizes[: len(new) + 1]
+    return _Group(old, new)
+
+
+def _regrouped(axes: list[AxisRange], group: _Group, empty: Tensor) -> list[AxisRange]:
+    """The ranges of the new axes of a group, from those of its old axes."""
+    if group.old == group.new:
+        return axes
+    # The first and the last element of each box, counted through the whole group.
+    first = torch.zeros(len(empty), dtype=torch.long)
+    last = torch.zeros(len(empty), dtype=torch.long)
+    for (axis_first, axis_last), size in zip(axes, group.old, strict=True):
+        first = first * size + axis_first.masked_fill(empty, 0)
+        last = last * size + axis_last.masked_fill(empty, 0)
+    # Their indices along the new axes, outermost first.
+    new_axes: list[AxisRange] = []
+    is_one_index = torch.ones(len(empty), dtype=torch.bool)  # so far, from first to last
+    inner = math.prod(group.new)  # elements for each index of the axis
+    for size in group.new:
+        inner //= max(size, 1)
+        # Behind the first axis with several indices a box may have any index.
+        low = torch.where(is_one_index, first // inner, 0)
+        high = torch.where(is_one_index, last // inner, size - 1)
+        new_axes.append((low.masked_fill(empty, NOWHERE), high.masked_fill(empty, -1)))
+        is_one_index = is_one_index & (low == high)
+        first = first % inner
+        last = last % inner
+    return new_axes
