@@ -24,6 +24,7 @@ from model_zoo_defs.training.learning.patterns import keep, scan_lines, uniform
 Depth = NDArray[np.float32]
 Points = Callable[[Generator, Depth], Depth]
 
+# Batches after which shards that came since are read.
 REFRESH_EVERY = 200
 
 
@@ -104,7 +105,8 @@ def spliced(
     """
     width = one[1].shape[1]
     seam = int(rng.integers(width // 4, width - width // 4 + 1))
-    first, second = int(rng.integers(width - seam + 1)), int(rng.integers(seam + 1))
+    first = int(rng.integers(width - seam + 1))
+    second = int(rng.integers(seam + 1))
     (left_rgb, left), (right_rgb, right) = one, other
     rgb = [left_rgb[:, first : first + seam], right_rgb[:, second : second + width - seam]]
     depth = [left[:, first : first + seam], right[:, second : second + width - seam]]

@@ -26,6 +26,7 @@ from model_zoo_defs.training.learning import priors
 from model_zoo_defs.training.learning.patterns import draw
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
+# Samples after which shards that came since are read.
 REFRESH_EVERY = 2000
 
 
@@ -144,7 +145,8 @@ def augmented(
     """
     image, distance = _zoomed_part(rng, rgb, depth, size)
     if rng.random() < 0.5:
-        image, distance = image.flip(-1), distance.flip(-1)
+        image = image.flip(-1)
+        distance = distance.flip(-1)
     distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
     sparse = draw(rng, distance.numpy(), image.mean(0).numpy())
     if rng.random() < 0.15:
@@ -176,8 +178,10 @@ def _zoomed_part(
     least = max(size[0] / height, size[1] / width)
     most = max(least, min(1.0, 2.5 * least))
     zoom = float(np.exp(rng.uniform(np.log(least), np.log(most))))
-    h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
-    top, left = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
+    h = min(height, round(size[0] / zoom))
+    w = min(width, round(size[1] / zoom))
+    top = int(rng.integers(height - h + 1))
+    left = int(rng.integers(width - w + 1))
     part = (slice(top, top + h), slice(left, left + w))
     image = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
     image = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[

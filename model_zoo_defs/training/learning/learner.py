@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+# Steps in which the learning rate rises from 0, unless the run says otherwise.
 WARM_UP_STEPS = 200
 
 

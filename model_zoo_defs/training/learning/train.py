@@ -41,9 +41,11 @@ NEW_LAYERS = (
     "gain_prior",
     "scale.",
 )
+# Weight of the loss of σ beside that of depth.
 SIGMA_WEIGHT = 0.1
+# How much faster layers learn that the start did not have.
 NEW_LAYER_FACTOR = 8.0
-# weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
+# Weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
 LEVEL_WEIGHTS = (0.15, 0.2, 0.3, 0.4, 1.0)
 
 
@@ -218,7 +220,8 @@ def train(settings: Settings) -> Path:
 
 def _report(run: Run, held_out: list[Case], loss: float) -> None:
     run.save()
-    out, now = run.out, {"step": float(run.step), "seconds": round(run.elapsed_s)}
+    out = run.out
+    now = {"step": float(run.step), "seconds": round(run.elapsed_s)}
     append_row(out / "log.csv", now | {"loss": round(loss, 4)})
     if held_out:
         results = {k: round(v, 2) for k, v in scores(run.average, held_out, run.device).items()}

@@ -32,16 +32,27 @@ from model_zoo_defs.training.learning.learner import Schedule, export, follow
 from model_zoo_defs.training.learning.patterns import outliers, wrong_tracks
 from model_zoo_defs.training.learning.train import upgrade
 
-BATCH, RATE, STEPS = 4, 1.5e-3, 12_000
+# Samples in a step.
+BATCH = 4
+# Learning rate after the warm-up.
+RATE = 1.5e-3
+# Steps of a run, unless the command line says otherwise.
+STEPS = 12_000
+# Rows and columns of a sample's image.
 WINDOW = (384, 512)
-# a strip of the image with so many points is enough of a sample
+# A strip of the image with so many points is enough of a sample.
 MOST_POINTS = 3000
-OUTLIERS_IN, MOST_OUTLIERS = 0.6, 0.35
-# fractions of the samples: of those with outliers the ones with wrong tracks, and of all the ones
-# whose image is moved away from the points or shows little or nothing
-TRACKS_IN, MOVED_IN, FLAT_IN = 0.25, 0.15, 0.25
-# |error of log depth| below which a point is an inlier, and above which it is an outlier
-INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
+# Fraction of the samples that outliers are added to, and most of their fraction there.
+OUTLIERS_IN = 0.6
+MOST_OUTLIERS = 0.35
+# Fraction of the samples with outliers whose outliers are wrong tracks.
+TRACKS_IN = 0.25
+# Fractions of all samples: the image is moved away from the points; it shows little or nothing.
+MOVED_IN = 0.15
+FLAT_IN = 0.25
+# |error of log depth| below which a point is an inlier, and above which it is an outlier.
+INLIER_ERROR = 0.05
+OUTLIER_ERROR = 0.2
 
 
 class Example(NamedTuple):
