@@ -26,9 +26,6 @@ from model_zoo_defs.training.learning import priors
 from model_zoo_defs.training.learning.patterns import draw
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
-# Samples after which shards that came since are read.
-REFRESH_EVERY = 2000
-
 
 class Sample(NamedTuple):
     """rgb (3, H, W) normalised; sparse, depth and prior (1, H, W) metres, 0 = unknown."""
@@ -40,26 +37,20 @@ class Sample(NamedTuple):
 
 
 class Frames:
-    """All frames of some folders' shards; `refresh` adds shards that came since.
+    """All frames of some folders' shards, folder by folder, in the order of their names.
 
     The arrays are memory-mapped: parallel runs use the same page cache.
     """
 
     def __init__(self, *folders: Path):
-        self.folders = folders
         self.frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
-        self._read: set[Path] = set()
-        self.refresh()
-        if not self.frames:
-            raise FileNotFoundError(f"no shard (*.npz) in {', '.join(map(str, folders))}")
-
-    def refresh(self) -> None:
-        """Reads the shards not read so far, folder by folder, in the order of their names."""
-        for path in (path for folder in self.folders for path in sorted(folder.glob("*.npz"))):
-            if path not in self._read:
+        for folder in folders:
+            for path in sorted(folder.glob("*.npz")):
                 shard = mapped(path)
                 self.frames += list(zip(shard["rgb"], shard["depth"], strict=True))
-                self._read.add(path)
+        if not self.frames:
+            names = ", ".join(map(str, folders))
+            raise FileNotFoundError(f"no shard (*.npz) in {names}: render some first")
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -96,17 +87,16 @@ class Samples(Dataset[Sample]):
         self, folders: tuple[Path, ...], size: tuple[int, int], seed: int,
         prior_fraction: float = priors.PRIOR_FRACTION,
     ):  # fmt: skip
-        self.folders, self.size, self.seed = folders, size, seed
+        self.folders = folders
+        self.size = size
+        self.seed = seed
         self.prior_fraction = prior_fraction
         self.frames: Frames | None = None
-        self._calls = 0
 
     def __getitem__(self, index: int) -> Sample:
+        # A process of the loader opens the shards itself.
         if self.frames is None:
             self.frames = Frames(*self.folders)
-        self._calls += 1
-        if self._calls % REFRESH_EVERY == 0:
-            self.frames.refresh()
         rng = np.random.default_rng((self.seed, index))
         while True:
             rgb, depth = self.frames[int(rng.integers(len(self.frames)))]

@@ -49,8 +49,8 @@ def make_drive(folder: Path) -> None:
         (float(plan.high[0]) * 0.55, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=_SIZE
     )
     start = replace(start, fx=_FOCAL_PX, fy=_FOCAL_PX, cx=_CX, cy=_CY)
-    for part in ("rgb", "sparse", "gt", "calib"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+    for kind in ("rgb", "sparse", "gt", "calib"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
     turn = laser_axes()
     for number in range(FRAMES):
         name = f"drive_{number:03}"
