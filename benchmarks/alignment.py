@@ -103,7 +103,8 @@ def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> f
     """The MAE of plain least squares in the quantity that the network gives."""
     reading = alignment._READINGS[TRUE.get(case.output, case.output)]
     d = points.depth.double()
-    low, high = float(d.min()) / 10, float(d.max()) * 10
+    low = float(d.min()) / 10
+    high = float(d.max()) * 10
     at = to_space(torch.from_numpy(x), reading.output).numpy()
     scale, shift = np.polyfit(at, to_space(d, reading.space).numpy(), 1)
     line = scale * to_space(torch.from_numpy(case.x), reading.output) + shift
@@ -157,7 +158,8 @@ def case_of(
 ) -> Case:
     """The case of a network's map (H, W), NaN where unknown, and a frame's ground truth."""
     rows, columns = _drawn((gt > 0) & np.isfinite(x), rng)
-    numbers, depth = x[rows, columns].astype(float), gt[rows, columns].astype(float)
+    numbers = x[rows, columns].astype(float)
+    depth = gt[rows, columns].astype(float)
     return Case(set=set_name, network=network, output=output, x=numbers, depth=depth)
 
 

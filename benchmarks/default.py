@@ -127,8 +127,10 @@ def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
     assert refined.valid is not None
     known = (gt > 0) & (refined.depth > 0)
     error, sigma = np.abs(gt - refined.depth)[known], refined.sigma[known]
-    relative, large = sigma / refined.depth[known], error > LARGE_ERROR * gt[known]
-    masked, uncertain = ~refined.valid[known], relative > np.quantile(relative, 1 - MASKED)
+    relative = sigma / refined.depth[known]
+    large = error > LARGE_ERROR * gt[known]
+    masked = ~refined.valid[known]
+    uncertain = relative > np.quantile(relative, 1 - MASKED)
     return {
         "within": [float((error <= multiple * sigma).mean()) for multiple in MULTIPLES],
         "large": float(large.mean()),

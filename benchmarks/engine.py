@@ -30,7 +30,12 @@ from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
-ITERATIONS, STEP, POINTS = 5, 0.01, 500
+ITERATIONS = 5
+"""K of the paper."""
+STEP = 0.01
+"""α of the paper."""
+POINTS = 500
+"""Points that the loss is taken at, as in most rows of the paper's tables."""
 SETTINGS = ClosedSettings(iterations=ITERATIONS, lr=STEP)
 COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 """What gives the same, bit for bit."""

@@ -151,7 +151,8 @@ class Light(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3, 24, 3, 2, 1)
-        stages, inputs = list[nn.Module](), 24
+        stages = list[nn.Module]()
+        inputs = 24
         for outputs, count in self.STAGES:
             blocks = [Block(inputs, outputs, 2 if stages else 1)]
             blocks += [Block(outputs, outputs, 1) for _ in range(count - 1)]
@@ -164,7 +165,8 @@ class Light(nn.Module):
         self.head = nn.Conv2d(channels[-1], 1, 3, padding=1)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        x, skips = self.stem(rgb), list[Tensor]()
+        x = self.stem(rgb)
+        skips = list[Tensor]()
         for stage in self.stages:
             x = stage(x)
             skips.append(x)
@@ -193,7 +195,8 @@ def light_onnx(path: Path) -> str:
 
 def cases(folder: Path, fastdepth: Path | None) -> list[Case]:
     """The networks, written to a folder."""
-    small, hybrid = anything_small(folder / "anything-small"), dpt_hybrid(folder / "dpt-hybrid")
+    small = anything_small(folder / "anything-small")
+    hybrid = dpt_hybrid(folder / "dpt-hybrid")
     listed = [
         Case("Depth Anything V2 Small", small, BARE_FOLDER, (518, 686)),
         Case("DPT Hybrid", hybrid, BARE_FOLDER, (384, 384)),
@@ -209,7 +212,8 @@ def cases(folder: Path, fastdepth: Path | None) -> list[Case]:
 def run(command: list[str], cache: Path) -> Spent:
     """Runs a process on one thread. Its output is shown only if it fails."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PNPDEPTH_CACHE": str(cache)}
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start = time.perf_counter()
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, cwd=ROOT, env=environment
     )
@@ -223,7 +227,8 @@ def run(command: list[str], cache: Path) -> Spent:
 
 def measure(case: Case, folder: Path, runs: int) -> dict[str, list[Spent]]:
     """What each of the three processes took, in turn."""
-    python, files = sys.executable, [str(SAMPLE / "rgb.png"), "--sparse"]
+    python = sys.executable
+    files = [str(SAMPLE / "rgb.png"), "--sparse"]
     files += [str(SAMPLE / "sparse.png"), "--gt", str(SAMPLE / "gt.png")]
     refine = [python, "-m", "pnpdepth_cli", "refine", *files, "--model", case.model]
     refine += ["-o", str(folder / "out"), "--overwrite"]

@@ -52,7 +52,8 @@ class EvalFrame:
         else:
             depth = self.gt if self.pool is None else self.pool
             rows, columns = np.nonzero(depth > 0)
-            count, generator = min(count, len(rows)), np.random.default_rng(seed)
+            count = min(count, len(rows))
+            generator = np.random.default_rng(seed)
             chosen = generator.choice(len(rows), count, replace=False)
             rows, columns = rows[chosen], columns[chosen]
         xy = np.stack([columns, rows], axis=1).astype(np.float32)
@@ -172,7 +173,8 @@ def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoi
     """So many of the points at random depths, from half the nearest to twice the farthest."""
     generator = torch.Generator().manual_seed(seed)
     outlier = torch.rand(len(points), generator=generator) < fraction
-    low, high = float(points.depth.min()) / 2, float(points.depth.max()) * 2
+    low = float(points.depth.min()) / 2
+    high = float(points.depth.max()) * 2
     random = low + (high - low) * torch.rand(len(points), generator=generator)
     return replace(points, depth=torch.where(outlier, random, points.depth))
 
@@ -187,7 +189,8 @@ def with_wrong_factors(points: SparsePoints, fraction: float, seed: int) -> Spar
 
 def with_wrong_tracks(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
     """So many of the points in groups of up to 6 neighbours, each times exp(0.5 n), n normal."""
-    rng, xy = np.random.default_rng(seed), points.xy.numpy()
+    rng = np.random.default_rng(seed)
+    xy = points.xy.numpy()
     factor = np.ones(len(xy), np.float32)
     while (factor != 1).mean() < fraction:
         near = np.argsort(((xy - xy[rng.integers(len(xy))]) ** 2).sum(axis=1))[:6]

@@ -84,7 +84,8 @@ def sfmlearner_front(network: DispNet, rgb: Tensor) -> Any:
 
 
 def sfmlearner_rear(network: DispNet, z: Tensor, features: tuple[Tensor, ...]) -> Tensor:
-    x, disparity = z, None
+    x = z
+    disparity = None
     for level in range(7, 0, -1):
         beside = features[level - 1]
         x = sfmlearner.cropped(network.get_submodule(f"upconv{level}")(x), beside)
@@ -143,7 +144,8 @@ def sparse2dense_rear(network: SparseToDense, z: Tensor, size: Any) -> Tensor:
 
 def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
     """`decoder.s8`; the encoders' features at 1/4 and 1/2 and the size stay."""
-    image, points = network.rgb(rgb), network.sparse(sparse)
+    image = network.rgb(rgb)
+    points = network.sparse(sparse)
     x = network.fuse(torch.cat([image.pop(), points.pop()], dim=1))
     for level in LEVELS[:2]:
         x = network.decoder[level](x, image.pop(), points.pop())
@@ -158,7 +160,10 @@ def latefusion_rear(network: LateFusion, z: Tensor, kept: Any) -> Tensor:
     return 1 / (F.softplus(x) + 1 / FARTHEST)
 
 
-NYU, KITTI = (228, 304), (352, 1216)
+NYU = (228, 304)
+"""Rows and columns that the paper's networks for NYU take."""
+KITTI = (352, 1216)
+"""Rows and columns of the frames of KITTI's depth completion."""
 
 ZOO = (
     Case("eigen", "coarse.conv5", (3,), NYU, eigen_front, eigen_rear),

@@ -75,7 +75,8 @@ class Scores:
 def cut_holes(gt: Depth, seed: int) -> NDArray[np.uint8]:
     """Returns (H, W) the size of the hole that each pixel is in, 0 for none."""
     rng = np.random.default_rng(seed)
-    (height, width), size_of = gt.shape, np.zeros(gt.shape, np.uint8)
+    height, width = gt.shape
+    size_of = np.zeros(gt.shape, np.uint8)
     for size in reversed(SIZES):
         wanted = min(MOST, max(1, round(AREA / (0.55 * size * size))))
         for _ in range(TRIES):
@@ -116,12 +117,15 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
     errors: dict[int, list[Depth]] = {size: [] for size in SIZES}
     within: dict[int, list[Depth]] = {size: [] for size in SIZES}
     valid = list[NDArray[np.bool_]]()
-    changed, cpu, wall = list[float](), 0.0, 0.0
+    changed = list[float]()
+    cpu = 0.0
+    wall = 0.0
     frames = frames_of(name, data, half, count)
     for number, frame in enumerate(frames):
         size_of = cut_holes(frame.gt, number)
         holed = replace(frame, gt=np.where(size_of > 0, 0, frame.gt))
-        start, start_wall = time.process_time(), time.perf_counter()
+        start = time.process_time()
+        start_wall = time.perf_counter()
         result = filled(method, holed, data)
         cpu += time.process_time() - start
         wall += time.perf_counter() - start_wall

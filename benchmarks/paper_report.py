@@ -56,7 +56,8 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
     for row in rows:
         published = paper_row(row, street)
         if beside:
-            fine, points = published.fine, published.points or "LiDAR"
+            fine = published.fine
+            points = published.points or "LiDAR"
             before, after = (
                 dict(zip(MEASURES, figures, strict=True))
                 for figures in (published.before, published.after)

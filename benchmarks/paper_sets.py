@@ -17,8 +17,10 @@ from pnpdepth_cli.protocols import NYU_PART, FramePart
 from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import LIDARS, simulate_lidar
 
-ROOM_LIMIT, STREET_LIMIT = 10.0, 80.0
-"""Metres beyond which rendered ground truth counts as unknown: a Kinect's range, and KITTI's."""
+ROOM_LIMIT = 10.0
+"""Metres beyond which the ground truth of rooms counts as unknown: a Kinect's range."""
+STREET_LIMIT = 80.0
+"""Metres beyond which the ground truth of streets counts as unknown, as in KITTI's protocol."""
 
 SCANNER = LIDARS["hdl-64e"]
 VIEWS = 4  # of one scene; frames are rendered a scene at a time
@@ -124,7 +126,8 @@ def shared(root: Path, most: int) -> list[FrameSet]:
             continue
         count = min(most, len(every))
         chosen = [every[i] for i in np.linspace(0, len(every) - 1, count).astype(int)]
-        street, frames = every[0].sensor is not None, partial(iter, chosen)
+        street = every[0].sensor is not None
+        frames = partial(iter, chosen)
         sets.append(FrameSet(name, street, count, frames, beside_paper=False))
     if not sets:
         raise UsageError(f"{root} holds none of {', '.join(SETS)}; check --shared")

@@ -241,7 +241,8 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     """Prints the tables."""
-    args, began = parsed(), time.monotonic()
+    args = parsed()
+    began = time.monotonic()
     entries, notes = entries_of(args.only)
     tables = []
     for frame_set in sets_of(args, entries):

@@ -15,7 +15,12 @@ import numpy as np
 from benchmarks.frames import SETS, by_default, drawn_inputs, opened
 from pnpdepth_cli.measures import PROPAGATED
 
-FRAME, COUNT, SEED = "00025", 500, 0
+FRAME = "00025"
+"""Of ICL-NUIM."""
+COUNT = 500
+"""Points that are drawn."""
+SEED = 0
+"""Random seed of the points."""
 
 
 @click.command()

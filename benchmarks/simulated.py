@@ -163,9 +163,11 @@ def weakened(gt: Depth, error: float, rng: Generator) -> Depth:
     blur_px = EDGE_BLUR_PX
     while off(0.0, blur_px) > MOST_OF_BLUR * error:
         blur_px /= 2
-    low, high = 0.0, error
+    low = 0.0
+    high = error
     while off(high, blur_px) < error:
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
     for _ in range(12):
         middle = (low + high) / 2
         low, high = (middle, high) if off(middle, blur_px) < error else (low, middle)
@@ -178,7 +180,8 @@ def error_aligned(depth: Depth, gt: Depth) -> float:
     The fit is that of least squares of true / aligned, over the pixels with ground truth.
     """
     known = gt > 0
-    x, true = 1 / depth[known].astype(np.float64), gt[known].astype(np.float64)
+    x = 1 / depth[known].astype(np.float64)
+    true = gt[known].astype(np.float64)
     system = np.stack([x * true, true], axis=1)
     scale, shift = np.linalg.lstsq(system.T @ system, system.sum(axis=0), rcond=None)[0]
     aligned = 1 / np.maximum(scale * x + shift, 0.1 / true.max())

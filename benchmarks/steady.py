@@ -219,7 +219,8 @@ class TiedLines:
         self._maps, self._points = maps, points
         at_points = [p.sample(x).double().numpy() for x, p in zip(maps, points, strict=True)]
         together = np.concatenate(at_points)
-        self._centre, self._spread = float(np.median(together)), float(together.std())
+        self._centre = float(np.median(together))
+        self._spread = float(together.std())
         disparity = [1 / p.depth.double().numpy() for p in points]
         self._typical = float(np.median(np.concatenate(disparity)))
         # A row for each point: (level, slope)·row is 1 where the line is exact.

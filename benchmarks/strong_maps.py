@@ -76,8 +76,10 @@ STORED = {
 """By folder of `strong/`."""
 LEAST_TRUTH = 10
 """Pixels with ground truth for each point that is drawn; most of the truth is left to score on."""
-LINE_ROWS, LINE_COLUMNS = 8, 2
-"""Rows from scan line to scan line, and columns from point to point, of lines drawn from truth."""
+LINE_ROWS = 8
+"""Rows from scan line to scan line, of lines that are drawn from truth."""
+LINE_COLUMNS = 2
+"""Columns from point to point on such a line."""
 
 ERRORS = {"simulated, 2 %": 0.02, "simulated, 4 %": 0.04, "simulated, 9 %": 0.09}
 """Errors after alignment of the simulated networks, by row."""

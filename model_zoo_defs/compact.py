@@ -203,7 +203,8 @@ class Compact(nn.Module):
         for level, stride in STRIDES.items():
             size = image[level].shape[-2:]
             if level == "s16":
-                before, candidates = depth, fit.estimates
+                before = depth
+                candidates = fit.estimates
             else:
                 before = resize(depth, size)
                 candidates = F.interpolate(neighbours(depth), scale_factor=2.0, mode="nearest")
@@ -224,7 +225,8 @@ class Compact(nn.Module):
             yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
             extra = [resize(fit.distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
-                extra, features = [F.pixel_unshuffle(rgb, 2)], self.narrow(features)
+                extra = [F.pixel_unshuffle(rgb, 2)]
+                features = self.narrow(features)
         depth = self._enlarge(features, depth, guide, fit.of_prior)
         yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
 

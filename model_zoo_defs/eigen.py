@@ -48,7 +48,8 @@ class Coarse(nn.Module):
         self.conv5 = nn.Conv2d(four, five, 3, stride=2)
         self.fc1 = nn.Linear(five * DEEP[0] * DEEP[1], hidden)
         self.fc2 = nn.Linear(hidden, OUT[0] * OUT[1])
-        self.relu, self.pool = nn.ReLU(), nn.MaxPool2d(2)
+        self.relu = nn.ReLU()
+        self.pool = nn.MaxPool2d(2)
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, rgb: Tensor) -> Tensor:
@@ -69,7 +70,8 @@ class Fine(nn.Module):
         self.conv1 = nn.Conv2d(3, channels - 1, 9, stride=2)
         self.conv2 = nn.Conv2d(channels, channels, 5, padding=2)
         self.conv3 = nn.Conv2d(channels, 1, 5, padding=2)
-        self.relu, self.pool = nn.ReLU(), nn.MaxPool2d(2)
+        self.relu = nn.ReLU()
+        self.pool = nn.MaxPool2d(2)
 
     def forward(self, rgb: Tensor, coarse: Tensor) -> Tensor:
         x = self.pool(self.relu(self.conv1(rgb)))

@@ -94,7 +94,9 @@ class Unpooling(nn.Module):
         b = self.ConvB(around[..., :-1, :])
         c = self.ConvC(around[..., :-1])
         d = self.ConvD(around[..., :-1, :-1])
-        even, odd = torch.stack([a, b], dim=3), torch.stack([c, d], dim=3)  # rows a, b, a, b, …
+        # Rows a, b, a, b, … and c, d, c, d, …
+        even = torch.stack([a, b], dim=3)
+        odd = torch.stack([c, d], dim=3)
         batch, channels, height, _, width = even.shape
         y = torch.stack([even, odd], dim=5).reshape(batch, channels, 2 * height, 2 * width)
         normed: Tensor = self.BN(y)
@@ -127,7 +129,8 @@ class FCRN(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3)
         self.bn_conv1 = batch_norm(width)
-        self.relu, self.pool = nn.ReLU(), MaxPoolSame()
+        self.relu = nn.ReLU()
+        self.pool = MaxPoolSame()
         channels = width
         self.trunk: list[str] = []
         for stage, (name, count) in enumerate(BLOCKS.items()):

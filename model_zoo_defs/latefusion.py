@@ -57,7 +57,8 @@ class Halved(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x = F.relu(x)
-        even, odd = self.even(x[..., ::2, ::2]), self.odd(x[..., 1::2, 1::2])
+        even = self.even(x[..., ::2, ::2])
+        odd = self.odd(x[..., 1::2, 1::2])
         return self.norm(torch.cat([even, odd], dim=1))  # type: ignore[no-any-return]
 
 
@@ -85,13 +86,15 @@ class NormalCell(nn.Module):
         super().__init__()
         self.earlier = fitted(earlier, width, halved)
         self.later = pointwise(later, width)
-        self.later5, self.later3 = separable(width, width, 5), separable(width, width, 3)
+        self.later5 = separable(width, width, 5)
+        self.later3 = separable(width, width, 3)
         self.earlier5 = separable(width, width, 5)
         self.earlier3 = separable(width, width, 3)
         self.earlier3_too = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        p, h = self.earlier(earlier), self.later(later)
+        p = self.earlier(earlier)
+        h = self.later(later)
         parts = [
             p,
             self.later5(h) + self.earlier3(p),
@@ -125,7 +128,8 @@ class ReductionCell(nn.Module):
         self.first3 = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        p, h = self.earlier(earlier), self.later(later)
+        p = self.earlier(earlier)
+        h = self.later(later)
         first = self.later5(h) + self.earlier7(p)
         largest = F.max_pool2d(h, 3, 2, 1)
         second = largest + self.earlier7_too(p)
@@ -149,11 +153,14 @@ class Stage(nn.Module):
     ) -> None:
         super().__init__()
         self.cells = nn.ModuleList([ReductionCell(earlier, later, reduced, halved=halved)])
-        self.earlier, self.later = later, 4 * reduced  # channels of the last two features
+        # Channels of the last two features.
+        self.earlier = later
+        self.later = 4 * reduced
         for number in range(count):
             cell = NormalCell(self.earlier, self.later, normal, halved=number == 0)
             self.cells.append(cell)
-            self.earlier, self.later = self.later, 6 * normal
+            self.earlier = self.later
+            self.later = 6 * normal
 
     def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
         for cell in self.cells:
@@ -168,7 +175,9 @@ class Encoder(nn.Module):
         super().__init__()
         stem = width * 8 // 11  # NASNet's 32 before its 44
         self.stem = nn.Conv2d(channels, stem, 3, 2, 1)  # without batch norm, as in the paper
-        earlier, later, halved = None, stem, False
+        earlier = None
+        later = stem
+        halved = False
         self.channels = [stem]
         self.stages = nn.ModuleList()
         for reduced, normal, count in (
@@ -178,13 +187,16 @@ class Encoder(nn.Module):
             (4 * width, 4 * width, cells),
         ):
             stage = Stage(earlier, later, reduced, normal, count, halved=halved)
-            earlier, later, halved = stage.earlier, stage.later, count == 0
+            earlier = stage.earlier
+            later = stage.later
+            halved = count == 0
             self.stages.append(stage)
             self.channels.append(later)
 
     def forward(self, x: Tensor) -> list[Tensor]:
         later = self.stem(x)
-        earlier, features = later, [later]
+        earlier = later
+        features = [later]
         for stage in self.stages:
             earlier, later = stage(earlier, later)
             features.append(later)
@@ -219,7 +231,8 @@ class LateFusion(nn.Module):
 
     def __init__(self, width: int = 44, cells: int = 4) -> None:
         super().__init__()
-        self.rgb, self.sparse = Encoder(3, width, cells), Encoder(1, width, cells)
+        self.rgb = Encoder(3, width, cells)
+        self.sparse = Encoder(1, width, cells)
         *skips, deepest = (2 * count for count in self.rgb.channels)
         before = 4 * width
         self.fuse = convolved(deepest, before)
@@ -232,7 +245,8 @@ class LateFusion(nn.Module):
         nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-        rgb_skips, sparse_skips = self.rgb(rgb), self.sparse(sparse)
+        rgb_skips = self.rgb(rgb)
+        sparse_skips = self.sparse(sparse)
         x = self.fuse(torch.cat([rgb_skips.pop(), sparse_skips.pop()], dim=1))
         for layer in self.decoder.values():
             x = layer(x, rgb_skips.pop(), sparse_skips.pop())

@@ -21,7 +21,9 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation, Settings
 
-GAIN, FLOOR = 10.0, 0.01  # disparity is between FLOOR and GAIN + FLOOR
+# Disparity is between FLOOR and GAIN + FLOOR, as published.
+GAIN = 10.0
+FLOOR = 0.01
 DOWN = (1, 2, 4, 8, 16, 16, 16)  # channels of conv1 … conv7, in units of `width`
 DOWN_KERNELS = (7, 5, 3, 3, 3, 3, 3)
 UP = (1, 2, 4, 8, 16, 32, 32)  # channels of upconv1 … upconv7, in units of half a `width`

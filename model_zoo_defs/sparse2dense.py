@@ -85,7 +85,8 @@ def stages(depth: int, width: int = WIDTH) -> tuple[list[nn.Sequential], int]:
         width: Input channels of the first stage.
     """
     block = Bottleneck if depth >= 50 else BasicBlock
-    channels, built = width, []
+    channels = width
+    built = []
     for index, count in enumerate(BLOCKS[depth]):
         inner = width * 2**index
         blocks = []
@@ -149,7 +150,8 @@ class SparseToDense(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(4, width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
-        self.relu, self.maxpool = nn.ReLU(), nn.MaxPool2d(3, 2, 1)
+        self.relu = nn.ReLU()
+        self.maxpool = nn.MaxPool2d(3, 2, 1)
         (self.layer1, self.layer2, self.layer3, self.layer4), channels = stages(depth, width)
         channels //= 2
         self.conv2 = nn.Conv2d(2 * channels, channels, 1, bias=False)
@@ -170,7 +172,8 @@ class SparseToDense(nn.Module):
         return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
-NYU, KITTI = Fixed(228, 304), Fixed(228, 912, "crop")
+NYU = Fixed(228, 304)
+KITTI = Fixed(228, 912, "crop")
 
 _NYU = ModelDefinition(
     name="sparse2dense",

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from model_zoo_defs._compact.points import Points
 
+# How many of the nearest points send a message to a point.
 NEIGHBOURS = 12
 # How many points of a cell of the search grid, which holds about one, may be neighbours.
 CELL_POINTS = 3

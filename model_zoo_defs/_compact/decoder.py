@@ -20,12 +20,18 @@ STRIDES = {"s16": 16, "s8": 8, "s4": 4, "s2": 2}
 PRIOR_HINTS = {"s16": 3 * FIT_HEADS + 2, "s8": 4, "s4": 4, "s2": 4}
 # Untrained, a prior is followed where the points' residuals against it have a much smaller std
 # than the points: logit = bias + gain * reliability, less for neighbours than for the own cell.
-PRIOR_GAIN, PRIOR_BIAS, PRIOR_SIDE = 4.5, -3.0, -2.0
+PRIOR_GAIN = 4.5
+PRIOR_BIAS = -3.0
+PRIOR_SIDE = -2.0
 # The initial weights (as logits) make the untrained network a fair interpolator: follow the depth
 # so far, correct it by the residual of the own cell, else of the nearest ones.
-KEEP, STAY = 4.0, -2.0
-STAY_PUT, PULL = 6.0, -4.0
+KEEP = 4.0
+STAY = -2.0
+STAY_PUT = 6.0
+PULL = -4.0
+# Updates of spatial propagation at a level.
 PROPAGATION_STEPS = 6
+# Of the residuals in the 3×3 cells: the own one, then the four beside it, then the corners.
 NEIGHBOURS = (-0.5, 0.5, -0.5, 0.5, 2.5, 0.5, -0.5, 0.5, -0.5)
 
 
@@ -176,7 +182,8 @@ def prior_candidates(
     if level == "s16":
         return fit.estimates, fit.valid, fit.reliability
     stride = STRIDES[level]
-    (value, valid), (coarse, known) = prior.at(stride), prior.at(2 * stride)
+    value, valid = prior.at(stride)
+    coarse, known = prior.at(2 * stride)
     both = torch.cat([neighbours(depth - coarse), neighbours(known)], 1)
     offset, known = F.interpolate(both, scale_factor=2.0, mode="nearest").chunk(2, 1)
     reliability = resize(fit.reliability.mean(1, keepdim=True), value.shape[-2:])

@@ -12,8 +12,11 @@ from model_zoo_defs._compact.encoder import ENCODER_CHANNELS
 from model_zoo_defs._compact.points import MASKED, Points, resize
 from model_zoo_defs._compact.prior import Prior
 
+# Planes that are fitted to each cell, with weights of their own.
 FIT_HEADS = 4
+# Numbers in a key or query of a cell, which say how far a point counts there.
 FIT_KEY = 16
+# So many cells are fitted at a time: bounds the memory.
 FIT_CHUNK = 1024
 
 
@@ -77,10 +80,12 @@ class PointFit(nn.Module):
         seen = cells[-1].any(0)
         if not bool(seen.any()):
             return self._without_points(near, prior)
-        keys, cells = keys[:, :, seen], [x[..., seen] for x in cells]
+        keys = keys[:, :, seen]
+        cells = [x[..., seen] for x in cells]
         centres = _cell_grid(height, width, near).flatten(1)
         middle = centres.mean(1, keepdim=True)  # small numbers keep the moments exact
-        centres, cells[0] = centres - middle, cells[0] - middle
+        centres = centres - middle
+        cells[0] = cells[0] - middle
         # The moments are small differences of large sums, which bfloat16 would leave nothing of.
         with torch.autocast(near.device.type, enabled=False):
             parts = [
@@ -120,7 +125,8 @@ class PointFit(nn.Module):
         In order: position (B, 2, cells), value and log weight; with a prior, the residual against
         it and the fraction of points where it is known; last, whether the cell has a point.
         """
-        weight, value = points.at(points.weight), points.at(points.value)
+        weight = points.at(points.weight)
+        value = points.at(points.value)
         here = [position / 16.0 * weight.detach() for position in points.positions()]
         parts = [torch.ones_like(weight), weight, value * weight, *here]
         if prior is not None:
@@ -180,12 +186,17 @@ class PointFit(nn.Module):
         moments (B, heads, cells, 8): weighted means of y, x, z, yy, xx, xy, yz and xz.
         """
         my, mx, mz, yy, xx, xy, yz, xz = moments.unbind(-1)
-        yy, xx = (yy - my * my).clamp(min=0.0), (xx - mx * mx).clamp(min=0.0)
-        xy, yz, xz = xy - mx * my, yz - my * mz, xz - mx * mz
+        yy = (yy - my * my).clamp(min=0.0)
+        xx = (xx - mx * mx).clamp(min=0.0)
+        xy = xy - mx * my
+        yz = yz - my * mz
+        xz = xz - mx * mz
         damping = self.ridge.exp().view(1, -1, 1) * (yy + xx) + 1e-2
-        yy, xx = yy + damping, xx + damping
+        yy = yy + damping
+        xx = xx + damping
         determinant = (yy * xx - xy * xy).clamp(min=1e-4)
-        slope_y, slope_x = (xx * yz - xy * xz) / determinant, (yy * xz - xy * yz) / determinant
+        slope_y = (xx * yz - xy * xz) / determinant
+        slope_x = (yy * xz - xy * yz) / determinant
         tilt = slope_y * (centres[0] - my) + slope_x * (centres[1] - mx)
         # far outside the points a plane runs away: half a unit of log depth is as far as it may go
         return mz + 0.5 * torch.tanh(tilt / 0.5)

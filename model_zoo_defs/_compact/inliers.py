@@ -15,13 +15,25 @@ from model_zoo_defs._compact.points import Points
 # The weight of a point as a function of its log odds of being an inlier: steep, because a softmax
 # over few candidates follows a doubtful point too far. Its half is at log odds of 2: an inlier
 # that is left out costs less than an outlier that is kept.
-STEEPNESS, THRESHOLD = 4.0, 2.0
+STEEPNESS = 4.0
+THRESHOLD = 2.0
 # Up to the first expected fraction of outliers in an image their log odds gain the margin, which
 # falls to 0 at the second: isolated points of clean images lie on thin objects.
-CLEAN_FRACTION, SPOILT_FRACTION, CLEAN_MARGIN = 0.045, 0.075, 7.0
-WIDTH, MESSAGE, ROUNDS, HEADS = 32, 48, 4, 4
-# numbers per pair of points: agreement in depth and in colour, and position
-AGREEMENT, COLOUR, POSITION = 6, 6, 5
+CLEAN_FRACTION = 0.045
+SPOILT_FRACTION = 0.075
+CLEAN_MARGIN = 7.0
+# Numbers in the state of a point.
+WIDTH = 32
+# Numbers in a message between two points.
+MESSAGE = 48
+# How often each point receives messages.
+ROUNDS = 4
+# Attention heads, over which the messages of the neighbours are weighed.
+HEADS = 4
+# Numbers for a pair of points: agreement in depth, agreement in colour, and position.
+AGREEMENT = 6
+COLOUR = 6
+POSITION = 5
 
 
 class InlierWeights(nn.Module):
@@ -81,7 +93,8 @@ class Messages(nn.Module):
         self.pair = _matrix(MESSAGE, AGREEMENT + COLOUR + POSITION)
         self.bias = nn.Parameter(torch.zeros(MESSAGE))
         self.neighbour = nn.Linear(WIDTH, MESSAGE, bias=False)
-        self.message, self.message_bias = _matrix(WIDTH, MESSAGE), nn.Parameter(torch.zeros(WIDTH))
+        self.message = _matrix(WIDTH, MESSAGE)
+        self.message_bias = nn.Parameter(torch.zeros(WIDTH))
         self.attention = _matrix(HEADS, MESSAGE)
         self.update = nn.Linear(4 * WIDTH, 2 * WIDTH)
         self.change = nn.Linear(2 * WIDTH, WIDTH)
@@ -105,7 +118,8 @@ class Messages(nn.Module):
 
     def _received(self, sent: Tensor, cloud: Cloud, some: slice, pairs: Tensor) -> Tensor:
         """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
-        near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
+        near = cloud.near[some]
+        found = cloud.found[some].unsqueeze(2)
         hidden = F.relu(F.linear(pairs, self.pair).add_(F.embedding(near, sent)), inplace=True)
         message = F.relu(F.linear(hidden, self.message, self.message_bias), inplace=True) * found
         attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)
@@ -121,7 +135,8 @@ def chunks(cloud: Cloud) -> list[slice]:
 
 def _pairs(cloud: Cloud, some: slice) -> Tensor:
     """What is known of some points and their neighbours (m, NEIGHBOURS, 17), 0 without one."""
-    near, found = cloud.near[some], cloud.found[some].unsqueeze(2)
+    near = cloud.near[some]
+    found = cloud.found[some].unsqueeze(2)
     table = torch.cat([cloud.value.unsqueeze(1), cloud.position, cloud.colour], 1)
     relative = F.embedding(near, table) - table[some].unsqueeze(1)
     difference, shift, colour = relative[..., 0], relative[..., 1:3], relative[..., 3:]

@@ -40,7 +40,8 @@ class Points:
         Sums over 2 x 2 pixels are all the residuals need; finer positions change them by less
         than half a pixel's slope.
         """
-        weight, value = self.at(self.weight), self.at(self.value)
+        weight = self.at(self.weight)
+        value = self.at(self.value)
         return self.pooled([torch.ones_like(weight), weight, weight * value, weight * value**2], 2)
 
     def at(self, values: Tensor) -> Tensor:
@@ -58,7 +59,8 @@ class Points:
             values: The k maps at the points, (n,) each.
             stride: A cell's side in pixels.
         """
-        count, (height, width) = len(self.mask), (n // stride for n in self.mask.shape[-2:])
+        count = len(self.mask)
+        (height, width) = (n // stride for n in self.mask.shape[-2:])
         row = self._image * height + self._row // stride
         cell = row * width + self._column // stride
         sums = self.mask.new_zeros(len(values), count * height * width)

@@ -43,7 +43,8 @@ class Prior:
         residual = points.at(points.value) - points.at(log_depth)
         valid = known * explains(residual, points.at(known), points, cloud)
         at_points = points.at(valid)
-        weight, residual = points.at(points.weight) * at_points, residual * at_points
+        weight = points.at(points.weight) * at_points
+        residual = residual * at_points
         moments = points.pooled([at_points, weight, weight * residual, weight * residual**2], 2)
         return cls(log_depth * valid, valid, weight, residual, moments)
 
@@ -75,7 +76,8 @@ def explains(residual: Tensor, known: Tensor, points: Points, cloud: Cloud) -> T
         points: The points.
         cloud: The same points with their neighbours.
     """
-    weight, near = points.at(points.weight)[cloud.chosen], cloud.near
+    weight = points.at(points.weight)[cloud.chosen]
+    near = cloud.near
     residual, known = residual[cloud.chosen], known[cloud.chosen]
     square = (cloud.position[near] - cloud.position.unsqueeze(1)).square().sum(2)
     share = cloud.found * known[near] * weight[near] / (square + 0.1)

@@ -24,8 +24,6 @@ from model_zoo_defs.training.learning.patterns import keep, scan_lines, uniform
 Depth = NDArray[np.float32]
 Points = Callable[[Generator, Depth], Depth]
 
-REFRESH_EVERY = 200
-
 
 class Batch(NamedTuple):
     """rgb (B, 3, h, w) in 0..1, sparse (B, 1, H, W) and depth (B, 1, H, W) metres, 0 = unknown."""
@@ -46,21 +44,18 @@ class Batches:
         self, folders: Sequence[Path], seed: int, points: Points | None = None, spliced: float = 0.0
     ):
         self.sets = [Frames(folder) for folder in folders]
-        self.seed, self.points, self.spliced = seed, points, spliced
-        self._calls = 0
+        self.seed = seed
+        self.points = points
+        self.spliced = spliced
 
     def batch(
         self, number: int, size: int, window: tuple[int, int], shown: tuple[int, int] | None = None
     ) -> Batch:
         """Batch number `number`: `size` windows (H, W), their images resized to `shown`."""
-        self._calls += 1
-        if self._calls % REFRESH_EVERY == 0:
-            for frames in self.sets:
-                frames.refresh()
         rng = np.random.default_rng((self.seed, number))
         windows = [self._one_or_two(rng, window) for _ in range(size)]
         depth = np.stack([depth for _, depth in windows])
-        sparse = np.stack([self._sparse(rng, one) for one in depth])
+        sparse = np.stack([self._sparse(rng, window_depth) for window_depth in depth])
         rgb = torch.from_numpy(np.stack([rgb for rgb, _ in windows])).permute(0, 3, 1, 2)
         rgb = rgb.contiguous(memory_format=torch.channels_last).float() / 255.0
         if shown:
@@ -71,23 +66,26 @@ class Batches:
     def _one_or_two(
         self, rng: Generator, window: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], Depth]:
-        one = self._window(rng, window)
+        first = self._window(rng, window)
         if self.spliced and rng.random() < self.spliced:
-            return spliced(rng, one, self._window(rng, window))
-        return one
+            return spliced(rng, first, self._window(rng, window))
+        return first
 
     def _window(self, rng: Generator, window: tuple[int, int]) -> tuple[NDArray[np.uint8], Depth]:
         frames = self.sets[int(rng.integers(len(self.sets)))]
         while True:
             rgb, depth = frames[int(rng.integers(len(frames)))]
             top, left = (
-                int(rng.integers(length - part + 1))
-                for length, part in zip(depth.shape, window, strict=True)
+                int(rng.integers(length - side + 1))
+                for length, side in zip(depth.shape, window, strict=True)
             )
-            part = (slice(top, top + window[0]), slice(left, left + window[1]))
-            rgb, depth = rgb[part], depth[part]
+            cut = (slice(top, top + window[0]), slice(left, left + window[1]))
+            rgb = rgb[cut]
+            depth = depth[cut]
             if rng.random() < 0.5:
-                rgb, depth = rgb[:, ::-1], depth[:, ::-1]
+                rgb = rgb[:, ::-1]
+                depth = depth[:, ::-1]
+            # A window of hardly any known depth teaches little.
             if np.count_nonzero(depth) > depth.size // 10:
                 return rgb, depth
 
@@ -104,8 +102,10 @@ def spliced(
     """
     width = one[1].shape[1]
     seam = int(rng.integers(width // 4, width - width // 4 + 1))
-    first, second = int(rng.integers(width - seam + 1)), int(rng.integers(seam + 1))
-    (left_rgb, left), (right_rgb, right) = one, other
+    first = int(rng.integers(width - seam + 1))
+    second = int(rng.integers(seam + 1))
+    left_rgb, left = one
+    right_rgb, right = other
     rgb = [left_rgb[:, first : first + seam], right_rgb[:, second : second + width - seam]]
     depth = [left[:, first : first + seam], right[:, second : second + width - seam]]
     return np.concatenate(rgb, axis=1), np.concatenate(depth, axis=1)
@@ -114,17 +114,21 @@ def spliced(
 def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
     """Images (B, 3, h, w) 0..1 with random exposure and colour, often permuted channels."""
 
-    def each(values: NDArray[np.float64]) -> Tensor:
+    def per_image(values: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(values.astype(np.float32)).view(len(rgb), -1, 1, 1)
 
     count = len(rgb)
     orders = [rng.permutation(3) if rng.random() < 0.5 else np.arange(3) for _ in range(count)]
-    rgb = torch.stack([one[torch.from_numpy(o)] for one, o in zip(rgb, orders, strict=True)])
-    rgb = rgb * each(np.exp(rng.normal(0.0, 0.2, (count, 1)) + rng.normal(0.0, 0.06, (count, 3))))
+    pairs = zip(rgb, orders, strict=True)
+    rgb = torch.stack([image[torch.from_numpy(order)] for image, order in pairs])
+    # Exposure and white balance, then saturation, contrast and gamma.
+    exposure = rng.normal(0.0, 0.2, (count, 1))
+    balance = rng.normal(0.0, 0.06, (count, 3))
+    rgb = rgb * per_image(np.exp(exposure + balance))
     grey = rgb.mean(1, keepdim=True)
-    rgb = grey + (rgb - grey) * each(rng.uniform(0.3, 1.3, count))
-    rgb = 0.5 + (rgb - 0.5) * each(rng.uniform(0.8, 1.2, count))
-    return rgb.clamp(0.0, 1.0) ** each(np.exp(rng.normal(0.0, 0.2, count)))
+    rgb = grey + (rgb - grey) * per_image(rng.uniform(0.3, 1.3, count))
+    rgb = 0.5 + (rgb - 0.5) * per_image(rng.uniform(0.8, 1.2, count))
+    return rgb.clamp(0.0, 1.0) ** per_image(np.exp(rng.normal(0.0, 0.2, count)))
 
 
 def some_points(rng: Generator, depth: Depth) -> Depth:

@@ -26,8 +26,6 @@ from model_zoo_defs.training.learning import priors
 from model_zoo_defs.training.learning.patterns import draw
 from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
-REFRESH_EVERY = 2000
-
 
 class Sample(NamedTuple):
     """rgb (3, H, W) normalised; sparse, depth and prior (1, H, W) metres, 0 = unknown."""
@@ -39,26 +37,20 @@ class Sample(NamedTuple):
 
 
 class Frames:
-    """All frames of some folders' shards; `refresh` adds shards that came since.
+    """All frames of some folders' shards, folder by folder, in the order of their names.
 
     The arrays are memory-mapped: parallel runs use the same page cache.
     """
 
     def __init__(self, *folders: Path):
-        self.folders = folders
         self.frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
-        self._read: set[Path] = set()
-        self.refresh()
-        if not self.frames:
-            raise FileNotFoundError(f"no shard (*.npz) in {', '.join(map(str, folders))}")
-
-    def refresh(self) -> None:
-        """Reads the shards not read so far, folder by folder, in the order of their names."""
-        for path in (path for folder in self.folders for path in sorted(folder.glob("*.npz"))):
-            if path not in self._read:
+        for folder in folders:
+            for path in sorted(folder.glob("*.npz")):
                 shard = mapped(path)
                 self.frames += list(zip(shard["rgb"], shard["depth"], strict=True))
-                self._read.add(path)
+        if not self.frames:
+            names = ", ".join(map(str, folders))
+            raise FileNotFoundError(f"no shard (*.npz) in {names}: render some first")
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -95,17 +87,16 @@ class Samples(Dataset[Sample]):
         self, folders: tuple[Path, ...], size: tuple[int, int], seed: int,
         prior_fraction: float = priors.PRIOR_FRACTION,
     ):  # fmt: skip
-        self.folders, self.size, self.seed = folders, size, seed
+        self.folders = folders
+        self.size = size
+        self.seed = seed
         self.prior_fraction = prior_fraction
         self.frames: Frames | None = None
-        self._calls = 0
 
     def __getitem__(self, index: int) -> Sample:
+        # A process of the loader opens the shards itself.
         if self.frames is None:
             self.frames = Frames(*self.folders)
-        self._calls += 1
-        if self._calls % REFRESH_EVERY == 0:
-            self.frames.refresh()
         rng = np.random.default_rng((self.seed, index))
         while True:
             rgb, depth = self.frames[int(rng.integers(len(self.frames)))]
@@ -144,7 +135,8 @@ def augmented(
     """
     image, distance = _zoomed_part(rng, rgb, depth, size)
     if rng.random() < 0.5:
-        image, distance = image.flip(-1), distance.flip(-1)
+        image = image.flip(-1)
+        distance = distance.flip(-1)
     distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
     sparse = draw(rng, distance.numpy(), image.mean(0).numpy())
     if rng.random() < 0.15:
@@ -176,8 +168,10 @@ def _zoomed_part(
     least = max(size[0] / height, size[1] / width)
     most = max(least, min(1.0, 2.5 * least))
     zoom = float(np.exp(rng.uniform(np.log(least), np.log(most))))
-    h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
-    top, left = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
+    h = min(height, round(size[0] / zoom))
+    w = min(width, round(size[1] / zoom))
+    top = int(rng.integers(height - h + 1))
+    left = int(rng.integers(width - w + 1))
     part = (slice(top, top + h), slice(left, left + w))
     image = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
     image = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from model_zoo_defs._compact.encoder import STAGES
 
+# Added to the variance by the published batch normalisation.
 EPSILON = 1e-3
 
 
@@ -43,7 +44,8 @@ def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 state |= _folded(
                     published, source + "_project_conv", source + "_bn2", target + "project"
                 )
-                number, index = number + 1, index + 1
+                number = number + 1
+                index = index + 1
     return state
 
 

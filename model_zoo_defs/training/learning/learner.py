@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+# Steps in which the learning rate rises from 0, unless the run says otherwise.
 WARM_UP_STEPS = 200
 
 
@@ -58,12 +59,14 @@ class Learner:
     def __init__(
         self, network: nn.Module, schedule: Schedule, out: Path, name: str, lanes: int = 1
     ):
-        self.schedule, self.out, self.name = schedule, out, name
+        self.schedule = schedule
+        self.out = out
+        self.name = name
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.network = network.to(self.device)
         self.average = copy.deepcopy(self.network)
-        for one in (self.network, self.average):
-            _channels_last(one)
+        _channels_last(self.network)
+        _channels_last(self.average)
         self.learnt = [p for p in self.network.parameters() if p.requires_grad]
         self.optimiser = torch.optim.AdamW(
             self.groups(), lr=schedule.lr, weight_decay=1e-2, fused=True
@@ -74,7 +77,8 @@ class Learner:
         self.pool = ThreadPoolExecutor(self.lanes)
         if self.lanes > 1:
             torch.set_num_threads(1)
-        self.step, self.elapsed_s = 0, 0.0
+        self.step = 0
+        self.elapsed_s = 0.0
 
     def groups(self) -> list[dict[str, Any]]:
         """The parameters for the optimiser; `factor` multiplies the learning rate of a group."""
@@ -139,7 +143,8 @@ class Learner:
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+        self.step = state["step"]
+        self.elapsed_s = state["elapsed_s"]
 
     @property
     def weights(self) -> Path:

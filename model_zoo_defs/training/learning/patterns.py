@@ -150,7 +150,8 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
     top = rng.uniform(0.0, 0.45) * height if rng.random() < 0.8 else 0.0
     lines = np.arange(top, height, spacing)
     across = np.arange(rng.uniform(0.0, stride), width, stride)
-    bow, tilt = rng.uniform(-0.04, 0.04) * height, rng.uniform(-0.03, 0.03) * height
+    bow = rng.uniform(-0.04, 0.04) * height
+    tilt = rng.uniform(-0.03, 0.03) * height
     position = across / width * 2.0 - 1.0
     rows = lines[:, None] + (bow * position**2 + tilt * position)[None, :]
     rows = rows + rng.normal(0.0, 0.3, rows.shape)
@@ -212,7 +213,8 @@ def outliers(rng: Generator, sparse: Depth, fraction: float) -> Depth:
     rows, columns = rows[chosen], columns[chosen]
     if not len(rows):
         return sparse
-    known, count = sparse[sparse > 0], len(rows)
+    known = sparse[sparse > 0]
+    count = len(rows)
     kind = rng.integers(4)
     if kind == 0:
         changed = (sparse[rows, columns] * np.exp(rng.normal(0.0, 0.7, count))).astype(np.float32)
@@ -233,8 +235,10 @@ def wrong_tracks(rng: Generator, sparse: Depth, fraction: float) -> Depth:
     Such are the points of wrong tracks of structure from motion.
     """
     rows, columns = np.nonzero(sparse)
-    out, left = sparse.copy(), round(fraction * len(rows))
-    spread, most = rng.uniform(0.2, 0.8), int(rng.integers(2, 13))
+    out = sparse.copy()
+    left = round(fraction * len(rows))
+    spread = rng.uniform(0.2, 0.8)
+    most = int(rng.integers(2, 13))
     while left > 0:
         size = min(max(int(rng.integers(2, most + 1)), len(rows) // 500), left)
         one = int(rng.integers(len(rows)))
@@ -250,7 +254,8 @@ def _shifted(x: Depth, down: int, right: int) -> Depth:
     height, width = x.shape
     reach = abs(down) + abs(right)
     padded = np.pad(x, reach)
-    top, left = reach - down, reach - right
+    top = reach - down
+    left = reach - right
     return padded[top : top + height, left : left + width].copy()
 
 
@@ -258,7 +263,8 @@ def _mask_at(
     shape: tuple[int, ...], rows: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> Mask:
     mask = np.zeros(shape, dtype=bool)
-    r, c = np.rint(rows).astype(int), np.rint(columns).astype(int)
+    r = np.rint(rows).astype(int)
+    c = np.rint(columns).astype(int)
     inside = (r >= 0) & (r < shape[0]) & (c >= 0) & (c < shape[1])
     mask[r[inside], c[inside]] = True
     return mask

@@ -19,6 +19,7 @@ from model_zoo_defs.training.learning.patterns import window
 
 Depth = NDArray[np.float32]
 
+# Fraction of the samples that have a prior, and of these the ones whose prior is unrelated depth.
 PRIOR_FRACTION = 0.55
 NONSENSE_FRACTION = 0.3
 
@@ -50,13 +51,16 @@ def aligned(prior: Depth, sparse: Depth, *, affine: bool) -> Depth:
     at = (sparse > 0) & (prior > 0)
     if not at.any():
         return prior
-    x, y = np.log(prior[at]), np.log(sparse[at])
-    slope, offset = 1.0, float(np.median(y - x))
+    x = np.log(prior[at])
+    y = np.log(sparse[at])
+    slope = 1.0
+    offset = float(np.median(y - x))
     if affine and len(x) >= 5:
         for _ in range(5):
             weight = 1.0 / np.maximum(np.abs(slope * x + offset - y), 0.02)
             weight /= weight.sum()
-            mx, my = float(weight @ x), float(weight @ y)
+            mx = float(weight @ x)
+            my = float(weight @ y)
             variance = float(weight @ (x - mx) ** 2) + 1e-4
             slope = float(np.clip(weight @ ((x - mx) * (y - my)) / variance, 0.3, 3.0))
             offset = my - slope * mx

@@ -34,9 +34,9 @@ def log_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
 def log_error_up_to_scale(depth: Tensor, ground_truth: Tensor) -> Tensor:
     """`log_error` after removing the mean of each image, plus 0.1 of that mean towards 10 m = 1."""
     losses = []
-    for one, other in zip(depth, ground_truth, strict=True):
-        known = other > 0
-        difference = smooth_log(one[known]) - torch.log(other[known] / 10.0)
+    for predicted, true in zip(depth, ground_truth, strict=True):
+        known = true > 0
+        difference = smooth_log(predicted[known]) - torch.log(true[known] / 10.0)
         mean = difference.mean()
         losses.append((difference - mean).abs().mean() + 0.1 * mean.abs())
     return torch.stack(losses).mean()
@@ -45,9 +45,9 @@ def log_error_up_to_scale(depth: Tensor, ground_truth: Tensor) -> Tensor:
 def relative_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
     """Mean log of the MAE of each image over its median depth: near and far scenes count alike."""
     losses = []
-    for one, other in zip(depth, ground_truth, strict=True):
-        known = other > 0
-        error = (one[known] - other[known]).abs().mean() / other[known].median()
+    for predicted, true in zip(depth, ground_truth, strict=True):
+        known = true > 0
+        error = (predicted[known] - true[known]).abs().mean() / true[known].median()
         losses.append(torch.log(error + 1e-2))
     return torch.stack(losses).mean()
 
@@ -56,9 +56,9 @@ def inverse_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
     """Mean log of the MAE of inverse depth of each image times its median depth."""
     inverse = 1.0 / depth.clamp(min=NEAREST) + (NEAREST - depth).clamp(min=0.0) / NEAREST**2
     losses = []
-    for one, other in zip(inverse, ground_truth, strict=True):
-        known = other > 0
-        error = (one[known] - 1.0 / other[known]).abs().mean() * other[known].median()
+    for predicted, true in zip(inverse, ground_truth, strict=True):
+        known = true > 0
+        error = (predicted[known] - 1.0 / true[known]).abs().mean() * true[known].median()
         losses.append(torch.log(error + 1e-2))
     return torch.stack(losses).mean()
 
@@ -150,11 +150,15 @@ class Recipe:
 
     def stage(self, progress: float) -> Stage:
         """The stage at this fraction of the run."""
-        return next((one for one in self.stages if progress < one.until), self.stages[-1])
+        return next((stage for stage in self.stages if progress < stage.until), self.stages[-1])
 
 
 KINECT = 10.0  # metres; windows of rooms look farther
-ROOM, STREET, QUARTER = (228, 304), (228, 912), (114, 152)
+# Rows and columns of the windows: what the paper's networks take for NYU and for KITTI, and a
+# quarter of NYU's pixels.
+ROOM = (228, 304)
+STREET = (228, 912)
+QUARTER = (114, 152)
 
 # metres straight from normalised features: rooms and streets together are learnt much more slowly
 WITH_POINTS = Recipe(

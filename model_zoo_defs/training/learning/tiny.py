@@ -191,7 +191,8 @@ def scores(run: TinyRun, frames: list[Batch]) -> dict[str, float]:
         if run.definition.output_scale != "metric":
             ours = ours * (ground_truth.median() / ours.median())
         ours = ours.clamp(min=1e-3)
-        error, ratio = ours - ground_truth, torch.maximum(ours / ground_truth, ground_truth / ours)
+        error = ours - ground_truth
+        ratio = torch.maximum(ours / ground_truth, ground_truth / ours)
         close = 100.0 * (ratio < 1.25).float().mean()
         rows.append([error.abs().mean(), error.square().mean().sqrt(), close])
     means = np.array(rows).mean(0)
@@ -211,7 +212,8 @@ def train(definition: ModelDefinition, recipe: Recipe, settings: Settings) -> Pa
     with bar, ThreadPoolExecutor(1) as ahead:
         coming = ahead.submit(run.batch, run.step)
         while run.progress < 1.0:
-            batch, coming = coming.result(), ahead.submit(run.batch, run.step + 1)
+            batch = coming.result()
+            coming = ahead.submit(run.batch, run.step + 1)
             loss = run.learn(batch)
             smooth = loss if math.isnan(smooth) else 0.99 * smooth + 0.01 * loss
             run.elapsed_s = time.monotonic() - began

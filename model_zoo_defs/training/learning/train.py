@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,39 +24,33 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from model_zoo_defs.compact import Compact
-from model_zoo_defs.training.learning import priors
 from model_zoo_defs.training.learning.dataset import Counting, Sample, Samples
 from model_zoo_defs.training.learning.encoder_weights import pretrained_encoder
 from model_zoo_defs.training.learning.learner import WARM_UP_STEPS, Learner, Schedule, append_row
 from model_zoo_defs.training.learning.validation import Case, cases, scores
 
-# Layers that the first generation of the network did not have; `upgrade` leaves them as they
-# are initialised, which changes no output without a prior.
-NEW_LAYERS = (
-    "propagation.",
-    "inlier_weights.",
-    "enter_prior.",
-    "weigh_prior.",
-    "enlarge_prior.",
-    "gain_prior",
-    "scale.",
-)
+# Weight of the loss of σ beside that of depth.
 SIGMA_WEIGHT = 0.1
-NEW_LAYER_FACTOR = 8.0
-# weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
+# Stages of the encoder that are trained if any are: those at 1/16 and 1/32.
+ENCODER_STAGES = ("s16", "s32")
+# Weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
 LEVEL_WEIGHTS = (0.15, 0.2, 0.3, 0.4, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """One training run; `minutes` ends it earlier than `steps` would, the schedule follows."""
+    """One training run.
+
+    start: weights to start from; without them the encoder is pretrained and the rest random.
+    decay: steps at the end in which the rate falls to 0; None: it falls throughout.
+    encoder_rate: of the encoder's last stages, over that of all else; 0: they are frozen.
+    """
 
     data: tuple[Path, ...]
     out: Path
     steps: int
     seed: int = 1
     val: Path | None = None
-    minutes: float | None = None
     batch: int = 8
     lanes: int = 2
     size: tuple[int, int] = (192, 256)
@@ -68,10 +62,7 @@ class Settings:
     decay: int | None = None
     warm_up: int = WARM_UP_STEPS
     averaging: float = 0.999
-    prior_fraction: float = priors.PRIOR_FRACTION
-    only: tuple[str, ...] = ()
     encoder_rate: float = 0.0
-    encoder_stages: tuple[str, ...] = ("s16", "s32")
     workers: int = 1
     resume: bool = False
 
@@ -86,37 +77,33 @@ class Run(Learner):
         network = Compact()
         if settings.pretrained:
             network.encoder.load_state_dict(pretrained_encoder())
-        self.new = upgrade(network, load_file(settings.start)) if settings.start else ()
+        if settings.start:
+            network.load_state_dict(load_file(settings.start))
         # The encoder is pretrained on photographs, which rendered frames differ from: it is frozen,
         # or its last stages are trained at a low rate.
         self.encoder_rate = settings.encoder_rate
         network.encoder.requires_grad_(False)
         if settings.encoder_rate > 0:
-            for stage in settings.encoder_stages:
+            for stage in ENCODER_STAGES:
                 network.encoder.stages[stage].requires_grad_(True)
-        if settings.only:
-            for name, parameter in network.named_parameters():
-                parameter.requires_grad_(any(layer in name for layer in settings.only))
-        # `train_inliers` trains it: the loss of depth makes it worse at outliers
+        # `train_inliers` trains it: the loss of depth makes it worse at outliers.
         network.inlier_weights.requires_grad_(False)
         schedule = Schedule(
-            lr=settings.lr, steps=settings.steps, minutes=settings.minutes,
-            averaging=settings.averaging, decay=settings.decay, warm_up=settings.warm_up,
+            lr=settings.lr, steps=settings.steps, averaging=settings.averaging,
+            decay=settings.decay, warm_up=settings.warm_up,
         )  # fmt: skip
         lanes = min(settings.lanes, settings.batch)
         super().__init__(network, schedule, settings.out, "compact", lanes)
         self.bfloat16 = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups: the encoder learns more slowly, untrained layers faster."""
+        """Parameter groups: the encoder learns more slowly."""
         groups: dict[float, list[nn.Parameter]] = {}
         for name, parameter in self.network.named_parameters():
             if parameter.requires_grad:
-                factor = NEW_LAYER_FACTOR if name in self.new else 1.0
-                if name.startswith("encoder."):
-                    factor = self.encoder_rate
+                factor = self.encoder_rate if name.startswith("encoder.") else 1.0
                 groups.setdefault(factor, []).append(parameter)
-        return [{"params": some, "factor": factor} for factor, some in groups.items()]
+        return [{"params": members, "factor": factor} for factor, members in groups.items()]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
         """Depth loss over all levels plus the weighted loss of sigma."""
@@ -127,22 +114,6 @@ class Run(Learner):
             sigma = self.network.sigma(outputs)
         of_sigma = sigma_loss(sigma, outputs.depths[-1], depth)
         return pyramid_loss(outputs.depths, depth) + SIGMA_WEIGHT * of_sigma
-
-
-def upgrade(network: Compact, weights: Mapping[str, Tensor]) -> list[str]:
-    """Loads the weights into the network; layers missing in them keep their initial weights.
-
-    Returns:
-        The names of the missing weights.
-    """
-    own = network.state_dict()
-    missing = sorted(name for name in own.keys() - weights.keys())
-    unknown = sorted(weights.keys() - own.keys())
-    unexplained = [name for name in missing if not any(layer in name for layer in NEW_LAYERS)]
-    if unknown or unexplained:
-        raise ValueError(f"not weights of compact: {', '.join((unknown + unexplained)[:5])}")
-    network.load_state_dict(own | dict(weights))
-    return missing
 
 
 def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:
@@ -186,7 +157,7 @@ def depth_loss(depth: Tensor, ground_truth: Tensor) -> Tensor:
 def _loader(settings: Settings, first_step: int) -> Iterable[Sample]:
     start = first_step * settings.batch
     numbers = Counting(start, (settings.steps - first_step) * settings.batch)
-    data = Samples(settings.data, settings.size, settings.seed, settings.prior_fraction)
+    data = Samples(settings.data, settings.size, settings.seed)
     return DataLoader(
         data, batch_size=settings.batch, sampler=numbers, num_workers=settings.workers,
         prefetch_factor=4 if settings.workers else None,
@@ -218,7 +189,8 @@ def train(settings: Settings) -> Path:
 
 def _report(run: Run, held_out: list[Case], loss: float) -> None:
     run.save()
-    out, now = run.out, {"step": float(run.step), "seconds": round(run.elapsed_s)}
+    out = run.out
+    now = {"step": float(run.step), "seconds": round(run.elapsed_s)}
     append_row(out / "log.csv", now | {"loss": round(loss, 4)})
     if held_out:
         results = {k: round(v, 2) for k, v in scores(run.average, held_out, run.device).items()}
@@ -241,7 +213,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, help="end after this long at the latest")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
     parser.add_argument(
         "--window", dest="size", type=_size, default=Settings.size, help="height x width in pixels"
@@ -253,19 +224,12 @@ def main() -> None:
     parser.add_argument("--warm-up", type=int, default=Settings.warm_up)
     parser.add_argument("--averaging", type=float, default=Settings.averaging)
     parser.add_argument("--encoder-rate", type=float, default=0.0, help="times the rate; 0: frozen")
-    parser.add_argument("--only", nargs="+", default=[], help="parts of names of layers to train")
-    parser.add_argument(
-        "--prior-share", dest="prior_fraction", type=float, default=Settings.prior_fraction,
-        help="fraction of samples with a prior",
-    )  # fmt: skip
-    parser.add_argument("--encoder-stages", nargs="+", default=["s16", "s32"])
     parser.add_argument("--save-every", type=int, default=Settings.save_every)
     parser.add_argument("--val-frames", type=int, default=Settings.val_frames)
     parser.add_argument("--lanes", type=int, default=Settings.lanes)
     parser.add_argument("--workers", type=int, default=Settings.workers)
     options = parser.parse_args()
-    lists = {name: tuple(vars(options)[name]) for name in ("data", "encoder_stages", "only")}
-    print(train(Settings(**vars(options) | lists)))
+    print(train(Settings(**vars(options) | {"data": tuple(options.data)})))
 
 
 if __name__ == "__main__":

@@ -30,18 +30,28 @@ from model_zoo_defs.compact import Compact
 from model_zoo_defs.training.learning.dataset import Samples
 from model_zoo_defs.training.learning.learner import Schedule, export, follow
 from model_zoo_defs.training.learning.patterns import outliers, wrong_tracks
-from model_zoo_defs.training.learning.train import upgrade
 
-BATCH, RATE, STEPS = 4, 1.5e-3, 12_000
+# Samples in a step.
+BATCH = 4
+# Learning rate after the warm-up.
+RATE = 1.5e-3
+# Steps of a run, unless the command line says otherwise.
+STEPS = 12_000
+# Rows and columns of a sample's image.
 WINDOW = (384, 512)
-# a strip of the image with so many points is enough of a sample
+# A strip of the image with so many points is enough of a sample.
 MOST_POINTS = 3000
-OUTLIERS_IN, MOST_OUTLIERS = 0.6, 0.35
-# fractions of the samples: of those with outliers the ones with wrong tracks, and of all the ones
-# whose image is moved away from the points or shows little or nothing
-TRACKS_IN, MOVED_IN, FLAT_IN = 0.25, 0.15, 0.25
-# |error of log depth| below which a point is an inlier, and above which it is an outlier
-INLIER_ERROR, OUTLIER_ERROR = 0.05, 0.2
+# Fraction of the samples that outliers are added to, and most of their fraction there.
+OUTLIERS_IN = 0.6
+MOST_OUTLIERS = 0.35
+# Fraction of the samples with outliers whose outliers are wrong tracks.
+TRACKS_IN = 0.25
+# Fractions of all samples: the image is moved away from the points; it shows little or nothing.
+MOVED_IN = 0.15
+FLAT_IN = 0.25
+# |error of log depth| below which a point is an inlier, and above which it is an outlier.
+INLIER_ERROR = 0.05
+OUTLIER_ERROR = 0.2
 
 
 class Example(NamedTuple):
@@ -56,7 +66,8 @@ class Examples(Dataset[Example]):
 
     def __init__(self, folders: tuple[Path, ...], count: int, seed: int):
         self.samples = Samples(folders, WINDOW, seed, prior_fraction=0.0)
-        self.count, self.seed = count, seed
+        self.count = count
+        self.seed = seed
 
     def __len__(self) -> int:
         return self.count
@@ -117,13 +128,14 @@ def inlier_targets(sparse: Tensor, ground_truth: Tensor) -> Tensor:
 
 def loss_of(layer: InlierWeights, examples: Sequence[Example]) -> Tensor:
     """Mean over the examples of the mean cross entropy of their points."""
-    cloud = Cloud.joined([one.cloud for one in examples])
+    cloud = Cloud.joined([example.cloud for example in examples])
     log_odds = layer.log_odds(cloud)
     total = log_odds.new_zeros(())
-    for logits, one in zip(torch.split(log_odds, list(cloud.counts)), examples, strict=True):
-        known = ~one.target.isnan()
+    per_example = torch.split(log_odds, list(cloud.counts))
+    for logits, (_, target) in zip(per_example, examples, strict=True):
+        known = ~target.isnan()
         if bool(known.any()):
-            total = total + F.binary_cross_entropy_with_logits(logits[known], one.target[known])
+            total = total + F.binary_cross_entropy_with_logits(logits[known], target[known])
     return total / len(examples)
 
 
@@ -180,7 +192,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     network = Compact()
-    upgrade(network, load_file(options.start))
+    network.load_state_dict(load_file(options.start))
     examples = drawn(tuple(options.data), options.samples, options.seed, options.workers)
     loss = fit(network.inlier_weights, examples, options.steps, options.seed)
     print(f"{len(examples)} samples, cross entropy {loss:.4f}")
@@ -188,7 +200,7 @@ def main() -> None:
     if options.val:
         held_out = drawn((options.val,), 300, options.seed + 1, options.workers)
         with torch.no_grad():
-            losses = [float(loss_of(network.inlier_weights, [one])) for one in held_out]
+            losses = [float(loss_of(network.inlier_weights, [example])) for example in held_out]
         print(f"{len(losses)} samples not trained on, cross entropy {np.mean(losses):.4f}")
 
 

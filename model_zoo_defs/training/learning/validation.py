@@ -112,5 +112,6 @@ def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[s
     result = {}
     for pattern, pairs in ratios.items():
         mae, rmse = np.exp(np.log(np.array(pairs) + 1e-9).mean(0)) * 100.0
-        result[f"{pattern}_mae"], result[f"{pattern}_rmse"] = float(mae), float(rmse)
+        result[f"{pattern}_mae"] = float(mae)
+        result[f"{pattern}_rmse"] = float(rmse)
     return result

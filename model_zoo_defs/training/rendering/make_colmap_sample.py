@@ -25,13 +25,21 @@ from model_zoo_defs.training.scenes.scenes import build, generator, pick_view
 from model_zoo_defs.training.scenes.world import View
 from pnpdepth_cli.sensors.lens import undistort
 
-SCENE, VIEW = 6, 1
+SCENE = 6
+"""Number of the room among those of the reserved seed."""
+VIEW = 1
+"""Number of the view that the first photo is taken near."""
 PHOTOS = 8
 WITH_GROUND_TRUTH = (3, 4)
-HEIGHT, WIDTH = 360, 480
+"""Numbers of the photos whose true depth is written."""
+HEIGHT = 360
+WIDTH = 480
 DISTORTION = (-0.12, 0.0, 0.0, 0.0)
+"""Of the lens: k1, k2, p1 and p2 of OpenCV's radial-tangential model."""
 _AMBIENT_RAYS = 8
+"""Rays a pixel for ambient occlusion."""
 _STEP_M = 0.12
+"""Distance between two photos."""
 _PIVOT_M = 3.0
 """Distance of the point that the camera keeps looking at."""
 

@@ -28,9 +28,16 @@ from model_zoo_defs.training.rendering.shading import seen
 from model_zoo_defs.training.scenes.scenes import build, generator
 from model_zoo_defs.training.scenes.world import looking
 
-FRAMES, STEP_M = 3, 0.6
+FRAMES = 3
+STEP_M = 0.6
+"""Distance from frame to frame."""
 _AMBIENT_RAYS = 12
-_SIZE, _FOCAL_PX, _CX, _CY = (187, 621), 360.77, 304.53, 86.18  # KITTI's camera at half the size
+"""Rays a pixel for ambient occlusion."""
+# KITTI's camera, as `make_samples` has it, at half the size.
+_SIZE = (187, 621)
+_FOCAL_PX = 360.77
+_CX = 304.53
+_CY = 86.18
 _POSE = "1 0 0 0 0 1 0 0 0 0 1 {ahead:g}\n"  # the camera moves along its own axis
 
 
@@ -42,11 +49,12 @@ def make_drive(folder: Path) -> None:
         (float(plan.high[0]) * 0.55, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=_SIZE
     )
     start = replace(start, fx=_FOCAL_PX, fy=_FOCAL_PX, cx=_CX, cy=_CY)
-    for part in ("rgb", "sparse", "gt", "calib"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+    for kind in ("rgb", "sparse", "gt", "calib"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
     turn = laser_axes()
     for number in range(FRAMES):
-        name, ahead = f"drive_{number:03}", STEP_M * number
+        name = f"drive_{number:03}"
+        ahead = STEP_M * number
         view = replace(
             start, position=start.position + (start.axes[:, 2] * ahead).astype(np.float32)
         )

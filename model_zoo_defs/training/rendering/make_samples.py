@@ -27,14 +27,21 @@ from model_zoo_defs.training.scenes.world import View, World, looking
 SAMPLE_SEED = 770077
 """Reserved for samples; training uses others."""
 
-INDOOR_SCENE, INDOOR_VIEW = 5, 1
+# Numbers of the scenes and of a view among those of the reserved seed.
+INDOOR_SCENE = 5
+INDOOR_VIEW = 1
 STREET_SCENE = 13
-
 UNREGISTERED_SCENE = 22
-_COLOUR_FOCAL, _COLOUR_ASIDE_M = 0.9, 0.025
-"""Focal length of the colour over the depth camera, and the distance between them."""
 
-INDOOR_SCALE, STREET_SCALE = 1000, 256
+_COLOUR_FOCAL = 0.9
+"""Focal length of the colour camera over that of the depth camera."""
+_COLOUR_ASIDE_M = 0.025
+"""Distance of the colour camera from the depth camera."""
+
+INDOOR_SCALE = 1000
+"""Integers a metre in a stored depth map of a room, as NYU has them."""
+STREET_SCALE = 256
+"""Integers a metre in a stored depth map of a street, as KITTI has them."""
 SPARSE_POINTS = 500
 
 _AMBIENT_RAYS = 24
@@ -42,14 +49,25 @@ _AMBIENT_RAYS = 24
 
 # The rectified left colour camera of KITTI's first recording day, and its offsets along x from
 # the reference camera (Geiger et al. 2013, calib_cam_to_cam.txt), rounded.
-_FOCAL_PX, _CX, _CY = 721.54, 609.56, 172.85
+_FOCAL_PX = 721.54
+_CX = 609.56
+_CY = 172.85
 _BASELINES_M = (0.0, -0.54, 0.06, -0.48)
 _LASER_IN_CAMERA = np.array([0.0, -0.08, -0.27])
 """Position of the scanner in the reference camera's frame (right, down, forward), metres."""
 
-_BEAMS, _TOP_DEG, _BOTTOM_DEG = 64, 2.0, -24.8
-_STEP_DEG, _SECTOR_DEG = 0.17, 120.0
-_RANGE_NOISE_M, _REACH_M = 0.015, 100.0
+# A scanner like KITTI's HDL-64E: beams, and the elevation of the first and of the last one.
+_BEAMS = 64
+_TOP_DEG = 2.0
+_BOTTOM_DEG = -24.8
+_STEP_DEG = 0.17
+"""Azimuth from point to point of a beam."""
+_SECTOR_DEG = 120.0
+"""Azimuth that is scanned, the image's field of view in its middle."""
+_RANGE_NOISE_M = 0.015
+"""Standard deviation of a range."""
+_REACH_M = 100.0
+"""Range beyond which nothing returns."""
 
 
 def make_indoor(folder: Path) -> None:

@@ -167,8 +167,10 @@ class MaterialTable:
         part = spot - corner
         low = corner.astype(np.int64)
         mask = (side - 1).astype(np.int64)
-        u0, v0 = low[:, 0] & mask, low[:, 1] & mask
-        u1, v1 = (low[:, 0] + 1) & mask, (low[:, 1] + 1) & mask
+        u0 = low[:, 0] & mask
+        v0 = low[:, 1] & mask
+        u1 = (low[:, 0] + 1) & mask
+        v1 = (low[:, 1] + 1) & mask
         fu, fv = part[:, :1], part[:, 1:]
         total = np.zeros((len(coordinates), 3), np.float32)
         for u, v, weight in (

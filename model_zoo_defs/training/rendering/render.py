@@ -11,8 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
-from PIL import Image
 from tqdm import tqdm
 
 from model_zoo_defs.training.scenes.scenes import (
@@ -93,40 +91,9 @@ def render_all(job: Job, *, workers: int) -> None:
                 progress.update(count)
 
 
-def coloured(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Returns an image of log depth, near warm and far cold, unknown black."""
-    known = depth > 0
-    if not known.any():
-        return np.zeros((*depth.shape, 3), np.uint8)
-    value = np.log(np.where(known, depth, 1.0))
-    low, high = np.percentile(value[known], (1, 99))
-    relative = np.clip((value - low) / max(high - low, 1e-6), 0, 1)
-    stops = np.array([[250, 240, 120], [240, 120, 60], [150, 40, 110], [40, 20, 90], [20, 60, 140]])
-    position = relative * (len(stops) - 1)
-    left = np.minimum(position.astype(int), len(stops) - 2)
-    part = (position - left)[..., None]
-    colour = stops[left] * (1 - part) + stops[left + 1] * part
-    return np.where(known[..., None], colour, 0).astype(np.uint8)
-
-
-def contact_sheet(job: Job, *, columns: int = 4) -> Image.Image:
-    """Returns one image of job.frames frames, one per scene, rgb above depth."""
-    images = []
-    for scene in range(job.frames):
-        frame = job.scene(scene)[0]
-        images.append(np.concatenate([frame.rgb, coloured(frame.depth)], axis=0))
-    while len(images) % columns:
-        images.append(np.zeros_like(images[0]))
-    rows = [
-        np.concatenate(images[start : start + columns], axis=1)
-        for start in range(0, len(images), columns)
-    ]
-    return Image.fromarray(np.concatenate(rows, axis=0))
-
-
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Render random scenes with exact depth.")
-    parser.add_argument("--out", type=Path, help="folder for the shards")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
     parser.add_argument("--frames", type=int, default=4000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
@@ -134,10 +101,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--shard-frames", type=int, default=64, help="a multiple of 4")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds to draw from")
     parser.add_argument("--camera", choices=tuple(CAMERAS), default="any")
-    parser.add_argument("--contact-sheet", type=Path, help="write one image of frames instead")
     chosen = parser.parse_args(arguments)
-    if chosen.out is None and chosen.contact_sheet is None:
-        parser.error("give --out, or --contact-sheet")
     unknown = set(chosen.kinds.split(",")) - set(KINDS)
     if unknown:
         parser.error(f"unknown kinds: {', '.join(sorted(unknown))}; known: {', '.join(KINDS)}")
@@ -149,9 +113,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Renders what the command line asks for."""
     chosen = _parsed(arguments)
-    height, width = (int(part) for part in chosen.size.split("x"))
+    height, width = (int(side) for side in chosen.size.split("x"))
     job = Job(
-        out=chosen.out or Path(),
+        out=chosen.out,
         seed=chosen.seed,
         height=height,
         width=width,
@@ -160,10 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         kinds=tuple(chosen.kinds.split(",")),
         camera=chosen.camera,
     )
-    if chosen.contact_sheet is not None:
-        contact_sheet(job).save(chosen.contact_sheet)
-    else:
-        render_all(job, workers=chosen.workers)
+    render_all(job, workers=chosen.workers)
 
 
 if __name__ == "__main__":

@@ -62,7 +62,8 @@ def _smoothed(visible: FloatArray, hits: Hits, shape: tuple[int, int]) -> FloatA
     tolerance = (0.02 + 0.01 * hits.t).reshape(shape)
     material = hits.material.reshape(shape)
     for axis in (0, 1):
-        total, weight = image.copy(), np.ones(shape, np.float32)
+        total = image.copy()
+        weight = np.ones(shape, np.float32)
         for step in (1, 2, 3):
             here = tuple(slice(step, None) if a == axis else slice(None) for a in (0, 1))
             there = tuple(slice(None, -step) if a == axis else slice(None) for a in (0, 1))

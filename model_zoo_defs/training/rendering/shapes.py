@@ -25,8 +25,12 @@ class Mesh:
 
 def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> FloatArray:
     """Returns the 3x3 matrix that turns about y (roll), then x (pitch), then z (yaw); radians."""
-    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    cr, sr = np.cos(roll), np.sin(roll)
+    cy = np.cos(yaw)
+    sy = np.sin(yaw)
+    cp = np.cos(pitch)
+    sp = np.sin(pitch)
+    cr = np.cos(roll)
+    sr = np.sin(roll)
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
@@ -85,7 +89,8 @@ class Group:
 def _moved(mesh: Mesh, at: Point, yaw: float, pitch: float, roll: float, scale: float) -> Mesh:
     offset = np.asarray(at, np.float32)
     if yaw == 0.0 and pitch == 0.0 and roll == 0.0:
-        vertices, normals = mesh.vertices * np.float32(scale) + offset, mesh.normals
+        vertices = mesh.vertices * np.float32(scale) + offset
+        normals = mesh.normals
     else:
         turn = rotation(yaw, pitch, roll).T
         vertices = mesh.vertices @ (turn * np.float32(scale)) + offset
@@ -109,7 +114,8 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 def quads(corners: npt.ArrayLike, uv: npt.ArrayLike | None = None) -> Mesh:
     """Returns flat four-cornered faces; corners (k, 4, 3) go round each, uv (k, 4, 2)."""
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
-    along, up = points[:, 1] - points[:, 0], points[:, 3] - points[:, 0]
+    along = points[:, 1] - points[:, 0]
+    up = points[:, 3] - points[:, 0]
     normal = np.cross(along, up)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     if uv is None:
@@ -153,7 +159,8 @@ def surface(points: npt.ArrayLike) -> Mesh:
     """Returns a smooth surface through a grid of points (rows, columns, 3)."""
     grid = np.asarray(points, np.float32)
     rows, columns = grid.shape[:2]
-    down, across = np.gradient(grid, axis=0), np.gradient(grid, axis=1)
+    down = np.gradient(grid, axis=0)
+    across = np.gradient(grid, axis=1)
     if np.allclose(grid[:, 0], grid[:, -1], atol=1e-6):
         across[:, 0] = across[:, -1] = (grid[:, 1] - grid[:, -2]) / 2
     if np.allclose(grid[0], grid[-1], atol=1e-6):

@@ -67,7 +67,8 @@ def near(rng: np.random.Generator, base: npt.ArrayLike, deviation: float = 0.08)
 
 def mixed(first: npt.ArrayLike, second: npt.ArrayLike, weight: FloatArray) -> FloatArray:
     """Returns the image (SIDE, SIDE, 3) of `first` at weight 0 and `second` at weight 1."""
-    a, b = np.asarray(first, np.float32), np.asarray(second, np.float32)
+    a = np.asarray(first, np.float32)
+    b = np.asarray(second, np.float32)
     return a + (b - a) * np.clip(weight, 0, 1)[..., None]
 
 
@@ -87,7 +88,8 @@ def _cells(
     column = np.floor(shifted) % columns
     table = rng.random((rows, columns), dtype=np.float32)
     value = table[row.astype(int), column.astype(int)]
-    du, dv = shifted % 1.0, (_V * rows) % 1.0
+    du = shifted % 1.0
+    dv = (_V * rows) % 1.0
     width = gap * columns / max(rows, columns)
     height = gap * rows / max(rows, columns)
     joint = (du < width) | (dv < height)
@@ -190,7 +192,8 @@ def _fabric(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 def _spots(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     count = int(rng.integers(3, 16))
-    du, dv = (_U * count) % 1 - 0.5, (_V * count + 0.5 * (np.floor(_U * count) % 2)) % 1 - 0.5
+    du = (_U * count) % 1 - 0.5
+    dv = (_V * count + 0.5 * (np.floor(_U * count) % 2)) % 1 - 0.5
     spot = (np.hypot(du, dv) < rng.uniform(0.15, 0.4)).astype(np.float32)
     return mixed(base, colour(rng, vivid=0.5), spot)
 

@@ -12,8 +12,10 @@ from model_zoo_defs.training.scenes.walls import Hole, wall
 def building(kit: Kit, width: float) -> Group:
     """Returns a house whose front lies along x at y = 0 and looks toward -y."""
     group = Group()
-    floors, storey = int(kit.rng.integers(1, 6)), kit.size(2.6, 3.4)
-    height, deep = floors * storey + kit.size(0.2, 1), kit.size(7, 12)
+    floors = int(kit.rng.integers(1, 6))
+    storey = kit.size(2.6, 3.4)
+    height = floors * storey + kit.size(0.2, 1)
+    deep = kit.size(7, 12)
     skin = kit.surface(
         "plaster",
         "plaster",
@@ -39,7 +41,9 @@ def building(kit: Kit, width: float) -> Group:
     recess = kit.size(0.06, 0.3)
     balcony = kit.chance(0.3)
     for u0, v0, u1, v1 in holes:
-        x, w, h = (u0 + u1) / 2 - width / 2, u1 - u0, v1 - v0
+        x = (u0 + u1) / 2 - width / 2
+        w = u1 - u0
+        h = v1 - v0
         curtain = glass if kit.chance(0.6) else kit.surface("plain", "stripes", vivid=0.1)
         group.add(box(w, 0.02, h), curtain, (x, recess, v0))
         reveal, sill = (0.01, recess, h), (w + 0.15, recess + 0.1, 0.05)
@@ -70,7 +74,9 @@ def building(kit: Kit, width: float) -> Group:
 def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
     holes: list[Hole] = []
     count = max(1, int(width / kit.size(1.8, 3.2)))
-    w, h, sill = kit.size(0.8, 1.5), kit.size(1.1, 1.8), kit.size(0.7, 1.0)
+    w = kit.size(0.8, 1.5)
+    h = kit.size(1.1, 1.8)
+    sill = kit.size(0.7, 1.0)
     door = int(kit.rng.integers(count))
     for floor in range(floors):
         for column in range(count):
@@ -97,9 +103,11 @@ def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
 def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
     tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
     if kit.chance(0.65):
-        rise, eave = kit.size(1.5, 4.5), kit.size(0.2, 0.6)
+        rise = kit.size(1.5, 4.5)
+        eave = kit.size(0.2, 0.6)
         w = width / 2 + 0.1
-        ridge, low = height + rise, height - eave * rise / (deep / 2)
+        ridge = height + rise
+        low = height - eave * rise / (deep / 2)
         front = [(-w, -eave, low), (w, -eave, low), (w, deep / 2, ridge), (-w, deep / 2, ridge)]
         back = [
             (-w, deep + eave, low),

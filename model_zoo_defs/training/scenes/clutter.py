@@ -36,7 +36,8 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 def gadget(kit: Kit) -> Group:
     """Returns a toy-like pile of rounded bodies."""
-    group, z = Group(), 0.0
+    group = Group()
+    z = 0.0
     for _ in range(int(kit.rng.integers(1, 4))):
         size = kit.rng.uniform(0.03, 0.16, 3)
         body = superquadric(size, vertical=kit.size(0.15, 1.8), around=kit.size(0.15, 1.8))
@@ -50,7 +51,8 @@ def gadget(kit: Kit) -> Group:
 
 def ring(kit: Kit) -> Group:
     """Returns a ring, flat or leaning."""
-    group, r = Group(), kit.size(0.03, 0.1)
+    group = Group()
+    r = kit.size(0.03, 0.1)
     thick = r * kit.size(0.1, 0.5)
     pitch = kit.size(0, 1.4)
     group.add(
@@ -66,8 +68,11 @@ def ring(kit: Kit) -> Group:
 def tool(kit: Kit) -> Group:
     """Returns something long: pen, spoon, screwdriver, ruler, scissors."""
     group = Group()
-    long, thick, yaw = kit.size(0.1, 0.35), kit.size(0.003, 0.014), kit.size(0, 6.3)
-    c, s = np.cos(yaw) * long / 2, np.sin(yaw) * long / 2
+    long = kit.size(0.1, 0.35)
+    thick = kit.size(0.003, 0.014)
+    yaw = kit.size(0, 6.3)
+    c = np.cos(yaw) * long / 2
+    s = np.sin(yaw) * long / 2
     group.add(rod((-c, -s, thick), (c, s, thick), thick), kit.any_surface())
     if kit.chance(0.6):
         group.add(
@@ -101,7 +106,8 @@ def cable(kit: Kit) -> Group:
 
 def cloth(kit: Kit) -> Group:
     """Returns a crumpled piece of cloth or paper: a rough height field."""
-    group, size = Group(), kit.size(0.1, 0.4)
+    group = Group()
+    size = kit.size(0.1, 0.4)
     x, y = np.meshgrid(np.linspace(-1, 1, 24), np.linspace(-1, 1, 24))
     z = sum(
         kit.size(0.2, 1)
@@ -118,8 +124,10 @@ def cloth(kit: Kit) -> Group:
 
 def letters(kit: Kit) -> Group:
     """Returns standing block letters built of bars."""
-    group, material = Group(), kit.any_surface()
-    h, d = kit.size(0.06, 0.2), kit.size(0.015, 0.05)
+    group = Group()
+    material = kit.any_surface()
+    h = kit.size(0.06, 0.2)
+    d = kit.size(0.015, 0.05)
     t = h * kit.size(0.14, 0.24)
     strokes = {
         "L": "lb",
@@ -143,7 +151,8 @@ def letters(kit: Kit) -> Group:
 
 def frame(kit: Kit) -> Group:
     """Returns a small framed photo leaning back."""
-    group, tall = Group(), kit.size(0.1, 0.3)
+    group = Group()
+    tall = kit.size(0.1, 0.3)
     wide = tall * kit.size(0.6, 1.4)
     group.add(
         box(wide, 0.015, tall), kit.wood() if kit.chance(0.6) else kit.any_surface(), pitch=-0.2
@@ -157,7 +166,8 @@ def frame(kit: Kit) -> Group:
 
 def wedge(kit: Kit) -> Group:
     """Returns a many-cornered block, such as a house-shaped toy or a piece of cheese."""
-    count, r = int(kit.rng.integers(3, 9)), kit.size(0.03, 0.12)
+    count = int(kit.rng.integers(3, 9))
+    r = kit.size(0.03, 0.12)
     angle = np.sort(kit.rng.uniform(0, 2 * np.pi, count)) + np.linspace(0, 1, count)
     far = r * kit.rng.uniform(0.6, 1.0, count)
     outline = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=1)

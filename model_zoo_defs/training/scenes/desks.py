@@ -20,7 +20,8 @@ from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 def _wild(kit: Kit) -> Group:
     """Returns a body that no household has: bent, lumpy or turned."""
-    group, choice = Group(), kit.rng.random()
+    group = Group()
+    choice = kit.rng.random()
     size = kit.size(0.04, 0.3)
     if choice < 0.35:
         body = superquadric(
@@ -57,7 +58,8 @@ def _wild(kit: Kit) -> Group:
 def desk_scene(kit: Kit) -> Plan:
     """Returns a table top seen from near by, full of things."""
     group = Group()
-    w, d = kit.size(0.8, 2.2), kit.size(0.6, 1.4)
+    w = kit.size(0.8, 2.2)
+    d = kit.size(0.6, 1.4)
     top = kit.surface(
         "wood",
         "planks",
@@ -105,7 +107,9 @@ def desk_scene(kit: Kit) -> Plan:
     heaps = int(kit.rng.integers(2, 7))
     targets = []
     for _ in range(heaps):
-        x, y, radius = kit.size(-half[0], half[0]), kit.size(-half[1], half[1]), kit.size(0.05, 0.4)
+        x = kit.size(-half[0], half[0])
+        y = kit.size(-half[1], half[1])
+        radius = kit.size(0.05, 0.4)
         targets.append((x, y, z + kit.size(0, 0.15)))
         low = (max(-half[0], x - radius), max(-half[1], y - radius))
         high = (min(half[0], x + radius), min(half[1], y + radius))

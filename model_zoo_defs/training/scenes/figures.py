@@ -10,12 +10,15 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 def person(kit: Kit) -> Group:
     """Returns a standing or sitting figure of rounded bodies, about the origin."""
-    group, cloth, legs = Group(), kit.any_surface(), kit.surface("plain", "fabric", vivid=0.2)
+    group = Group()
+    cloth = kit.any_surface()
+    legs = kit.surface("plain", "fabric", vivid=0.2)
     skin = kit.palette.new("plain", np.array([0.85, 0.65, 0.52]) * kit.size(0.45, 1.1), gloss=0.1)
     h = kit.size(1.5, 1.9)
     stride = kit.size(0, 0.3)
     for side in (-1, 1):
-        x, foot = side * 0.09, side * stride
+        x = side * 0.09
+        foot = side * stride
         group.add(
             tube(
                 [(x, 0, h * 0.5), (x * 1.1, -0.03 + foot * 0.4, h * 0.27), (x * 1.1, foot, 0.05)],
@@ -54,11 +57,14 @@ def person(kit: Kit) -> Group:
 
 def bicycle(kit: Kit) -> Group:
     """Returns a bicycle along x."""
-    group, paint, tyre = Group(), kit.palette.new("plain", vivid=0.9, gloss=0.6), kit.dark()
+    group = Group()
+    paint = kit.palette.new("plain", vivid=0.9, gloss=0.6)
+    tyre = kit.dark()
     for x in (-0.52, 0.52):
         group.add(torus(0.33, 0.018), tyre, (x, -0.2, 0.35), pitch=np.pi / 2)
         for angle in np.arange(6) * np.pi / 6:
-            c, s = 0.32 * np.cos(angle), 0.32 * np.sin(angle)
+            c = 0.32 * np.cos(angle)
+            s = 0.32 * np.sin(angle)
             group.add(rod((x - c, -0.2, 0.35 - s), (x + c, -0.2, 0.35 + s), 0.003, sides=4), tyre)
     joints = {
         "a": (-0.52, 0.35),

@@ -45,8 +45,11 @@ _TABLE_THINGS = (mug, books, papers, laptop, bowl, bottle, plant, lamp, gadget, 
 
 def table(kit: Kit, *, width: float = 0.0) -> Group:
     """Returns a table with legs and things on it."""
-    group, wood = Group(), kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
-    w, d, h = width or kit.size(0.7, 2.0), kit.size(0.5, 0.95), kit.size(0.4, 0.78)
+    group = Group()
+    wood = kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
+    w = width or kit.size(0.7, 2.0)
+    d = kit.size(0.5, 0.95)
+    h = kit.size(0.4, 0.78)
     thick = kit.size(0.015, 0.05)
     legs = kit.metal() if kit.chance(0.3) else wood
     y = -d / 2
@@ -102,8 +105,11 @@ def desk(kit: Kit) -> Group:
 
 def bookshelf(kit: Kit) -> Group:
     """Returns open shelves full of books and things."""
-    group, wood = Group(), kit.wood() if kit.chance(0.6) else kit.surface("plain")
-    w, d, h = kit.size(0.6, 1.6), kit.size(0.24, 0.4), kit.size(0.8, 2.2)
+    group = Group()
+    wood = kit.wood() if kit.chance(0.6) else kit.surface("plain")
+    w = kit.size(0.6, 1.6)
+    d = kit.size(0.24, 0.4)
+    h = kit.size(0.8, 2.2)
     t = 0.025
     for side in (-1, 1):
         group.add(box(t, d, h), wood, (side * (w - t) / 2, -d / 2, 0))
@@ -128,11 +134,9 @@ def _fill_shelf(
     x = -w / 2
     while x < w / 2 - 0.06:
         if kit.chance(0.8):
-            wide, tall, deep = (
-                kit.size(0.012, 0.06),
-                gap * kit.size(0.5, 0.97),
-                d * kit.size(0.5, 0.9),
-            )
+            wide = kit.size(0.012, 0.06)
+            tall = gap * kit.size(0.5, 0.97)
+            deep = d * kit.size(0.5, 0.9)
             lean = kit.size(-0.25, 0.0) if kit.chance(0.06) else 0.0
             group.add(
                 box(wide * 0.97, deep, tall),
@@ -158,15 +162,18 @@ def _fill_shelf(
 
 def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
     """Returns a closed cupboard with door panels, joints and handles."""
-    group, front = (
-        Group(),
+    group = Group()
+    front = (
         kit.wood()
         if kit.chance(0.5)
-        else kit.palette.new("plain", tile_m=1.0, gloss=0.4, mirror=kit.size(0, 0.05), vivid=0.4),
+        else kit.palette.new("plain", tile_m=1.0, gloss=0.4, mirror=kit.size(0, 0.05), vivid=0.4)
     )
-    w, d, h = kit.size(0.5, 1.8), kit.size(0.35, 0.65), kit.size(0.5, 2.2)
+    w = kit.size(0.5, 1.8)
+    d = kit.size(0.35, 0.65)
+    h = kit.size(0.5, 2.2)
     if hang:
-        d, h = 0.35, kit.size(0.5, 0.8)
+        d = 0.35
+        h = kit.size(0.5, 0.8)
     group.add(box(w, d, h), front, (0, -d / 2, hang))
     _doors(kit, group, (w, d, h), hang, front)
     if h < 1.3 and not hang:
@@ -184,15 +191,16 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
     """Adds doors with handles to the front of a body of this width, depth and height at z."""
     w, d, h = size
     steel = kit.metal()
-    columns, rows = (
-        max(1, round(w / kit.size(0.4, 0.6))),
-        int(kit.rng.integers(1, 5)) if h > 0.6 else 1,
-    )
-    style, gap = int(kit.rng.integers(3)), 0.006
+    columns = max(1, round(w / kit.size(0.4, 0.6)))
+    rows = int(kit.rng.integers(1, 5)) if h > 0.6 else 1
+    style = int(kit.rng.integers(3))
+    gap = 0.006
     for column in range(columns):
         for row in range(rows):
-            wide, tall = w / columns, (h - 0.06) / rows
-            x, low = -w / 2 + (column + 0.5) * wide, z + 0.05 + row * tall
+            wide = w / columns
+            tall = (h - 0.06) / rows
+            x = -w / 2 + (column + 0.5) * wide
+            low = z + 0.05 + row * tall
             group.add(box(wide - 2 * gap, 0.018, tall - 2 * gap), front, (x, -d - 0.01, low + gap))
             if style == 0:
                 group.add(
@@ -220,7 +228,9 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
 def kitchen(kit: Kit) -> Group:
     """Returns a kitchen counter with tap, tiled back wall, hung cupboards and clutter."""
     group = Group()
-    w, d, h = kit.size(1.6, 3.6), kit.size(0.58, 0.68), kit.size(0.84, 0.94)
+    w = kit.size(1.6, 3.6)
+    d = kit.size(0.58, 0.68)
+    h = kit.size(0.84, 0.94)
     front = kit.palette.new("plain", tile_m=1.0, gloss=0.5, mirror=kit.size(0.0, 0.06), vivid=0.6)
     top = kit.surface("marble", "speckle", "plain", "wood", tile_m=0.8)
     group.add(box(w, d - 0.05, h - 0.1), front, (0, -d / 2, 0.1))
@@ -230,7 +240,8 @@ def kitchen(kit: Kit) -> Group:
     group.add(
         box(w, 0.012, 0.55), kit.surface("tiles", "brick", "plain", tile_m=0.5), (0, -0.006, h)
     )
-    x, steel = kit.size(-0.3, 0.3) * w, kit.metal()
+    x = kit.size(-0.3, 0.3) * w
+    steel = kit.metal()
     group.add(box(0.5, 0.4, 0.006), steel, (x, -d / 2, h))
     group.add(box(0.42, 0.32, 0.002), kit.dark(), (x, -d / 2, h + 0.006))
     a = np.linspace(0, np.pi, 12)
@@ -254,7 +265,9 @@ def kitchen(kit: Kit) -> Group:
 
 def floor_lamp(kit: Kit) -> Group:
     """Returns a tall thin lamp."""
-    group, metal, h = Group(), kit.metal(), kit.size(1.3, 1.8)
+    group = Group()
+    metal = kit.metal()
+    h = kit.size(1.3, 1.8)
     group.add(cylinder(0.14, 0.02), metal, (0, -0.2, 0))
     group.add(cylinder(0.011, h), metal, (0, -0.2, 0))
     r = kit.size(0.12, 0.22)
@@ -285,8 +298,10 @@ def drawers(kit: Kit) -> Group:
 
 def railing(kit: Kit) -> Group:
     """Returns a rail with thin bars."""
-    group, steel = Group(), kit.metal() if kit.chance(0.6) else kit.wood()
-    w, h = kit.size(0.8, 2.4), kit.size(0.7, 1.1)
+    group = Group()
+    steel = kit.metal() if kit.chance(0.6) else kit.wood()
+    w = kit.size(0.8, 2.4)
+    h = kit.size(0.7, 1.1)
     group.add(rod((-w / 2, -0.05, h), (w / 2, -0.05, h), 0.022), steel)
     group.add(rod((-w / 2, -0.05, 0.1), (w / 2, -0.05, 0.1), 0.012), steel)
     for x in np.arange(-w / 2, w / 2 + 0.01, kit.size(0.08, 0.16)):

@@ -19,8 +19,10 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 def mug(kit: Kit) -> Group:
     """Returns a hollow cup with a handle."""
-    group, material = Group(), kit.any_surface()
-    r, h = kit.size(0.03, 0.05), kit.size(0.07, 0.12)
+    group = Group()
+    material = kit.any_surface()
+    r = kit.size(0.03, 0.05)
+    h = kit.size(0.07, 0.12)
     taper = kit.size(0.75, 1.1)
     group.add(
         lathe([(0, 0), (r * taper, 0), (r, h), (r * 0.9, h), (r * taper * 0.9, 0.01), (0, 0.01)]),
@@ -41,7 +43,9 @@ def mug(kit: Kit) -> Group:
 def bottle(kit: Kit) -> Group:
     """Returns a bottle with a cap."""
     group = Group()
-    r, h, neck = kit.size(0.025, 0.05), kit.size(0.15, 0.33), kit.size(0.25, 0.5)
+    r = kit.size(0.025, 0.05)
+    h = kit.size(0.15, 0.33)
+    neck = kit.size(0.25, 0.5)
     body = [(0, 0), (r, 0), (r, h * 0.6), (r * 0.95, h * 0.65), (r * neck, h * 0.85), (r * neck, h)]
     group.add(lathe(body), kit.palette.new("plain", gloss=0.7, mirror=0.05, vivid=0.6))
     label = kit.palette.new("poster", tile_m=h * 0.4)
@@ -75,7 +79,8 @@ def bowl(kit: Kit) -> Group:
     )
     if kit.chance(0.5):
         for _ in range(int(kit.rng.integers(2, 6))):
-            angle, far = kit.size(0, 6.3), r * kit.size(0, 0.5)
+            angle = kit.size(0, 6.3)
+            far = r * kit.size(0, 0.5)
             d = r * kit.size(0.45, 0.7)
             material = kit.palette.new("speckle", tile_m=0.1, vivid=1.0)
             group.add(
@@ -88,8 +93,10 @@ def bowl(kit: Kit) -> Group:
 
 def pot(kit: Kit) -> Group:
     """Returns a cooking pot or pan with its handles."""
-    group, steel = Group(), kit.metal()
-    r, h = kit.size(0.08, 0.16), kit.size(0.04, 0.2)
+    group = Group()
+    steel = kit.metal()
+    r = kit.size(0.08, 0.16)
+    h = kit.size(0.04, 0.2)
     group.add(
         lathe([(0, 0), (r, 0), (r, h), (r * 0.96, h), (r * 0.96, 0.01), (0, 0.01)], sides=26), steel
     )
@@ -109,7 +116,9 @@ def pot(kit: Kit) -> Group:
 def carton(kit: Kit) -> Group:
     """Returns a box, plain or printed."""
     group = Group()
-    w, d, h = kit.size(0.05, 0.3), kit.size(0.04, 0.2), kit.size(0.05, 0.3)
+    w = kit.size(0.05, 0.3)
+    d = kit.size(0.04, 0.2)
+    h = kit.size(0.05, 0.3)
     printed = kit.chance(0.5)
     material = (
         kit.palette.new("poster", tile_m=max(w, h), whole=True) if printed else kit.any_surface()
@@ -120,12 +129,16 @@ def carton(kit: Kit) -> Group:
 
 def books(kit: Kit) -> Group:
     """Returns a small pile of books, turned against each other."""
-    group, z = Group(), 0.0
+    group = Group()
+    z = 0.0
     for _ in range(int(kit.rng.integers(1, 6))):
-        w, d, h = kit.size(0.13, 0.24), kit.size(0.18, 0.3), kit.size(0.008, 0.045)
+        w = kit.size(0.13, 0.24)
+        d = kit.size(0.18, 0.3)
+        h = kit.size(0.008, 0.045)
         cover = kit.palette.new("poster", tile_m=d, whole=True)
         paper = kit.palette.new("stripes", (0.9, 0.88, 0.8), tile_m=0.05)
-        yaw, at = kit.size(-0.4, 0.4), (kit.size(-0.02, 0.02), kit.size(-0.02, 0.02), z)
+        yaw = kit.size(-0.4, 0.4)
+        at = (kit.size(-0.02, 0.02), kit.size(-0.02, 0.02), z)
         group.add(box(w, d, h * 0.999, fit=d), cover, at, yaw=yaw)
         group.add(box(w * 0.99, d * 1.004, h * 0.8), paper, (at[0], at[1], z + h * 0.1), yaw=yaw)
         z += h
@@ -144,8 +157,11 @@ def papers(kit: Kit) -> Group:
 
 def laptop(kit: Kit) -> Group:
     """Returns an open portable computer."""
-    group, case = Group(), kit.metal() if kit.chance(0.5) else kit.dark()
-    w, d, tilt = kit.size(0.28, 0.38), kit.size(0.2, 0.26), kit.size(-0.6, 0.1)
+    group = Group()
+    case = kit.metal() if kit.chance(0.5) else kit.dark()
+    w = kit.size(0.28, 0.38)
+    d = kit.size(0.2, 0.26)
+    tilt = kit.size(-0.6, 0.1)
     group.add(box(w, d, 0.016), case)
     group.add(
         box(w * 0.9, d * 0.5, 0.002),
@@ -165,9 +181,11 @@ def laptop(kit: Kit) -> Group:
 
 def monitor(kit: Kit) -> Group:
     """Returns a flat screen on a foot, facing -y."""
-    group, case = Group(), kit.dark()
+    group = Group()
+    case = kit.dark()
     w = kit.size(0.4, 0.75)
-    h, z = w * kit.size(0.55, 0.65), kit.size(0.08, 0.16)
+    h = w * kit.size(0.55, 0.65)
+    z = kit.size(0.08, 0.16)
     group.add(box(w, 0.03, h), case, (0, 0, z))
     on = kit.chance(0.5)
     screen = (
@@ -183,8 +201,10 @@ def monitor(kit: Kit) -> Group:
 
 def lamp(kit: Kit) -> Group:
     """Returns a table lamp: foot, stem and shade."""
-    group, metal = Group(), kit.metal()
-    h, r = kit.size(0.25, 0.55), kit.size(0.08, 0.17)
+    group = Group()
+    metal = kit.metal()
+    h = kit.size(0.25, 0.55)
+    r = kit.size(0.08, 0.17)
     group.add(cylinder(r * 0.6, 0.02), metal)
     group.add(cylinder(0.008, h), metal)
     shade = kit.palette.new("fabric", tile_m=0.3, glow=kit.size(0, 1.5), vivid=0.3)
@@ -198,7 +218,8 @@ def lamp(kit: Kit) -> Group:
 def plant(kit: Kit) -> Group:
     """Returns a pot with many thin bent leaves."""
     group = Group()
-    r, h = kit.size(0.05, 0.15), kit.size(0.08, 0.25)
+    r = kit.size(0.05, 0.15)
+    h = kit.size(0.08, 0.25)
     group.add(cylinder(r * 0.8, h, top=r), kit.any_surface())
     group.add(
         cylinder(r * 0.9, 0.01),
@@ -211,7 +232,9 @@ def plant(kit: Kit) -> Group:
         tile_m=0.2,
         gloss=0.2,
     )
-    count, reach, wide = int(kit.rng.integers(12, 60)), kit.size(0.15, 0.6), kit.size(0.008, 0.05)
+    count = int(kit.rng.integers(12, 60))
+    reach = kit.size(0.15, 0.6)
+    wide = kit.size(0.008, 0.05)
     angle = kit.rng.uniform(0, 2 * np.pi, count)
     lift = kit.rng.uniform(0.2, 1.5, count)
     long = reach * kit.rng.uniform(0.5, 1.0, count)

@@ -24,7 +24,8 @@ def leaves(kit: Kit, centres: np.ndarray, size: float, material: int) -> Group:
     second = np.cross(first, kit.rng.normal(size=(count, 3)))
     second /= np.linalg.norm(second, axis=1, keepdims=True) + 1e-9
     half = size * kit.rng.uniform(0.5, 1.2, (count, 1))
-    a, b = first * half, second * half * kit.size(0.4, 0.9)
+    a = first * half
+    b = second * half * kit.size(0.4, 0.9)
     group = Group()
     corners = np.stack([centres - a, centres - b, centres + a, centres + b], axis=1)
     group.add(quads(corners), material)
@@ -41,7 +42,8 @@ def leaf_green(kit: Kit) -> tuple[float, float, float]:
 def tree(kit: Kit, *, far: bool = False) -> Group:
     """Returns a tree of trunk, branches and clumps of leaves; far: with fewer leaves."""
     group = Group()
-    h, r = kit.size(4, 13), kit.size(0.1, 0.3)
+    h = kit.size(4, 13)
+    r = kit.size(0.1, 0.3)
     stem = h * kit.size(0.2, 0.45)
     bark = kit.palette.new("speckle", np.array([0.35, 0.28, 0.22]) * kit.size(0.5, 1.2), tile_m=0.6)
     lean = kit.rng.normal(0, 0.04 * h, 2)
@@ -56,7 +58,8 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
     wide = h * kit.size(0.16, 0.34)
     centres = []
     for index in range(clumps):
-        angle, height = kit.size(0, 6.3), kit.size(0, 1) if not conifer else index / clumps
+        angle = kit.size(0, 6.3)
+        height = kit.size(0, 1) if not conifer else index / clumps
         out = (
             wide
             * kit.size(0.1, 0.9)
@@ -87,7 +90,9 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
 
 def hedge(kit: Kit, length: float) -> Group:
     """Returns a hedge or a row of bushes along y."""
-    group, tall, wide = Group(), kit.size(0.5, 2.2), kit.size(0.4, 1.0)
+    group = Group()
+    tall = kit.size(0.5, 2.2)
+    wide = kit.size(0.4, 1.0)
     green = kit.palette.new("foliage", leaf_green(kit), tile_m=0.8)
     dark = kit.palette.new("foliage", np.array(leaf_green(kit)) * 0.5, tile_m=0.8)
     group.add(box(wide * 0.9, length, tall * 0.95), dark)
@@ -103,8 +108,10 @@ def hedge(kit: Kit, length: float) -> Group:
 
 def fence(kit: Kit, length: float) -> Group:
     """Returns a fence of thin slats, bars or wires along y."""
-    group, material = Group(), kit.wood() if kit.chance(0.5) else kit.metal()
-    tall, step = kit.size(0.8, 1.8), kit.size(0.1, 0.3)
+    group = Group()
+    material = kit.wood() if kit.chance(0.5) else kit.metal()
+    tall = kit.size(0.8, 1.8)
+    step = kit.size(0.1, 0.3)
     wide = step * kit.size(0.15, 0.8)
     for y in np.arange(-length / 2, length / 2, step):
         group.add(box(0.02, wide, tall * kit.size(0.97, 1.0)), material, (0, float(y), 0.03))
@@ -115,10 +122,13 @@ def fence(kit: Kit, length: float) -> Group:
 
 def pole(kit: Kit) -> Group:
     """Returns a lamp post, traffic light, road sign or bare pole."""
-    group, grey = Group(), kit.palette.new("plain", (kit.size(0.2, 0.6),) * 3, gloss=0.3)
-    choice, r = kit.rng.random(), kit.size(0.03, 0.09)
+    group = Group()
+    grey = kit.palette.new("plain", (kit.size(0.2, 0.6),) * 3, gloss=0.3)
+    choice = kit.rng.random()
+    r = kit.size(0.03, 0.09)
     if choice < 0.4:
-        h, reach = kit.size(4.5, 9), kit.size(0.5, 2.2)
+        h = kit.size(4.5, 9)
+        reach = kit.size(0.5, 2.2)
         group.add(
             tube(
                 [(0, 0, 0), (0, 0, h * 0.6), (0, 0, h * 0.93), (reach * 0.3, 0, h), (reach, 0, h)],

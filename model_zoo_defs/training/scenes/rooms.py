@@ -21,7 +21,8 @@ def room(kit: Kit) -> Plan:
     d = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
     h = kit.size(2.2, 3.1)
     rise = kit.size(-0.9, 1.5) if kit.chance(0.2) else 0.0
-    group, targets = Group(), []
+    group = Group()
+    targets = []
     paint = kit.surface(
         "plaster",
         "plaster",
@@ -110,7 +111,8 @@ def _line_up(
             continue
         item = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))](kit)
         lower, upper = item.bounds()
-        wide, deep = float(upper[0] - lower[0]), float(-lower[1])
+        wide = float(upper[0] - lower[0])
+        deep = float(-lower[1])
         blocked = any(
             hole[1] == 0 and hole[0] - 0.1 < u + wide and u < hole[2] + 0.1 for hole in holes
         )
@@ -125,7 +127,9 @@ def _line_up(
 
 def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
     """Adds a table with chairs, a rug, single chairs, people and hanging lamps."""
-    x, y, yaw = kit.size(0.35, 0.65) * w, kit.size(0.35, 0.65) * d, kit.size(0, 6.3)
+    x = kit.size(0.35, 0.65) * w
+    y = kit.size(0.35, 0.65) * d
+    yaw = kit.size(0, 6.3)
     if kit.chance(0.5):
         rug = box(kit.size(1, 2.4), kit.size(0.8, 1.8), 0.008, fit=0.0)
         group.add(
@@ -173,7 +177,8 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
             yaw=kit.size(0, 6.3),
         )
     if kit.chance(0.4):
-        shade, z = kit.palette.new("plain", glow=kit.size(0, 2), vivid=0.4), kit.size(1.5, 2.0)
+        shade = kit.palette.new("plain", glow=kit.size(0, 2), vivid=0.4)
+        z = kit.size(1.5, 2.0)
         group.add(rod((x, y, z), (x, y, 2.9), 0.004, sides=5), kit.dark())
         group.add(
             cylinder(kit.size(0.1, 0.25), kit.size(0.12, 0.3), top=kit.size(0.03, 0.2)),
@@ -187,7 +192,8 @@ def _outside(kit: Kit, group: Group, w: float, d: float) -> None:
     ground = kit.surface("paving", "foliage", "speckle", tile_m=3, vivid=0.2)
     group.add(box(80, 80, 0.1), ground, (w / 2, d / 2, -kit.size(0.3, 4)))
     for _ in range(int(kit.rng.integers(0, 6))):
-        angle, far = kit.size(0, 6.3), kit.size(4, 25) + max(w, d)
+        angle = kit.size(0, 6.3)
+        far = kit.size(4, 25) + max(w, d)
         block = box(kit.size(1, 12), kit.size(1, 8), kit.size(1, 9))
         material = kit.surface("brick", "plaster", "foliage", tile_m=2, vivid=0.2)
         group.add(
@@ -207,7 +213,8 @@ def _lights(kit: Kit, w: float, d: float, h: float, group: Group) -> tuple[Light
         colour = (power, power * (0.3 + 0.7 * warm), power * warm**2)
         lights.append(Light(position=position, colour=colour, radius=kit.size(0.05, 0.5)))
     if kit.chance(0.5):
-        angle, power = kit.size(0, 6.3), kit.size(2, 9)
+        angle = kit.size(0, 6.3)
+        power = kit.size(2, 9)
         position = (np.cos(angle), np.sin(angle), kit.size(0.3, 1.2))
         lights.append(
             Light(
@@ -218,7 +225,8 @@ def _lights(kit: Kit, w: float, d: float, h: float, group: Group) -> tuple[Light
 
 
 def _indoor_sky(kit: Kit) -> Sky:
-    bright, level = kit.size(1, 5), kit.size(0.15, 0.6)
+    bright = kit.size(1, 5)
+    level = kit.size(0.15, 0.6)
     up = tuple(float(v) for v in level * kit.rng.uniform(0.85, 1.1, 3))
     down = tuple(
         float(v) for v in level * kit.rng.uniform(0.35, 1.0) * kit.rng.uniform(0.85, 1.1, 3)

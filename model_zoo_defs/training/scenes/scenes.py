@@ -102,7 +102,8 @@ def pick_view(
 ) -> View:
     """Returns a view (rows, columns) that shows much of the scene, the best of up to 24."""
     height, width = size
-    best, best_score = None, -1.0
+    best = None
+    best_score = -1.0
     for _ in range(24):
         view = _street_view(plan, rng, height, width, rig) if kind == "street" else _indoor_view(
             plan, rng, height, width, rig, near=kind == "desk"
@@ -125,7 +126,8 @@ def _street_view(
     # A crop of a wide image may be off-centre to its principal point.
     shift = (float(rng.uniform(-0.8, 0.8)), 0.0) if rng.random() < 0.3 else (0.0, 0.0)
     pitch = rng.normal(-0.02, 0.03)
-    fov, roll = rng.uniform(30, 85), rng.normal(0, 0.01)
+    fov = rng.uniform(30, 85)
+    roll = rng.normal(0, 0.01)
     shift = (shift[0], float(rng.uniform(-0.15, 0.1)))
     if rig is not None:
         position[2] = rng.uniform(*rig.height)
@@ -152,7 +154,8 @@ def _indoor_view(
     roll = rng.normal(0, 0.06 if rng.random() < 0.8 else 0.3)
     fov = rng.uniform(40, 95)
     if rig is not None:
-        roll, fov = np.radians(rng.normal(0, rig.roll_deg)), rig.fov_deg
+        roll = np.radians(rng.normal(0, rig.roll_deg))
+        fov = rig.fov_deg
         if rig.pitch_deg is not None:
             pitch = np.radians(rng.normal(*rig.pitch_deg))
     return looking(position, (yaw, pitch, roll), fov_deg=fov, size=(height, width))

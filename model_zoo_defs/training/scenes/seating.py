@@ -31,10 +31,14 @@ def cushion(
 
 def chair(kit: Kit) -> Group:
     """Returns a chair with legs and an open back."""
-    group, wood = Group(), kit.wood() if kit.chance(0.65) else kit.metal()
+    group = Group()
+    wood = kit.wood() if kit.chance(0.65) else kit.metal()
     seat = kit.surface("fabric", "plain", tile_m=0.3) if kit.chance(0.6) else wood
-    w, d, h = kit.size(0.38, 0.5), kit.size(0.38, 0.5), kit.size(0.42, 0.48)
-    back, t = kit.size(0.75, 1.1), kit.size(0.02, 0.045)
+    w = kit.size(0.38, 0.5)
+    d = kit.size(0.38, 0.5)
+    h = kit.size(0.42, 0.48)
+    back = kit.size(0.75, 1.1)
+    t = kit.size(0.02, 0.045)
     y = -d / 2
     if kit.chance(0.5):
         group.add(box(w, d, 0.04), seat, (0, y, h - 0.04))
@@ -59,7 +63,9 @@ def chair(kit: Kit) -> Group:
 
 def office_chair(kit: Kit) -> Group:
     """Returns a swivel or cantilever chair of bent tube."""
-    group, steel, cloth = Group(), kit.metal(), kit.surface("fabric", "plain", tile_m=0.3)
+    group = Group()
+    steel = kit.metal()
+    cloth = kit.surface("fabric", "plain", tile_m=0.3)
     cushion(kit, group, (0.48, 0.48, 0.1), (0, -0.3, 0.46), cloth)
     cushion(kit, group, (0.46, 0.09, 0.55), (0, -0.06, 0.85), cloth, pitch=-0.12)
     if kit.chance(0.5):
@@ -80,10 +86,14 @@ def office_chair(kit: Kit) -> Group:
 
 def sofa(kit: Kit) -> Group:
     """Returns a sofa or armchair with cushions."""
-    group, cloth = Group(), kit.surface("fabric", "plain", "stripes", "mottled", tile_m=0.4)
+    group = Group()
+    cloth = kit.surface("fabric", "plain", "stripes", "mottled", tile_m=0.4)
     seats = int(kit.rng.integers(1, 4))
-    each, d, h = kit.size(0.55, 0.75), kit.size(0.75, 0.95), kit.size(0.38, 0.46)
-    w, arm = seats * each, kit.size(0.12, 0.25)
+    each = kit.size(0.55, 0.75)
+    d = kit.size(0.75, 0.95)
+    h = kit.size(0.38, 0.46)
+    w = seats * each
+    arm = kit.size(0.12, 0.25)
     group.add(box(w + 2 * arm, d, h * 0.6), cloth, (0, -d / 2, 0.06))
     cushion(kit, group, (w + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
     for side in (-1, 1):
@@ -108,8 +118,10 @@ def sofa(kit: Kit) -> Group:
 
 def bed(kit: Kit) -> Group:
     """Returns a bed with blanket and pillows."""
-    group, wood = Group(), kit.wood()
-    w, d = kit.size(0.9, 1.9), kit.size(1.9, 2.1)
+    group = Group()
+    wood = kit.wood()
+    w = kit.size(0.9, 1.9)
+    d = kit.size(1.9, 2.1)
     group.add(box(w, d, 0.3), wood, (0, -d / 2, 0))
     group.add(box(w, 0.06, kit.size(0.6, 1.1)), wood, (0, -0.03, 0))
     cushion(

@@ -11,6 +11,7 @@ from model_zoo_defs.training.scenes.roadside import fence, hedge, leaf_green, po
 from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 
 _FAR = 110.0
+"""Metres along the street to the farthest trees."""
 
 
 def _ground(kit: Kit, group: Group, half: float) -> None:
@@ -37,7 +38,8 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
     white = kit.palette.new("speckle", (0.85, 0.85, 0.82), tile_m=0.6)
     lines = [0.0] if half < 5 else [-half / 3, half / 3]
     for x in lines:
-        dash, gap = kit.size(1, 4), kit.size(1, 6) if kit.chance(0.8) else 0.0
+        dash = kit.size(1, 4)
+        gap = kit.size(1, 6) if kit.chance(0.8) else 0.0
         for y in np.arange(-10, 90, dash + gap):
             group.add(box(0.13, dash, 0.008), white, (x, float(y), 0))
     if kit.chance(0.5):
@@ -95,7 +97,8 @@ def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, fl
 def _verge(kit: Kit, group: Group, side: float, x: float) -> None:
     """Adds poles, trees, people, bins and hedges along one pavement."""
     trees = [tree(kit) for _ in range(2)]
-    spacing, density = kit.size(5, 14), kit.size(0, 1)
+    spacing = kit.size(5, 14)
+    density = kit.size(0, 1)
     for y in np.arange(kit.size(0, 8), 75, spacing):
         if kit.chance(density):
             at = (side * (x + kit.size(0.5, 2.0)), float(y) + kit.size(-1, 1), 0.1)
@@ -160,7 +163,8 @@ def _background(kit: Kit, group: Group) -> None:
 
 def street(kit: Kit) -> Plan:
     """Returns a street along +y with cameras' free box over its lanes."""
-    group, half = Group(), kit.size(2.8, 7.0)
+    group = Group()
+    half = kit.size(2.8, 7.0)
     _ground(kit, group, half)
     targets = _traffic(kit, group, half)
     for side in (-1.0, 1.0):
@@ -172,7 +176,8 @@ def street(kit: Kit) -> Plan:
     _background(kit, group)
     if kit.chance(0.4):
         for _ in range(int(kit.rng.integers(1, 5))):
-            y, h = kit.size(5, 60), kit.size(5, 8)
+            y = kit.size(5, 60)
+            h = kit.size(5, 8)
             group.add(
                 rod(
                     (-half - 4, y, h),
@@ -199,7 +204,8 @@ def street(kit: Kit) -> Plan:
 
 def _daylight(kit: Kit) -> tuple[tuple[Light, ...], Sky]:
     overcast = kit.chance(0.35)
-    angle, power = kit.size(0, 6.3), kit.size(0.1, 0.4) if overcast else kit.size(1.2, 3.0)
+    angle = kit.size(0, 6.3)
+    power = kit.size(0.1, 0.4) if overcast else kit.size(1.2, 3.0)
     position = (np.cos(angle), np.sin(angle), kit.size(0.25, 1.8))
     sun = Light(
         position=position,

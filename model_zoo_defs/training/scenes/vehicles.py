@@ -23,8 +23,10 @@ from model_zoo_defs.training.scenes.kit import Kit
 def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Mesh:
     """Returns a closed hull through stations of (y, half width, low z, high z)."""
     angle = np.linspace(0, 2 * np.pi, 25)
-    c, s = np.cos(angle), np.sin(angle)
-    x, z = np.sign(c) * np.abs(c) ** power, np.sign(s) * np.abs(s) ** power
+    c = np.cos(angle)
+    s = np.sin(angle)
+    x = np.sign(c) * np.abs(c) ** power
+    z = np.sign(s) * np.abs(s) ** power
     rows = [
         (
             stations[0][0],
@@ -52,7 +54,8 @@ def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Me
 
 
 def _wheels(kit: Kit, group: Group, track: float, axles: tuple[float, ...], radius: float) -> None:
-    tyre, hub = kit.dark(), kit.metal()
+    tyre = kit.dark()
+    hub = kit.metal()
     for y in axles:
         for side in (-1, 1):
             at = (side * track - 0.1, y, radius)
@@ -83,10 +86,14 @@ def car(kit: Kit) -> Group:
         "plain", None if vivid else base, gloss=0.7, mirror=kit.size(0.04, 0.12), vivid=1.0
     )
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.size(0.1, 0.25))
-    long, half = kit.size(3.7, 4.8), kit.size(0.82, 0.93)
-    low, belt, roof = kit.size(0.18, 0.24), kit.size(0.82, 0.98), kit.size(1.4, 1.72)
+    long = kit.size(3.7, 4.8)
+    half = kit.size(0.82, 0.93)
+    low = kit.size(0.18, 0.24)
+    belt = kit.size(0.82, 0.98)
+    roof = kit.size(1.4, 1.72)
     hood = belt - kit.size(0.02, 0.14)
-    f, b = long / 2, -long / 2
+    f = long / 2
+    b = -long / 2
     estate = kit.chance(0.55)
     body = [
         (b, half * 0.86, low + 0.12, belt * 0.85), (b + 0.12, half * 0.95, low + 0.03, belt * 0.97),
@@ -164,8 +171,11 @@ def lorry(kit: Kit) -> Group:
     group = Group()
     paint = kit.palette.new("plain", gloss=0.5, mirror=0.05, vivid=0.5)
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=0.2)
-    long, half, tall = kit.size(4.8, 11), kit.size(0.95, 1.25), kit.size(1.9, 3.4)
-    f, b = long / 2, -long / 2
+    long = kit.size(4.8, 11)
+    half = kit.size(0.95, 1.25)
+    tall = kit.size(1.9, 3.4)
+    f = long / 2
+    b = -long / 2
     body = [(b, half, 0.4, tall), (f - 0.7, half, 0.4, tall), (f, half * 0.96, 0.4, tall * 0.55)]
     if kit.chance(0.4):
         load = kit.surface("plain", "poster", "stripes", tile_m=2.5, vivid=0.4)
@@ -192,7 +202,8 @@ def cyclist(kit: Kit) -> Group:
     """Returns a bicycle with a rider."""
     group = Group()
     group.insert(figures.bicycle(kit), (0.2, 0, 0), yaw=np.pi / 2)
-    cloth, skin = kit.any_surface(), kit.palette.new("plain", (0.75, 0.55, 0.42))
+    cloth = kit.any_surface()
+    skin = kit.palette.new("plain", (0.75, 0.55, 0.42))
     group.add(rod((0, -0.25, 1.0), (0, 0.1, 1.5), 0.15), cloth)
     group.add(superquadric((0.19, 0.22, 0.27)), skin, (0, 0.17, 1.68))
     group.add(superquadric((0.22, 0.26, 0.16)), kit.any_surface(), (0, 0.16, 1.78))

@@ -39,7 +39,10 @@ def wall(length: float, height: float, holes: Sequence[Hole], *, rise: float = 0
 def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     """Adds the reveal, the frame and what closes a window or door."""
     u0, v0, u1, v1 = hole
-    deep, x, w, h = kit.size(0.08, 0.3), (u0 + u1) / 2, u1 - u0, v1 - v0
+    deep = kit.size(0.08, 0.3)
+    x = (u0 + u1) / 2
+    w = u1 - u0
+    h = v1 - v0
     for at, size in (
         ((u0, deep / 2, v0), (0.004, deep, h)), ((u1, deep / 2, v0), (0.004, deep, h)),
         ((x, deep / 2, v0), (w, deep, 0.004)), ((x, deep / 2, v1), (w, deep, 0.004)),
@@ -88,7 +91,10 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
 
 def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
     """Adds the walls and the floor that an open door shows."""
-    left, right, far, top = x - kit.size(0.6, 2), x + kit.size(0.6, 2), deep + kit.size(0.9, 3), 2.6
+    left = x - kit.size(0.6, 2)
+    right = x + kit.size(0.6, 2)
+    far = deep + kit.size(0.9, 3)
+    top = 2.6
     low = deep + 0.03
     faces = [
         [(left, far, 0), (right, far, 0), (right, far, top), (left, far, top)],
@@ -110,7 +116,8 @@ def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
     side.add(rod((u0 - 0.3, -0.08, top + 0.1), (u1 + 0.3, -0.08, top + 0.1), 0.015), kit.metal())
     for start, end in ((u0 - 0.25, u0 + kit.size(0.1, 0.5)), (u1 - kit.size(0.1, 0.5), u1 + 0.25)):
         s, z = np.meshgrid(np.linspace(0, 1, 60), np.linspace(bottom, top + 0.1, 6))
-        folds, deep = kit.size(4, 9), kit.size(0.02, 0.05)
+        folds = kit.size(4, 9)
+        deep = kit.size(0.02, 0.05)
         y = -0.08 + deep * np.sin(2 * np.pi * folds * s + z * 0.4) * (1.2 - 0.2 * z)
         side.add(surface(np.stack([start + (end - start) * s, y, z], axis=2)), cloth)
 
@@ -123,7 +130,8 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
             continue
         choice = kit.rng.random()
         z = kit.size(1.1, max(1.2, height - 0.7))
-        w, h = kit.size(0.2, 1.0), kit.size(0.2, 0.8)
+        w = kit.size(0.2, 1.0)
+        h = kit.size(0.2, 0.8)
         if choice < 0.6:
             thick = kit.size(0.002, 0.04)
             if thick > 0.01:
