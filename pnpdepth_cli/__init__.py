@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _NAMES = (
     "load_network",
     "refine",
+    "save",
     "score",
     "Refiner",
     "Refined",
@@ -40,6 +41,7 @@ _NAMES = (
     "Alignment",
     "ImageRegistration",
     "Validation",
+    "UsedNetwork",
     "DepthMap",
     "Pair",
     "Registration",
@@ -51,6 +53,7 @@ _NAMES = (
     "ModelError",
     "DivergedError",
     "DeviceError",
+    "OutputError",
 )
 """The public names, which `api` has."""
 

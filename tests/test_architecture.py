@@ -48,7 +48,7 @@ MAY_IMPORT = {
         *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
-    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames"},
+    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames", "dataset"},
 }
 
 IN_COMMANDS = {

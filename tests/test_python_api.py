@@ -42,12 +42,22 @@ def frame() -> Frame:
 def test_the_public_names_are_these() -> None:
     assert {*pnp.__all__} == {
         "__version__",
-        *("load_network", "refine", "score", "Refiner", "Refined", "Settings", "Scores", "Split"),
+        *(
+            "load_network",
+            "refine",
+            "save",
+            "score",
+            "Refiner",
+            "Refined",
+            "Settings",
+            "Scores",
+            "Split",
+        ),
         *("Network", "ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"),
-        *("SparsePoints", "Camera", "Alignment", "ImageRegistration", "Validation"),
+        *("SparsePoints", "Camera", "Alignment", "ImageRegistration", "Validation", "UsedNetwork"),
         *("DepthMap", "Pair", "Registration", "Unit"),
         *("PnpDepthError", "UsageError", "InputError", "ModelError"),
-        *("NoPointsError", "DivergedError", "DeviceError"),
+        *("NoPointsError", "DivergedError", "DeviceError", "OutputError"),
     }
     assert all(getattr(pnp, name) is not None for name in pnp.__all__)
     assert set(pnp.__all__) <= set(dir(pnp))

@@ -98,6 +98,10 @@ def print_refinement(record: FrameRecord) -> None:
         parts.insert(0, f"{tables.count_of(updates, 'update')} of z ({how})")
     say(" · ".join(parts))
     say(f"wrote {'  '.join(result.outputs.values())}")
+    if result.depth_scale is not None:
+        say(
+            f"{result.outputs['depth']} has {result.depth_scale:g} integers per metre, 0 is unknown"
+        )
 
 
 def _times(seconds: Mapping[str, float]) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
 from pnpdepth_cli.commands.requests.eval_request import WITHOUT_SPARSE, EvalRequest
-from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order, versions
+from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order
 from pnpdepth_cli.commands.shared.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.shared.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.shared.tables import Table, count_of, some_names
@@ -23,6 +23,7 @@ from pnpdepth_cli.dataset.agreement import Agreement, unit_warning
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_of, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
+from pnpdepth_cli.dataset.result_record import versions
 from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.io.file_bytes import one_line, plain, read_json

@@ -143,6 +143,8 @@ class ResultRecord:
 
     outputs: dict[str, str] = field(default_factory=dict)
     """The files by kind; of a batch, below its output folder."""
+    depth_scale: float | None = None
+    """Integers per metre of the depth file. None for a file of metres."""
     size: tuple[int, int]
     """(width, height)"""
     points: PointsRecord

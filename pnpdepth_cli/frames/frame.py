@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from pnpdepth_cli.completion.image_registration import (
 from pnpdepth_cli.errors import DivergedError, UsageError
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import METRES, SparsePoints
-from pnpdepth_cli.settings import Settings
+from pnpdepth_cli.settings import ClosedSettings, Settings
 
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
@@ -135,6 +136,26 @@ class Prediction:
 
 
 @dataclass(frozen=True, kw_only=True)
+class UsedNetwork:
+    """A network as it was used, with nothing left open."""
+
+    name: str
+    layer: str
+    """The layer whose output z was updated."""
+    settings: ClosedSettings
+    """How its output was aligned and z updated."""
+    output_kind: str
+    """What its output is, of `choices.OutputKind`."""
+    normalise: str | None
+    """Name of the RGB range of its input. None: it has none, or another one."""
+    device: str
+    is_map: bool
+    """Whether it is a depth map that takes the place of a network."""
+    checkpoint: Path | None
+    """File of its weights. None: they are not of a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Refined:
     """A refined frame; maps have the image's size."""
 
@@ -169,6 +190,18 @@ class Refined:
     """Weights of the experts in the result, by name; their sum is 1."""
     registration: ImageRegistration | None = None
     """How the image was moved to the points. None: it was not."""
+    asked: Settings = field(default_factory=Settings)
+    """The settings that were asked for."""
+    networks: tuple[UsedNetwork, ...] = ()
+    """The networks with their settings, the user's first."""
+    camera: Camera | None = None
+    """The camera of the frame. None: unknown."""
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the depth and its record; `pnpdepth_cli.save` says how."""
+        import pnpdepth_cli  # the public door, which knows files; this module does not
+
+        pnpdepth_cli.save(self, path, overwrite=overwrite)
 
     def __repr__(self) -> str:
         height, width = self.depth.shape

@@ -14,11 +14,11 @@ import torch
 
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.frames.frame import Frame, Refined, Register
+from pnpdepth_cli.frames.frame import Frame, Refined, Register, UsedNetwork
 from pnpdepth_cli.frames.measured import with_measured, with_note_on_measured
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
-from pnpdepth_cli.frames.resolve import resolve_definition, resolve_member
+from pnpdepth_cli.frames.resolve import normalisation_name, resolve_definition, resolve_member
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.models.network import Network, load_network
 from pnpdepth_cli.models.stored_map import stored_map
@@ -78,6 +78,21 @@ def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
     if count and networks[0].definition.takes_prior:
         return [*maps, *networks]
     return [*networks, *maps]
+
+
+def _used(member: OpenNetwork) -> UsedNetwork:
+    """What a result keeps of a network."""
+    definition = member.network.definition
+    return UsedNetwork(
+        name=member.name,
+        layer=member.layer,
+        settings=member.settings,
+        output_kind=definition.output_kind,
+        normalise=normalisation_name(definition),
+        device=str(member.network.device),
+        is_map=definition.input_kind == "map",
+        checkpoint=member.network.checkpoint,
+    )
 
 
 class Method:
@@ -178,6 +193,12 @@ class Method:
         )
         follow = with_measured if self._keep_measured else with_note_on_measured
         refined = follow(refined)
+        refined = replace(
+            refined,
+            asked=self.asked,
+            networks=tuple(_used(member) for member in self.members),
+            camera=frame.camera,
+        )
         if not self._uncertainty:
             return refined
         return with_uncertainty(refined, of_matches=frame.of_matches)

@@ -15,14 +15,15 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.requests.refine_request import Outputs, RefineRequest, endings_of
 from pnpdepth_cli.completion.interpolation import in_hull, linear
+from pnpdepth_cli.dataset.depth_files import integer_scale, write_sigma
 from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
-from pnpdepth_cli.frames.frame import DepthMap, Refined
+from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.io.atomic import cannot_write
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, metres, write_depth
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
-from pnpdepth_cli.io.formats import KITTI_SCALE, LARGEST_CODE, format_of_suffix
+from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.visualisation import (
     PointErrors,
     depth_scale,
@@ -35,9 +36,6 @@ from pnpdepth_cli.measures import AFTER, BEFORE, LINEAR
 from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
-
-_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
-_LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
 
 _MUCH = 0.1  # part of an image outside of the points from which it is said
 
@@ -92,22 +90,6 @@ def remove_outdated(outputs: Outputs) -> None:
             raise cannot_write(path, error) from error
 
 
-def output_scale(inputs: ReadFrame) -> float:
-    """Returns the codes per metre of an integer depth file for this frame.
-
-    They are those of the sparse depth file. Without them they are 256, or the largest power of ten
-    that fits where the points do not fit 256 or are rounded by it.
-    """
-    if inputs.depth_scale is not None:
-        return inputs.depth_scale
-    nearest, farthest = float(inputs.own.depth.min()), float(inputs.own.depth.max())
-    finest = LARGEST_CODE / (_BEYOND_POINTS * farthest)
-    if finest < KITTI_SCALE:
-        return _power_of_ten(finest)
-    is_exact = nearest * KITTI_SCALE >= _LEAST_CODES
-    return KITTI_SCALE if is_exact else max(_power_of_ten(finest), KITTI_SCALE)
-
-
 def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -> Refined:
     """Returns the frame with 0 where no points support its depth, if that is asked for.
 
@@ -124,29 +106,6 @@ def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -
     hint = "their depth is a guess; --unknown zero writes 0 where points do not support it"
     note = f"note: {fact}, and {hint}"
     return replace(frame, notes=(*frame.notes, note)) if outside > _MUCH else frame
-
-
-def within_range(outputs: Outputs, inputs: ReadFrame, frame: Refined) -> Refined:
-    """Returns the frame with depths that the format can hold, with a note if any is clipped."""
-    if not format_of_suffix(outputs["depth"]).integer:
-        return frame
-    scale = output_scale(inputs)
-    nearest, farthest = np.float32(1 / scale), np.float32(LARGEST_CODE / scale)
-    known = np.isfinite(frame.depth) & (frame.depth > 0)
-    clipped = known & ((frame.depth > farthest) | (frame.depth < 0.5 / scale))
-    if not clipped.any():
-        return frame
-    limits = f"{metres(float(nearest))}–{metres(float(farthest))} m"
-    fact = f"{int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}"
-    holds = f"what a 16-bit PNG with {scale:g} codes per metre holds"
-    note = f"warning: {fact}, {holds}; --format exr holds every depth"
-    after = np.where(clipped, np.clip(frame.depth, nearest, farthest), frame.depth)
-    return replace(frame, depth=after, notes=(*frame.notes, note))
-
-
-def _power_of_ten(largest: float) -> float:
-    """The largest power of ten up to this number."""
-    return 10.0 ** math.floor(math.log10(largest))
 
 
 def write_outputs(
@@ -166,9 +125,9 @@ def write_outputs(
     inputs = replace(inputs, register=frame.registration).registered()
     image = inputs.image
     # Depth, its standard deviation, and where it is valid.
-    write_depth(outputs["depth"], frame.depth, scale=output_scale(inputs))
+    write_depth(outputs["depth"], frame.depth, scale=integer_scale(inputs.own, inputs.depth_scale))
     if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
-        _write_sigma(outputs["sigma"], frame.sigma)
+        write_sigma(outputs["sigma"], frame.sigma)
         write_mask(outputs["valid"], frame.valid)
     # Images for a person.
     figures = {}
@@ -214,14 +173,6 @@ def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
         linear=between,
         what=what,
     )
-
-
-def _write_sigma(path: Path, sigma: DepthMap) -> None:
-    """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
-    scale = _power_of_ten(LARGEST_CODE / max(float(sigma.max()), 1e-9))
-    if format_of_suffix(path).integer:
-        sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))
-    write_depth(path, sigma, scale=scale)
 
 
 def _write_view(path: Path, inputs: ReadFrame, frame: Refined) -> None:

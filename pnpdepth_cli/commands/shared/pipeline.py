@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import psutil
-
-from pnpdepth_cli.version import __version__
 
 if TYPE_CHECKING:
     import torch
@@ -75,13 +71,3 @@ def _peak_resident_bytes() -> int:
         return int(line.split()[1]) * 1024
     memory = psutil.Process().memory_info()
     return int(getattr(memory, "peak_wset", memory.rss))
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions of the program, Python and the numerical libraries."""
-    libraries = ("torch", "numpy", "opencv-python-headless", "OpenEXR")
-    return {
-        "pnpdepth": __version__,
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in libraries},
-    }

@@ -8,32 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import map_coordinates
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.commands.refinement.outputs import output_scale
-from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
 from tests.commands.frames import FrameOnDisk, run
-
-
-def test_the_scale_is_the_sparse_files_else_one_that_holds_the_points() -> None:
-    for nearest, farthest, scale, expected in (
-        (0.4, 80.0, None, 256),
-        (0.4, 80.0, 1000.0, 1000),
-        (900.0, 3000.0, None, 10),
-        (0.005, 0.02, None, 1_000_000),
-        (0.005, 80.0, None, 256),
-    ):
-        points = SparsePoints(xy=torch.eye(2), depth=torch.tensor([nearest, farthest]), size=(2, 2))
-        frame = ReadFrame(rgb=None, points=points, own=points, held_out=points, depth_scale=scale)
-        assert output_scale(frame) == expected
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> None:
