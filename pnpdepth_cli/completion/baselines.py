@@ -13,13 +13,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.completion import interpolation
 from pnpdepth_cli.completion.alignment import (
     Candidate,
     align,
     align_prediction,
     where_predicted,
 )
+from pnpdepth_cli.completion.interpolation import distinct, linear, nearest
 from pnpdepth_cli.completion.outliers import inlier_weights
 from pnpdepth_cli.completion.propagation import local_lines
 from pnpdepth_cli.points import SparsePoints
@@ -45,7 +45,7 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     device = prediction.device
     prediction = prediction.detach().cpu()
     known, points = where_predicted(prediction, points.tensors())
-    points = interpolation.distinct(points)
+    points = distinct(points)
     # The global alignment, as metres and as what keeps metres within its bounds.
     x = torch.where(known, prediction, 1.0).double()
     kinds = ("none", "scale", "affine")
@@ -74,9 +74,9 @@ def _aligned(kind: str, reading: str = "depth") -> Baseline:
 
 
 TABLE: dict[str, Baseline] = {
-    "nearest": lambda points, _: interpolation.nearest(points),
-    "linear": lambda points, _: interpolation.linear(points),
-    "linear-log": lambda points, _: interpolation.linear(points, space="log"),
+    "nearest": lambda points, _: nearest(points),
+    "linear": lambda points, _: linear(points),
+    "linear-log": lambda points, _: linear(points, space="log"),
     "median": _aligned("median"),
     "scale": _aligned("scale"),
     "affine": _aligned("affine"),
@@ -84,4 +84,3 @@ TABLE: dict[str, Baseline] = {
     "affine-disparity": _aligned("affine", "disparity"),
     "local": align_locally,
 }
-"""The baselines by name."""

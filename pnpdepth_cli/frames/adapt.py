@@ -108,7 +108,7 @@ def learn(
     lessons = [_lesson(network, name, frame) for name, frame in frames]
     every = max(2, min(5, len(lessons) // 3))
     validation = lessons[every - 1 :: every]
-    training = [one for number, one in enumerate(lessons, 1) if number % every]
+    training = [lesson for number, lesson in enumerate(lessons, 1) if number % every]
     # The loss before.
     theta = _weights_that_learn(network)
     before = _losses_of(network, validation, theta, seed)
@@ -139,22 +139,24 @@ def learn(
 def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
     """Inside, the network computes with these weights; afterwards it has its own again."""
     parameters = dict(network.module.named_parameters())
-    own = {name: parameters[name].data for name in weights}
+    originals = {name: parameters[name].data for name in weights}
     try:
         for name, value in weights.items():
             parameters[name].data = value.to(parameters[name].dtype)
         yield
     finally:
-        for name, value in own.items():
-            parameters[name].data = value
+        for name, original in originals.items():
+            parameters[name].data = original
 
 
 def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
-    """Raises NoPointsError with fewer than two points."""
+    """The lesson of a frame. Raises NoPointsError with fewer than two points."""
     prepared = prepare(network, frame.registered())
     points = prepared.points
     if len(points) < 2:
-        raise NoPointsError(f"{name}: {len(points)} points; hiding some needs 2")
+        raise NoPointsError(
+            f"{name}: {len(points)} points; hiding some needs 2, so leave this frame out"
+        )
     if len(points) >= FEW_POINTS:
         outlying = ResidualField(torch.ones(points.size), points.tensors(), None).outliers
         points = points.select(~outlying.to(points.xy.device))
@@ -173,18 +175,20 @@ def _open_lesson(
     prepared, points = lesson
     reader = AlignedDepth(network, prepared.points, network.definition.default_alignment)
     halves = _halves(len(points), generator)
-    own = dict(network.module.named_parameters())
+    parameters = dict(network.module.named_parameters())
 
     def loss_of(weights: Weights) -> Tensor:
-        hidden = next(halves).to(points.depth.device)
-        shown, asked = points.select(~hidden), points.select(hidden)
-        values = {name: value.to(own[name].dtype) for name, value in weights.items()}
-        arguments = tuple(each.clone() for each in prepared.arguments_for(shown))
+        """The loss at a half of the points, of which the network is given the other one."""
+        is_hidden = next(halves).to(points.depth.device)
+        shown = points.select(~is_hidden)
+        hidden = points.select(is_hidden)
+        values = {name: value.to(parameters[name].dtype) for name, value in weights.items()}
+        arguments = tuple(tensor.clone() for tensor in prepared.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
             output = functional_call(network.module, values, arguments)
-        predicted = asked.sample(reader(output))
+        predicted = hidden.sample(reader(output))
         known = predicted.isfinite()  # unknown where the network says so, such as in the sky
-        log_error = predicted[known].clamp_min(MIN_DEPTH).log() - asked.depth[known].log()
+        log_error = predicted[known].clamp_min(MIN_DEPTH).log() - hidden.depth[known].log()
         return log_error.abs().mean()
 
     with encoding_once(network, {}):
@@ -205,7 +209,7 @@ def _losses_of(
     network: Network, lessons: Sequence[Lesson], theta: Weights, seed: int
 ) -> NDArray[np.float64]:
     """The loss at hidden points of each frame; with a seed the same points are hidden."""
-    losses = list[float]()
+    losses: list[float] = []
     for lesson in lessons:
         generator = torch.Generator().manual_seed(seed)
         with _open_lesson(network, lesson, generator) as loss_of, torch.no_grad():

@@ -141,7 +141,11 @@ class Experts(NamedTuple):
     @property
     def of_users(self) -> list[Expert]:
         """The user's networks, each with its own depth."""
-        return [e for e in self.every if e.user is not None and e.user.name == e.name]
+        return [
+            expert
+            for expert in self.every
+            if expert.user is not None and expert.user.name == expert.name
+        ]
 
     def replaced(self, changed: Sequence[Expert]) -> Experts:
         """Returns these experts after a step that changed some of them, all in the same order."""
@@ -193,12 +197,13 @@ def expert_of(
         updated = split.points.sample(of_kept.updated)
         # Updates that the user states may do harm, such as at a layer near to the depth.
         if network.tuned and of_kept.updates and not_updated < 1:
-            plain = ResidualField(of_kept.aligned, kept.points, kept.rgb)
-            without = plain.depth(split.points.xy, kind=split.propagation)
-            errors = split.error(without), split.error(at)
-            if errors[1] > HARMFUL * errors[0]:
-                harm = errors
-                at = without
+            field_without = ResidualField(of_kept.aligned, kept.points, kept.rgb)
+            at_without = field_without.depth(split.points.xy, kind=split.propagation)
+            error_without = split.error(at_without)
+            error_with = split.error(at)
+            if error_with > HARMFUL * error_without:
+                harm = (error_without, error_with)
+                at = at_without
                 not_updated = 1.0
     return NetworkExpert(
         name=name,
@@ -226,6 +231,7 @@ def expert_of_user(network: OpenNetwork, split: ValidatedFrame, judged: Judged) 
     """
     whole = judged.by(network)
     unexplained = 1.0
+    # What its depth without updates leaves unexplained decides whether z is updated.
     if not network.takes_points:
         whole = whole or network.refine(split.whole, updates=network.always_updated)
         unexplained = unexplained_by(whole.aligned, split, judged)
@@ -272,9 +278,9 @@ def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
     count = len(field.at_points.points)
     if count < MIN_POINTS:
         return 1.0
-    own = field.at_inliers.leave_one_out_error
-    without = constant.at_inliers.leave_one_out_error
-    return own / max(without, 1e-9) * (count - 1) / (count - 1 - FITTED)
+    of_depth = field.at_inliers.leave_one_out_error
+    of_constant = constant.at_inliers.leave_one_out_error
+    return of_depth / max(of_constant, 1e-9) * (count - 1) / (count - 1 - FITTED)
 
 
 def strength_of(unexplained: float) -> float:
@@ -289,8 +295,7 @@ def _less_updated(prediction: Prediction, not_updated: float) -> Tensor:
     """
     if not prediction.updates or not_updated <= 0:
         return prediction.updated
-    updated = (prediction.updated, 1 - not_updated)
-    return weighted_mean([updated, (prediction.aligned, not_updated)])
+    return weighted_mean([(prediction.updated, 1 - not_updated), (prediction.aligned, not_updated)])
 
 
 def networks_alone(
@@ -336,7 +341,7 @@ def fused_experts(
     # The network that takes a prior predicts without one.
     alone = expert_of(fusing, split, fusing.name, known=judged.by(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
-    with_prior = list[NetworkExpert]()
+    with_prior: list[NetworkExpert] = []
     merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in own]
     for number, (user, expert) in enumerate(zip(users, own, strict=True)):
         share = trust(user, expert, split, alone) * merits[number] / sum(merits)
@@ -384,11 +389,13 @@ def trust(
         split: The frame and its validation points.
         alone: The network that takes a prior, without one.
     """
+    # A network that takes the points: by its error beside that of `alone`.
     if network.takes_points:
         if not len(split.points):
             return 0.0
         ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
         return min(1.0, max(0.0, 2.0 - ratio))
+    # Another one: x is its log depth at the points, y theirs.
     points = split.whole.points
     at = points.sample(expert.whole.aligned).double()
     x = log_of(at[at > 0])
@@ -399,8 +406,10 @@ def trust(
     x = x - x.mean()
     y = y - y.mean()
     slope = (x @ y) / (x @ x).clamp_min(1e-12)
+    # Errors at each point of a line through the others, and of their mean.
     left_out = (y - slope * x) / (1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12))
     total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
+    # A line that falls says that far is near.
     explained = float(1 - left_out.square().sum() / total) if slope > 0 else 0.0
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))
 
@@ -445,7 +454,7 @@ def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, f
     The second is the mirrored frame. An expert without weight does not need it.
     """
     fusing.next_image()  # all these experts share what is computed for the mirrored image
-    every = list[Expert]()
+    every: list[Expert] = []
     for expert in experts.every:
         if isinstance(expert, NetworkExpert) and weights[expert.name] > 0:
             frame = expert.frame

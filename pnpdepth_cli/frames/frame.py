@@ -76,35 +76,40 @@ class Frame:
     @functools.cached_property
     def _registration_of_points(self) -> ImageRegistration | None:
         """The registration that the points tell; kept, because most frames need it twice."""
-        assert self.image is not None
-        return estimate_registration([evidence(self.image, self.points)])
+        image = self.image
+        if image is None:
+            return None
+        return estimate_registration([evidence(image, self.points)])
 
     def registered(self: AnyFrame) -> AnyFrame:
         """Returns the frame with its image moved to the points, if it has to be."""
-        image, how = self.image, self.register
-        if image is None or how is None:
+        image = self.image
+        if image is None or self.register is None:
             return self
-        how = self._registration_of_points if how == "auto" else how
-        if how is None:
+        registration = self._registration_of_points if self.register == "auto" else self.register
+        if registration is None:
             return replace(self, register=None)
-        predicted = [torch.from_numpy(how.apply_to(each.numpy())) for each in self.predicted]
+        # Depth maps of networks belong to the image, so they are moved with it.
+        predicted = [
+            torch.from_numpy(registration.apply_to(depth_map.numpy()))
+            for depth_map in self.predicted
+        ]
         return replace(
             self,
-            rgb=tensor_of(how.apply_to(image)),
+            rgb=tensor_of(registration.apply_to(image)),
             predicted=tuple(predicted),
             register=None,
-            registration=how,
+            registration=registration,
         )
 
     def mirrored(self) -> Frame:
         """Returns the frame with left and right of image, points and prior exchanged."""
-        outliers, prior = self.outliers, self.prior
         return replace(
             self,
             rgb=None if self.rgb is None else self.rgb.flip(-1),
             points=self.points.mirrored(),
-            outliers=None if outliers is None else outliers.mirrored(),
-            prior=None if prior is None else prior.flip(-1),
+            outliers=None if self.outliers is None else self.outliers.mirrored(),
+            prior=None if self.prior is None else self.prior.flip(-1),
         )
 
     def without(self, outliers: Tensor) -> Frame:
@@ -249,7 +254,9 @@ def registration_to_make(registration: Registration, settings: Settings) -> Regi
         return ImageRegistration(zoom=zoom, right=right, down=down)
     if registration not in ("auto", "off"):
         raise UsageError(f"registration must be auto, off or three numbers, got {registration!r}")
-    return "auto" if registration == "auto" and not settings.is_paper else None
+    if registration == "off" or settings.is_paper:
+        return None
+    return "auto"
 
 
 def tensor_of(image: NDArray[np.float32]) -> Tensor:

@@ -30,6 +30,15 @@ ALL_ON_LINES = 1.5
 least weight. Simulated networks of 4 and 9 % error have 0.4 to 1.55, FastDepth 1.9 to 2.5."""
 NONE_ON_LINES = 2.0
 """The same quotient, from which on it has no least weight."""
+LEAST_ERROR = 1e-9
+"""Metres; errors at validation points are at least this before they are divided by."""
+
+
+# Of the fit of the weights.
+_PASSES = 5  # of iteratively reweighted least squares
+_STD_OF_MEAN = 1.25  # standard deviation over the mean size of normal errors
+_LEAST_STD = 1e-3  # of log depth, from which on a residual counts less
+_SUM_WEIGHT = 1e4  # of the row by which the weights add up to 1
 
 
 def fit_weights(
@@ -51,7 +60,7 @@ def fit_weights(
     having = [expert for expert in experts if expert.weight > 0]
     prior = np.array([expert.weight for expert in having])
     prior = prior / prior.sum()
-    found = prior
+    fitted = prior
     points = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
     if len(having) > 1 and bool(points.any()):
         # Log predictions and log depths, relative to the prediction with the prior weights.
@@ -62,19 +71,21 @@ def fit_weights(
         residual = (log_of(split.points.depth.double()[points]) - centre).numpy()
         shares = split.weights[points].double().numpy()
         # Each pass weighs large residuals down, and solves for weights >= 0 whose sum is 1.
-        scale = max(1.25 * float(np.average(np.abs(residual), weights=shares)), 1e-3)
+        scale = max(_STD_OF_MEAN * float(np.average(np.abs(residual), weights=shares)), _LEAST_STD)
         ridge = np.sqrt(STRENGTH) * scale
-        sum_of_one = np.full((1, len(prior)), 1e4)
-        for _ in range(5):
-            size = np.abs(residual - offsets @ found)
+        sum_of_one = np.full((1, len(prior)), _SUM_WEIGHT)
+        for _ in range(_PASSES):
+            size = np.abs(residual - offsets @ fitted)
             root = np.sqrt(shares * np.minimum(1, scale / np.maximum(size, 1e-9)))
             system = [offsets * root[:, None], ridge * np.eye(len(prior)), sum_of_one]
-            right = [residual * root, ridge * prior, [1e4]]
-            found = nnls(np.concatenate(system), np.concatenate(right))[0]
-            found /= found.sum()
-    by_name = dict.fromkeys((expert.name for expert in experts), 0.0)
-    fitted = {expert.name: float(w) for expert, w in zip(having, found, strict=True)}
-    return by_name | fitted
+            right = [residual * root, ridge * prior, [_SUM_WEIGHT]]
+            fitted, _ = nnls(np.concatenate(system), np.concatenate(right))
+            fitted /= fitted.sum()
+    # An expert without prior weight has none.
+    weights = {expert.name: 0.0 for expert in experts}
+    for expert, weight in zip(having, fitted, strict=True):
+        weights[expert.name] = float(weight)
+    return weights
 
 
 class Share(NamedTuple):
@@ -91,7 +102,7 @@ class Share(NamedTuple):
 
 def with_shares(fused: Tensor, shares: Sequence[tuple[Tensor, float]]) -> Tensor:
     """Returns the fused depth (…) with the depths (…) of single networks, by their parts."""
-    rest = 1 - sum(part for _, part in shares)
+    rest = 1 - sum(weight for _, weight in shares)
     return weighted_mean([(fused, rest), *shares])
 
 
@@ -112,8 +123,10 @@ def shares_on_lines(
     """
     if not len(split.points):
         return []
-    own = _shares_of_scanner(experts.every, split, weights)
-    return own or _share_of_image(experts, split, inliers, weights)
+    of_scanner = _shares_of_scanner(experts.every, split, weights)
+    if of_scanner:
+        return of_scanner
+    return _share_of_image(experts, split, inliers, weights)
 
 
 def _shares_of_scanner(
@@ -124,15 +137,21 @@ def _shares_of_scanner(
     A network has one if its error at the points, which it was given, is at most the error of the
     experts' mean at the validation points.
     """
-    own = [expert for expert in experts if expert.of_scanner]
-    if not own:
+    of_scanner = [expert for expert in experts if expert.of_scanner]
+    if not of_scanner:
         return []
+    # Those that fit the points that they were given.
     mean = weighted_mean([(expert.at, weights[expert.name]) for expert in experts])
     limit = split.error(mean)
     points = split.whole.points
-    fit = [e for e in own if (points.sample(e.dense) - points.depth).abs().mean() <= limit]
-    part = OWN_SCANNER / max(len(fit), 1)
-    return [Share(expert.name, part, expert.dense, expert.updated) for expert in fit]
+    fitting = [
+        expert
+        for expert in of_scanner
+        if (points.sample(expert.dense) - points.depth).abs().mean() <= limit
+    ]
+    # They share the weight.
+    part = OWN_SCANNER / max(len(fitting), 1)
+    return [Share(expert.name, part, expert.dense, expert.updated) for expert in fitting]
 
 
 def _share_of_image(
@@ -143,12 +162,15 @@ def _share_of_image(
     alone = experts.alone
     if alone is None or own.user is None or own.user.takes_points:
         return []
+    # Its error at the validation points, beside that of `compact`, says how much it may have.
     kept = split.kept
     field = ResidualField(own.kept.aligned, kept.points, kept.rgb)
     at = field.depth(split.points.xy, kind=split.propagation)
-    ratio = split.error(at) / max(split.error(alone.at), 1e-9)
+    ratio = split.error(at) / max(split.error(alone.at), LEAST_ERROR)
     trusted = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
-    part = IMAGE_ON_LINES * min(1.0, max(0.0, trusted)) - weights[own.name]
+    least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, trusted))
+    # What it has already in the fused depth counts.
+    part = least_weight - weights[own.name]
     if part <= 0:
         return []
     whole = ResidualField(own.whole.aligned, inliers.points, inliers.rgb)

@@ -41,7 +41,10 @@ def check_combination(asked: Settings, networks: int, maps: int = 0) -> None:
         UsageError: They do not.
     """
     if asked.is_paper and maps:
-        raise UsageError("method 'paper' updates z of a network, and a depth map has none")
+        raise UsageError(
+            "method 'paper' updates z of a network, and a depth map has none; use 'fused' or"
+            " 'alone', or leave out the depth map"
+        )
     if asked.layer is not None and maps:
         raise UsageError("a depth map has no layer to cut at; leave out `layer`, or the depth map")
     if asked.is_paper and networks > 1:
@@ -144,7 +147,7 @@ class Method:
         ]
         # The included network joins, unless it is there.
         if self._maps and (asked.method == "alone" or first.rgb is None):
-            resolved = [each for each in resolved if not each.definition.takes_prior]
+            resolved = [network for network in resolved if not network.definition.takes_prior]
         named = {network.definition.name for network in resolved}
         if asked.method == "fused" and first.rgb is not None and COMPANION not in named:
             companion = load_network(COMPANION, None, str(resolved[0].device))
@@ -181,18 +184,20 @@ class Method:
         """
         if len(frame.predicted) != self._maps:
             raise UsageError(
-                f"a frame has {len(frame.predicted)} depth maps, but the first one has {self._maps}"
+                f"a frame has {len(frame.predicted)} depth maps, but the first one has"
+                f" {self._maps}; give every frame as many"
             )
         seed = self.asked.seed
         torch.manual_seed(seed)
+        # The image is moved to the points.
         if frame.register == "auto" and frame.size in self.registrations:
             frame = replace(frame, register=self.registrations[frame.size])
         frame = frame.registered()
+        # The steps of the method, and what is done with their result.
         refined = refine_frame(
             self.members, frame, self.pipeline, seed=seed, with_stages=with_stages
         )
-        follow = with_measured if self._keep_measured else with_note_on_measured
-        refined = follow(refined)
+        refined = with_measured(refined) if self._keep_measured else with_note_on_measured(refined)
         refined = replace(
             refined,
             asked=self.asked,
@@ -208,11 +213,12 @@ class Method:
 
         The size is that of the first image that tells it. A frame of another size decides alone.
         """
-        usable = list[Evidence]()
+        usable: list[Evidence] = []
         for read, frame in enumerate(frames, 1):
             if frame.image is not None and frame.register == "auto":
-                known = evidence(frame.image, frame.points)
-                usable += [] if known is None else [known]
+                of_frame = evidence(frame.image, frame.points)
+                if of_frame is not None:
+                    usable.append(of_frame)
             if read == _TRIED and not usable:  # such as scans, none of which will tell
                 break
         if usable:

@@ -102,9 +102,10 @@ def refine_frame(
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.prediction.aligned, inliers.points))
     # The residual at the inliers is propagated to every pixel.
-    depth = propagated = _propagated(fused, inliers, split, judged.field)
+    propagated = _propagate(fused, inliers, split, judged.field)
+    depth = propagated
     # On scan lines, validation points do not show what some networks are worth.
-    shares = list[Share]()
+    shares: list[Share] = []
     if pipeline.fuses and split.has_scan_lines:
         shares = shares_on_lines(experts, split, inliers, weights)
         depth = with_shares(propagated, [(share.dense, share.part) for share in shares])
@@ -119,7 +120,7 @@ def refine_frame(
     result = _refined(frame, inliers, experts, split, steps, pipeline)
     if with_stages:
         stages = _stages(experts, inliers, split, steps)
-        result = replace(result, stages={name: each.numpy() for name, each in stages.items()})
+        result = replace(result, stages={name: depth.numpy() for name, depth in stages.items()})
     return result
 
 
@@ -163,21 +164,25 @@ def without_outliers(
     Raises:
         NoPointsError: No point lies where the network predicts.
     """
+    # Points that contradict their neighbours by themselves are suspected.
     points = frame.points
     constant = ResidualField(torch.ones(points.size), points, frame.rgb)
     suspected = constant.outliers
-    # A network that weighs its points is given the outliers too, once they are known.
-    again = bool(suspected.any()) and judge.weighs_points
     consistent = frame
     if bool(suspected.any()):
         consistent = replace(frame, points=points.select(~suspected))
+    # The judge predicts from the others. If it weighs its points it predicts again, as it is given
+    # the outliers too, once they are known.
+    again = bool(suspected.any()) and judge.weighs_points
     prediction = judge.refine(consistent, updates=judge.takes_points and not again)
+    # Outliers beside its prediction.
     field = ResidualField(prediction.aligned, points, frame.rgb)
     outlying = field.outliers
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     if bool(outlying.any()) and not is_dense(points):
         outlying = outlying & contradict_strong(networks, frame, constant)
+    # What the judge gives for the frame without them.
     inliers = frame.without(outlying)
     if again or not torch.equal(outlying, suspected):
         prediction = judge.refine(inliers, updates=judge.takes_points)
@@ -208,8 +213,8 @@ def contradict_strong(
     return outlying
 
 
-def _propagated(
-    depth: Tensor, frame: Frame, split: ValidatedFrame, known: ResidualField | None
+def _propagate(
+    depth: Tensor, frame: Frame, split: ValidatedFrame, field: ResidualField | None
 ) -> Tensor:
     """Depth (H, W) with its residual at the points propagated.
 
@@ -217,9 +222,8 @@ def _propagated(
         depth: (H, W) metres.
         frame: The frame without its outliers.
         split: How the residual is propagated.
-        known: A field of the frame, which may be that of this depth.
+        field: A field of the frame, used if it is that of this depth.
     """
-    field = known
     if field is None or not field.is_of(depth, frame.points):
         field = ResidualField(depth, frame.points, frame.rgb)
     return field.depth(kind=split.propagation)
@@ -235,7 +239,35 @@ def _refined(
 ) -> Refined:
     """The refined frame, with what a person should know of it."""
     own = experts.own.whole
-    notes = [*own.notes]
+    notes = _notes(frame, inliers, experts, split, steps, pipeline)
+    return Refined(
+        before=own.aligned.numpy(),
+        depth=steps.depth.numpy(),
+        used=inliers.points,
+        losses=own.losses,
+        step=own.step,
+        diverged=own.diverged,
+        alignment=own.alignment,
+        propagation=split.propagation,
+        notes=tuple(notes),
+        validation=_validation(experts, split, steps.shares),
+        weights=steps.weights_in_depth,
+        registration=frame.registration,
+    )
+
+
+def _notes(
+    frame: Frame,
+    inliers: Frame,
+    experts: Experts,
+    split: ValidatedFrame,
+    steps: Steps,
+    pipeline: Pipeline,
+) -> list[str]:
+    """What a person should know of the refined frame, a line each; warnings last."""
+    own = experts.own
+    notes = list(own.whole.notes)
+    # Of the image and the points.
     if frame.registration is not None:
         notes.append(
             f"image: moved to the pixel coordinates of the depth camera by {frame.registration}"
@@ -246,36 +278,23 @@ def _refined(
             f"outliers: {left_out:,} of {len(frame.points):,} points left out, inconsistent with"
             " the others"
         )
+    # Of the networks, and of the updates of the user's.
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
-    not_updated = experts.own.not_updated
-    if experts.own.harm is not None:
-        without, with_updates = experts.own.harm
+    if own.harm is not None:
+        without, with_updates = own.harm
         notes.append(
-            f"{experts.own.name}: these updates of z are not used, as they raise its error at"
+            f"{own.name}: these updates of z are not used, as they raise its error at"
             f" {len(split.points):,} validation points from {without:.4f} to {with_updates:.4f}"
         )
-    elif not_updated > 0:
+    elif own.not_updated > 0:
         notes.append(
-            f"{experts.own.name} is strong: its depth makes points predict each other far better;"
-            f" {not_updated:.0%} of it is without updates of z"
+            f"{own.name} is strong: its depth makes points predict each other far better;"
+            f" {own.not_updated:.0%} of it is without updates of z"
         )
-    if pipeline.unused and not own.updates:
+    if pipeline.unused and not own.whole.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
-        notes.append(f"{names}: not used, as z of {experts.own.name} is not updated")
-    return Refined(
-        before=own.aligned.numpy(),
-        depth=steps.depth.numpy(),
-        used=inliers.points,
-        losses=own.losses,
-        step=own.step,
-        diverged=own.diverged,
-        alignment=own.alignment,
-        propagation=split.propagation,
-        notes=(*notes, *experts.warnings),
-        validation=_validation(experts, split, steps.shares),
-        weights=steps.weights_in_depth,
-        registration=frame.registration,
-    )
+        notes.append(f"{names}: not used, as z of {own.name} is not updated")
+    return [*notes, *experts.warnings]
 
 
 def _stages(
@@ -287,7 +306,7 @@ def _stages(
         """Depth (H, W) with its residual propagated; that of the result is known."""
         if dense is steps.fused:
             return steps.propagated
-        return _propagated(dense, frame, split, steps.judged)
+        return _propagate(dense, frame, split, steps.judged)
 
     own = experts.own
     stages = {BEFORE: own.whole.aligned}
@@ -313,15 +332,18 @@ def _validation(
     points = split.points
     if not len(points):
         return None
-    part = torch.arange(len(points)) % FOLDS
-    result = torch.empty(len(points))
+    # The result at each fifth of the points.
+    fold_of_point = torch.arange(len(points)) % FOLDS
+    fused = torch.empty(len(points))
     for fold in range(FOLDS):
-        weights = fit_weights(experts.every, split, part != fold)
-        fused = weighted_mean([(expert.at, weights[expert.name]) for expert in experts.every])
-        result[part == fold] = fused[part == fold]
+        weights = fit_weights(experts.every, split, fold_of_point != fold)
+        mean = weighted_mean([(expert.at, weights[expert.name]) for expert in experts.every])
+        fused[fold_of_point == fold] = mean[fold_of_point == fold]
+    # All points that were given for it, outliers too.
     given = split.kept.points
     if split.kept.outliers is not None:
         given = given.joined(split.kept.outliers)
+    # The steps of the user's network, `compact` alone, the result and interpolation.
     predicted = {BEFORE: points.sample(own.kept.aligned)}
     if own.kept.updates:
         predicted[UPDATED] = own.updated
@@ -331,7 +353,7 @@ def _validation(
         predicted[PROPAGATED] = own.at
     if experts.alone is not None:
         predicted[ALONE] = experts.alone.at
-    predicted[AFTER] = with_shares(result, [(share.at, share.part) for share in shares])
+    predicted[AFTER] = with_shares(fused, [(share.at, share.part) for share in shares])
     predicted[LINEAR] = linear(given, points.xy)
     return Validation(
         points=points,
@@ -346,17 +368,18 @@ def _notes_on_networks(
     experts: Experts, split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[str]:
     """Which of the user's networks have no part in the result, and why."""
-    notes = list[str]()
+    notes: list[str] = []
     alone = experts.alone
-    for own in experts.of_users:
-        of_user = sum(weights[expert.name] for expert in experts.every if expert.user is own.user)
-        if of_user >= LEAST_PART:
+    for network in experts.of_users:
+        # Its depth, and what the network that takes a prior makes of it.
+        experts_of_user = [expert for expert in experts.every if expert.user is network.user]
+        if sum(weights[expert.name] for expert in experts_of_user) >= LEAST_PART:
             continue
         why = "its depth does not help to predict the points from each other"
         if len(split.points) and alone is not None:
             why = (
                 f"at {len(split.points):,} validation points its error is"
-                f" {split.error(own.at):.4f}, that of {alone.name} {split.error(alone.at):.4f}"
+                f" {split.error(network.at):.4f}, that of {alone.name} {split.error(alone.at):.4f}"
             )
-        notes.append(f"{own.name} has no part in the result: {why}")
+        notes.append(f"{network.name} has no part in the result: {why}")
     return notes

@@ -46,25 +46,65 @@ At 2 m, the data sheets of Azure Kinect (11 mm + 0.1 %) and RealSense D400 give 
 # Exponents are fitted to 21 refinements of 7-Scenes, ICL-NUIM and even KITTI frames by the pinball
 # losses of the 68 and 95 % quantiles; the factors to 78 refinements of even frames of these sets.
 _EXPONENTS = (0.58, 0.10, 0.42, 0.18)
-_LEAST = 0.003  # of log depth, added to each difference
-_MEAN_OF, _AMONG = 3, 8  # nearest points
-_WINDOW = 9  # pixels
-_WITHIN = (0.68, 0.95)  # of normal errors within one and two standard deviations
-_TAIL = 0.75  # weight of the second in the scale: both cannot hold where tails are heavy
-_TYPICAL, _PER_POINT = 1.75, -0.18  # factor with 100 points, and its power of their number
-_FEWEST_POINTS, _MOST_POINTS = 20, 500  # fewer and more change nothing
-_TYPICAL_WEIGHT = 20  # validation points that the typical factor counts as
-_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point are valid
-_BEYOND_HULL = 2.0  # typical distances to the nearest point, outside the hull of the points
-_END, _SHARP, _LEAST_AT_END = 0.85, 0.5, 0.02
-"""Points end sharply if from 0.85 of the farthest on there are half as many as in the band before,
-and 2 % of all."""
-_GAP = 3.6  # median spacings to the nearest point; of random pixels 0.01 % are farther from one
-_GAP_LINES = 1.2  # spacings of scan lines
-_REACHED = 0.8  # of it, around the middle of a gap, belong to the gap
-_LEAST_GAP = 0.01  # of the image
-_AT_BORDER = 0.25  # of the points beside the gaps, that are at the end
-_SAMPLED = 4000  # pixels, for the typical distance
+"""Powers of the four differences, in the order of the module's list."""
+_LEAST = 0.003
+"""Log depth added to each difference."""
+_LEAST_DEPTH = 1e-6
+"""Metres; depth is at least this before its logarithm is taken."""
+_MEAN_OF = 3
+"""Nearest points whose mean the depth is compared with."""
+_AMONG = 8
+"""Nearest points among which depth may differ."""
+_WINDOW_PX = 9
+"""Side of the window over which the network's own depth may range."""
+
+# The factor of σ.
+_WITHIN = (0.68, 0.95)
+"""Fractions of normal errors within one and two standard deviations."""
+_TAIL = 0.75
+"""Weight of the second in the scale: both cannot hold where tails are heavy."""
+_TYPICAL = 1.75
+"""Typical factor with 100 points."""
+_PER_POINT = -0.18
+"""Its power of the number of points."""
+_FEWEST_POINTS = 20
+"""Fewer points change nothing of the typical factor."""
+_MOST_POINTS = 500
+"""More points change nothing of it."""
+_TYPICAL_WEIGHT = 20
+"""Validation points that the typical factor counts as."""
+
+# Where depth is valid.
+_BEYOND_POINTS = 1.5
+"""Depths up to this multiple of the farthest point are valid."""
+_BEYOND_HULL = 2.0
+"""Typical distances to the nearest point up to which depth outside the points' hull is valid."""
+_TYPICAL_QUANTILE = 0.95
+"""Quantile of the distances inside the hull that is typical."""
+_SAMPLED = 4000
+"""Pixels that the typical distance is measured at."""
+
+# What is beyond the range of a sensor.
+_END = 0.85
+"""Fraction of the farthest depth from which on a point is at the end; the band before is as deep.
+"""
+_SHARP = 0.5
+"""Least points at the end over those in the band before, if the points end sharply."""
+_LEAST_AT_END = 0.02
+"""Least fraction of all points at the end, likewise."""
+_FEWEST_AT_END = 10
+"""Least number of points at the end, likewise."""
+_GAP = 3.6
+"""Median spacings from a pixel in a gap to the nearest point. Of random pixels 0.01 % are farther
+from one."""
+_GAP_LINES = 1.2
+"""Spacings of scan lines from a pixel in a gap to the nearest point."""
+_REACHED = 0.8
+"""Fraction of that distance around the middle of a gap that belongs to the gap."""
+_LEAST_GAP = 0.01
+"""Least fraction of the image in the middle of gaps."""
+_AT_BORDER = 0.25
+"""Least fraction of the points beside the gaps that are at the end."""
 
 _OF_MATCHES = (
     "note: of points that were matched in images, ±2σ holds about 80 % of the true depths: they"
@@ -83,21 +123,30 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         of_matches: Whether its points were matched in images, as those of COLMAP.
     """
     points = frame.used
-    network, depth = (torch.from_numpy(each) for each in (frame.before, frame.depth))
+    network = torch.from_numpy(frame.before)
+    depth = torch.from_numpy(frame.depth)
     # The shape of the standard deviation, calibrated at the validation points.
-    shape, residual, sigma = relative_shape(points, network, depth), torch.empty(0), torch.empty(0)
+    shape = relative_shape(points, network, depth)
+    residual = torch.empty(0)
+    residual_sigma = torch.empty(0)
     note = "uncertainty: too few points to calibrate it with"
     if frame.validation is not None:
-        residual, sigma = _residuals(frame.validation)
+        residual, residual_sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
+    of_points = calibration(residual, residual_sigma, len(points)) * shape
+    # What a sensor's points have in common, and what they do not reach, comes on top.
     is_map = is_dense(points) and scan_pattern(points.xy, points.size) is None
-    of_points = calibration(residual, sigma, len(points)) * shape
-    of_sensor = torch.tensor(SENSOR_ERROR * is_map)
+    of_sensor = torch.tensor(SENSOR_ERROR if is_map else 0.0)
     beyond = beyond_range(points)
     of_range = torch.where(beyond, BEYOND_RANGE_SIGMA, 0.0)
-    sigma_m = of_points.hypot(of_sensor).hypot(of_range) * depth
-    valid = valid_depth(points, depth, sigma_m)
-    notes = [*frame.notes, note, *[_OF_MATCHES] * of_matches, *[_OF_MAP] * is_map]
+    sigma = of_points.hypot(of_sensor).hypot(of_range) * depth
+    valid = valid_depth(points, depth, sigma)
+    # What to know of it.
+    notes = [*frame.notes, note]
+    if of_matches:
+        notes.append(_OF_MATCHES)
+    if is_map:
+        notes.append(_OF_MAP)
     if bool(beyond.any()):
         notes.append(
             f"note: the points end sharply at a depth of {float(points.depth.max()):.3g}, with none"
@@ -110,16 +159,16 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         percent = round(100 * count / valid.numel())
         what = f"{percent} % of the image" if percent else f"{count:,} of {valid.numel():,} pixels"
         notes.append(f"note: the depth of {what} is beyond what the points support, and not valid")
-    of_depth, is_valid = (each.numpy() for each in (sigma_m, valid))
-    return replace(frame, sigma=of_depth, valid=is_valid, notes=tuple(notes))
+    return replace(frame, sigma=sigma.numpy(), valid=valid.numpy(), notes=tuple(notes))
 
 
 def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
     """Residual of log depth and uncalibrated standard deviation, (M,), at validation points."""
-    predicted, points = validation.predicted[AFTER], validation.points
+    predicted = validation.predicted[AFTER]
+    points = validation.points
     sigma = relative_shape(validation.kept, validation.network, predicted, points.xy)
-    good = (validation.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
-    return points.depth[good].log() - predicted[good].log(), sigma[good]
+    usable = (validation.weights > MIN_INLIER_WEIGHT) & (predicted > 0)
+    return points.depth[usable].log() - predicted[usable].log(), sigma[usable]
 
 
 def relative_shape(
@@ -134,34 +183,40 @@ def relative_shape(
         xy: (M, 2) pixel coordinates of `depth`. None: every pixel.
     """
     # How far the network's own log depth ranges over a window, at every pixel.
-    log_depth = depth.clamp_min(1e-6).log().double()
     known = network > 0
     middle = network[known].median() if bool(known.any()) else network.new_tensor(1.0)
-    own = torch.where(known, network, middle).log()[None, None]
-    half = _WINDOW // 2
-    steps = F.max_pool2d(own, _WINDOW, 1, half) + F.max_pool2d(-own, _WINDOW, 1, half)
+    log_network = torch.where(known, network, middle).log()[None, None]
+    half = _WINDOW_PX // 2
+    highest = F.max_pool2d(log_network, _WINDOW_PX, 1, half)
+    lowest = -F.max_pool2d(-log_network, _WINDOW_PX, 1, half)
+    ranges = highest - lowest
     # Where the standard deviation is asked for, and that range there.
     if xy is None:
-        queries, step = pixels_of(points.size), steps.flatten()
+        queries = pixels_of(points.size)
+        network_range = ranges.flatten()
     else:
         queries = xy.double()
-        step = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size).sample(steps[0, 0])
+        there = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
+        network_range = there.sample(ranges[0, 0])
     # Log depth of the nearest points.
     _, near = nearest_points(points, queries, min(_AMONG, len(points)))
     near_depths = points.depth.double().log()[near.reshape(len(queries), -1)]
     low, high = near_depths.aminmax(dim=1)
-    flat = log_depth.flatten()
     # The four differences of log depth, as in the module's list.
+    log_depth = depth.clamp_min(_LEAST_DEPTH).log().double().flatten()
+    log_linear = linear(points, xy).clamp_min(_LEAST_DEPTH).log().double().flatten()
     differences = (
-        (linear(points, xy).clamp_min(1e-6).log().double().flatten() - flat).abs(),
-        (near_depths[:, :_MEAN_OF].mean(dim=1) - flat).abs(),
+        (log_linear - log_depth).abs(),
+        (near_depths[:, :_MEAN_OF].mean(dim=1) - log_depth).abs(),
         high - low,
-        step.double(),
+        network_range.double(),
     )
     # The product of their powers.
-    parts = zip(_EXPONENTS, differences, strict=True)
-    logarithm = torch.stack([power * (each + _LEAST).log() for power, each in parts]).sum(dim=0)
-    return logarithm.exp().reshape(depth.shape).float()
+    logarithms = [
+        exponent * (difference + _LEAST).log()
+        for exponent, difference in zip(_EXPONENTS, differences, strict=True)
+    ]
+    return torch.stack(logarithms).sum(dim=0).exp().reshape(depth.shape).float()
 
 
 def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
@@ -184,8 +239,10 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     ratio = ratio[ratio.isfinite()].sort().values
     if not len(ratio):
         return typical
-    ranks = [min(math.ceil(part * (len(ratio) + 1)), len(ratio)) - 1 for part in _WITHIN]
+    # The residuals, in σ, that the fractions are within.
+    ranks = [min(math.ceil(fraction * (len(ratio) + 1)), len(ratio)) - 1 for fraction in _WITHIN]
     one, two = (max(float(ratio[rank]), 1e-12) for rank in ranks)
+    # Means of logarithms: of the two, and with the typical factor.
     of_residuals = (1 - _TAIL) * math.log(one) + _TAIL * math.log(two / 2)
     weight = len(ratio) / (len(ratio) + _TYPICAL_WEIGHT)
     low, high = CALIBRATION_RANGE
@@ -206,14 +263,16 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     """
     supported = (depth > 0) & (depth <= _BEYOND_POINTS * float(points.depth.max()))
     valid = supported & (sigma <= VALID_SIGMA * depth)
+    # Inside the hull, and outside of it as near to a point as pixels inside are.
     inside = in_hull(points)
     outside = torch.nonzero(~inside).flip(1)
     sample = torch.nonzero(inside & ~beyond_range(points)).flip(1)
     if len(outside) and len(sample):
         sample = sample[:: max(1, len(sample) // _SAMPLED)]
-        typical = float(nearest_points(points, sample.double(), 1)[0].quantile(0.95))
-        distance = nearest_points(points, outside.double(), 1)[0].flatten()
-        inside[~inside] = distance <= _BEYOND_HULL * typical
+        inside_px, _ = nearest_points(points, sample.double(), 1)
+        outside_px, _ = nearest_points(points, outside.double(), 1)
+        typical_px = float(inside_px.quantile(_TYPICAL_QUANTILE))
+        inside[~inside] = outside_px.flatten() <= _BEYOND_HULL * typical_px
     return valid & inside
 
 
@@ -232,18 +291,21 @@ def beyond_range(points: SparsePoints) -> Tensor:
     last = depth >= _END * farthest
     before = (depth >= (2 * _END - 1) * farthest) & ~last
     at_end = int(last.sum())
-    if at_end < max(_LEAST_AT_END * len(points), _SHARP * int(before.sum()), 10):
+    fewest = max(_LEAST_AT_END * len(points), _SHARP * int(before.sum()), _FEWEST_AT_END)
+    if at_end < fewest:
         return nowhere
     # The gaps: pixels too far from any point for their spacing.
-    spacing = float(nearest_points(points, points.xy.double(), 2)[0][:, 1].median())
-    reach_px = _GAP * spacing
-    if (pattern := scan_pattern(points.xy, points.size)) is not None:
-        reach_px = max(reach_px, _GAP_LINES * pattern[1])
-    pixels = pixels_of(points.size)
-    distance, nearest = nearest_points(points, pixels, 1)
-    core = (distance.flatten() > reach_px).reshape(points.size)
+    to_next_px, _ = nearest_points(points, points.xy.double(), 2)  # to itself, and to the next
+    reach_px = _GAP * float(to_next_px[:, 1].median())
+    pattern = scan_pattern(points.xy, points.size)
+    if pattern is not None:
+        _, across_px = pattern
+        reach_px = max(reach_px, _GAP_LINES * across_px)
+    distance_px, nearest = nearest_points(points, pixels_of(points.size), 1)
+    core = (distance_px.flatten() > reach_px).reshape(points.size)
     if float(core.double().mean()) < _LEAST_GAP:
         return nowhere
+    # At their border points must end there.
     beside = torch.unique(nearest.flatten()[core.flatten()])
     if float(last[beside].double().mean()) < _AT_BORDER:
         return nowhere

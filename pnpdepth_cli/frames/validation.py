@@ -41,14 +41,17 @@ class ValidatedFrame(ValidationPoints):
         In log depth; negative where it is worse. Points in one hole err together, so a hole counts
         as one of them.
         """
+        # How much nearer to the truth it is at each point, and what the point counts.
         truth = log_of(self.points.depth)
         share = self.weights / self.weights.sum()
         gain = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
+        # Means of holes in place of points.
         if self.hole is not None:
             _, number = torch.unique(self.hole, return_inverse=True)
             total = torch.bincount(number, share)
             gain = (torch.bincount(number, share * gain) / total)[total > 0]
             share = torch.full_like(gain, 1 / len(gain))
+        # The mean over its standard error.
         mean = (share * gain).sum()
         error = (share.square() * (gain - mean).square()).sum().sqrt()
         return float(mean / error.clamp_min(1e-12))
@@ -95,10 +98,11 @@ def split_frame(
     points = whole.whole.points
     if len(points) < MIN_POINTS:
         return whole
+    # Of a depth map those in copies of its holes, else a fold.
     hole = None
     if is_dense(points) and not whole.has_scan_lines:
         hole = under_holes(points, FOLDS, seed=seed)
-    chosen = spatial_folds(points, FOLDS, seed=seed) == 0 if hole is None else hole > 0
+    chosen = (spatial_folds(points, FOLDS, seed=seed) == 0) if hole is None else (hole > 0)
     kept = replace(whole.whole, points=points.select(~chosen))
     if not bool(chosen.any()) or not all(network.sees(kept) for network in networks):
         return whole

@@ -131,11 +131,17 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
     Raises:
         OutputError: Another run writes there, or the folder cannot be written to.
     """
-    own = folder / (_WHOLE if shard is None else f".batch.{shard[0]}of{shard[1]}.lock")
-    with _hold(own):
-        for other in sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]:
-            if other != own and other.exists():
-                with _hold(other):
+    lock = folder / _WHOLE
+    if shard is not None:
+        number, shards = shard
+        lock = folder / f".batch.{number}of{shards}.lock"
+    with _hold(lock):
+        # A run of all frames excludes every shard, and a shard only such a run. Whether another
+        # process holds a lock is found out by holding it for a moment.
+        excluded = sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]
+        for other_lock in excluded:
+            if other_lock != lock and other_lock.exists():
+                with _hold(other_lock):
                     pass
         yield
 

@@ -140,7 +140,8 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
     if is_json or text.lstrip().startswith("{"):
         fields = _Fields(path, read_json(path))
         if {"K", "w", "h", "poses"} <= set(fields.values):  # Record3D's, with K by columns
-            size, source = [fields.values["w"], fields.values["h"]], "Record3D's metadata"
+            source = "Record3D's metadata"
+            size = [fields.values["w"], fields.values["h"]]
             fields = _Fields(path, {"K": fields.matrix("K").T, "size": size})
     elif _FIELD.search(plain := _COMMENT.sub("", text)):
         fields = _named_values(path, text)
@@ -179,8 +180,10 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
             raise UsageError(f"{path} has no {name}; --camera can be one of: {', '.join(chain)}")
         fields = _Fields(path, chain[name])
         if (model := fields.text("camera_model", "pinhole")) != "pinhole":
-            fact = f"{name} is of model {one_line(model)[:20]}"
-            raise InputError(f"{path}: {fact}; calibrate it as a pinhole camera")
+            raise InputError(
+                f"{path}: {name} is of model {one_line(model)[:20]}; calibrate it as a pinhole"
+                " camera"
+            )
         return _single(fields, None, f"Kalibr camchain, {name}")
     kind = "ROS camera_info" if "distortion_model" in content else "OpenCV calibration"
     plain = {name: content[name] for name in content if name != "R"}  # the rectification
@@ -202,11 +205,15 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
     intrinsics, column = p.reshape(3, 4)[:, :3], p.reshape(3, 4)[:, 3]
     offset = np.linalg.solve(intrinsics, column)
     turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
-    turned, shifted = not np.allclose(turn, np.eye(3), atol=1e-9), np.abs(offset).max() > 1e-9
+    is_turned = not np.allclose(turn, np.eye(3), atol=1e-9)
+    is_shifted = np.abs(offset).max() > 1e-9
+    # The poses of the raw camera that may be meant, by what says them.
     poses: dict[str, Extrinsics] = {}
-    if shifted:
-        poses["P with its offset" + ", and R" * turned] = Extrinsics(turn, offset)
-    if turned:
+    if is_shifted and is_turned:
+        poses["P with its offset, and R"] = Extrinsics(turn, offset)
+    elif is_shifted:
+        poses["P with its offset"] = Extrinsics(turn, offset)
+    if is_turned:
         poses["P and R"] = Extrinsics(turn, np.zeros(3))
     if not poses and np.allclose(intrinsics, raw.intrinsics, atol=1e-3) and not raw.distortion:
         return {}
@@ -217,7 +224,8 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
 def _kitti(fields: _Fields, camera: int | None, kind: str, lidar: Extrinsics | None) -> Calibration:
     """The calibration P · R_rect · [R t]; the last column of P gives the camera's own offset."""
     # The number of the camera; the benchmarks have images of the left colour camera.
-    number, path = 2 if camera is None else camera, fields.path
+    number = 2 if camera is None else camera
+    path = fields.path
     matches = (re.fullmatch(r"P(?:_rect_0)?(\d)", name) for name in fields.values)
     present = sorted(int(match[1]) for match in matches if match)
     if number not in present:
@@ -301,19 +309,24 @@ def _kitti_size(intrinsics: Floats) -> tuple[int, int] | None:
 
 
 def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
+    """A name of `choices.LENSES` and the coefficients; "none" leaves them out."""
     model = fields.text("lens", fields.text("distortion_model", "none"))
     if "distortion_model" not in fields.values and fields.text("fisheye_model", "0") not in _FALSE:
         model = "fisheye"  # of OpenCV
     lens = _LENSES.get(model)
     if lens is None:
-        known, model = ", ".join(_LENSES), one_line(model)[:30]
-        raise InputError(f"{fields.path}: distortion model {model!r} is none of {known}")
+        raise InputError(
+            f"{fields.path}: distortion model {one_line(model)[:30]!r} is none of"
+            f" {', '.join(_LENSES)}"
+        )
     coefficients = tuple(fields.numbers(*_OF_LENS, optional=True))
     if lens == "radial-tangential" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _COEFFICIENTS[lens]:
-        fact = f"{len(coefficients)} coefficients of {lens} distortion"
-        raise InputError(f"{fields.path}: {fact}, which has {_COEFFICIENTS[lens]}")
+        raise InputError(
+            f"{fields.path}: {len(coefficients)} coefficients of {lens} distortion, which has"
+            f" {_COEFFICIENTS[lens]}"
+        )
     return lens, coefficients
 
 

@@ -39,7 +39,10 @@ def read_dense_map(path: Path, data: bytes) -> DepthFile:
     check_pixel_count(path, width, height, pixel_bytes=4)
     body = data[header.end() :]
     if len(body) != 4 * width * height:
-        fact = f"holds {len(body):,} bytes where {width}×{height} needs {4 * width * height:,}"
-        raise damaged(path, "COLMAP map", fact)
+        raise damaged(
+            path,
+            "COLMAP map",
+            f"holds {len(body):,} bytes where {width}×{height} needs {4 * width * height:,}",
+        )
     values = np.frombuffer(body, "<f4").reshape(height, width)
     return DepthFile(values=values, reading=Reading("COLMAP depth map"))

@@ -82,7 +82,7 @@ POINT = np.dtype(
 def model_files(folder: Path) -> list[Path]:
     """Returns the three files of a model; none if this is no folder with a model."""
     for suffix in (".bin", ".txt"):  # binary first, as COLMAP itself
-        files = [folder / f"{part}{suffix}" for part in MODEL_PARTS]
+        files = [folder / f"{name}{suffix}" for name in MODEL_PARTS]
         if all(file.is_file() for file in files):
             return files
     return []
@@ -143,21 +143,28 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
     Raises:
         InputError: The model lacks it, or has several of its name.
     """
-    whole = image.absolute().as_posix()
-    if ending := [name for name in model.images if whole.endswith(f"/{name}")]:
-        return max(ending, key=len)
+    # A name of the model is a path below its image folder, so it ends the photo's path.
+    path = image.absolute().as_posix()
+    at_the_end = [name for name in model.images if path.endswith(f"/{name}")]
+    if at_the_end:
+        return max(at_the_end, key=len)
+    # A photo elsewhere is told by its file name alone.
     alike = [name for name in model.images if name.rpartition("/")[2] == image.name]
     if len(alike) == 1:
         return alike[0]
-    fact = f"{image} is {len(alike)} of the {len(model.images):,} images of {model.folder}, not one"
-    hint = "COLMAP did not register it, or give it in the image folder of the model"
-    raise InputError(f"{fact}; {hint}")
+    raise InputError(
+        f"{image} is {len(alike)} of the {len(model.images):,} images of {model.folder}, not one;"
+        " COLMAP did not register it, or give it in the image folder of the model"
+    )
 
 
 def _parameter_count(name: str) -> int:
+    """How many numbers a camera of this model has. ValueError for an unknown model."""
     if name not in MODELS:
-        hint = "`colmap image_undistorter` writes pinhole cameras"
-        raise ValueError(f"camera model {name[:40]!r} is unknown; {hint}")
+        raise ValueError(
+            f"camera model {name[:40]!r} is unknown; `colmap image_undistorter` writes pinhole"
+            " cameras"
+        )
     _, focals, _, coefficients = MODELS[name]
     return focals + 2 + coefficients
 
@@ -175,10 +182,15 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
     distortion = tuple(parameters[focals + 2 :])
     if lens == _RADIAL and distortion:
         distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    # whole numbers are at pixel centres, where COLMAP has .5
+    # Whole numbers are at pixel centres, where COLMAP has .5.
     intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-    size, source = (height, width), f"{name} camera"
-    return Camera(intrinsics=intrinsics, lens=lens, distortion=distortion, size=size, source=source)
+    return Camera(
+        intrinsics=intrinsics,
+        lens=lens,
+        distortion=distortion,
+        size=(height, width),
+        source=f"{name} camera",
+    )
 
 
 def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
@@ -191,7 +203,8 @@ def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
 
 def _records(stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1) -> NDArray[_Kind]:
     """The next `count` records of a file, which must hold them."""
-    begin, size = stream.tell(), count * layout.itemsize
+    begin = stream.tell()
+    size = count * layout.itemsize
     data = stream.read(min(size, sys.maxsize))
     if len(data) < size:
         raise ValueError(f"it is cut short at byte {begin:,}")
@@ -225,7 +238,9 @@ def _binary_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]
 
 
 def _binary_points(path: Path) -> NDArray[np.void]:
-    stream, points = io.BytesIO(read_bytes(path)), [np.empty(0, POINT)]
+    """The points of points3D.bin, each of which is followed by its track."""
+    stream = io.BytesIO(read_bytes(path))
+    points = [np.empty(0, POINT)]
     for _ in range(_count(stream)):
         points.append(_records(stream, POINT))
         _records(stream, _TRACK_ENTRY, int(points[-1]["track"].item()))

@@ -116,28 +116,32 @@ def depth_from_stored(
     if values.ndim != 2:
         raise InputError(f"{path} has the shape {stored.values.shape}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
-    source, below = stored.reading.source, int(np.count_nonzero(np.less(values, 0)))
+    source = stored.reading.source
+    below = int(np.count_nonzero(np.less(values, 0)))
     lost = f", {below:,} pixels below 0 taken as unknown" if below else ""
+    # Floats are metres.
     if values.dtype.kind == "f":
         return DepthFile(values=known_metres(values), reading=Reading(source + lost))
+    # Integers are codes, of which so many are a metre: as stated, by the file, or as is usual.
     _check_codes(path, values, is_stated=scale is not None)
-    own = stored.reading.scale
+    of_file = stored.reading.scale
     assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
     if values.shape[1] > _WIDE * values.shape[0]:  # of no phone or depth camera
         assumed = KITTI_SCALE
-    divisor = scale or own or assumed
+    divisor = scale or of_file or assumed
     source += f" ÷ {divisor:.12g}"
-    if scale is None and own is not None:
+    if scale is None and of_file is not None:
         source += " (from the file)"
-    elif own not in (None, divisor):
-        source += f" (not {own:.12g}, as the file says)"
+    elif of_file not in (None, divisor):
+        source += f" (not {of_file:.12g}, as the file says)"
+    # The largest code is no depth.
     saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
     if saturated.any():
         count = int(saturated.sum())
         source += f", {count:,} pixels of value {formats.SATURATED_CODE} taken as unknown"
         values = np.where(saturated, 0, values)
     metres = values.astype(np.float64) / divisor
-    reading = Reading(source + lost, divisor, assumed=scale is None and own is None)
+    reading = Reading(source + lost, divisor, assumed=scale is None and of_file is None)
     return DepthFile(values=known_metres(metres), reading=reading)
 
 
@@ -228,16 +232,21 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
 
 
 def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:
+    """The codes of 16 bits of depth (H, W). OutputError if they cannot hold it."""
     formats.check_scale(scale)
     codes = np.rint(metres.astype(np.float64) * scale)
     if codes.max() > formats.LARGEST_CODE:
-        fact = f"the largest depth, {metres.max():.6g} m, does not fit"
-    elif (lost := (metres > 0) & (codes == 0)).any():
-        fact = f"{int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be unknown"
-    else:
-        return codes.astype(np.uint16)
-    of_16_bits = f"16 bits with {scale:g} codes per metre"
-    raise OutputError(f"{path}: {fact} in {of_16_bits}; write .exr, .npy or .tiff")
+        raise OutputError(
+            f"{path}: the largest depth, {metres.max():.6g} m, does not fit in 16 bits with"
+            f" {scale:g} codes per metre; write .exr, .npy or .tiff"
+        )
+    lost = (metres > 0) & (codes == 0)
+    if lost.any():
+        raise OutputError(
+            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be"
+            f" unknown in 16 bits with {scale:g} codes per metre; write .exr, .npy or .tiff"
+        )
+    return codes.astype(np.uint16)
 
 
 def read_sparse(
@@ -258,21 +267,25 @@ def read_sparse(
         InputError: The file is a list, and no size was given.
     """
     formats.check_scale(scale)
+    # A list: by its header, or an array with few columns and many rows.
     stored, header = _load_list(path)
-    shape, of_array = stored.values.shape, f"point list, {stored.reading.source}"
     if header is not None:
         return _from_rows(path, stored.values, "point list", size)
+    shape = stored.values.shape
     columns = 0 if stored.is_image or len(shape) != 2 else shape[1]
     if columns == 3 or (3 < columns <= _MOST_COLUMNS and shape[0] > _MANY_ROWS):
-        return _from_rows(path, stored.values, of_array, size)
+        return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
+    # Anything else is an image.
     image = depth_from_stored(path, stored, scale, size)
     known = image.values > 0
     yx = np.argwhere(known)
     if not len(yx):
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     height, width = image.values.shape
-    xy, depth = yx[:, ::-1].astype(np.float32), image.values[known]
-    return SparsePoints(xy=xy, depth=depth, size=(height, width)), image.reading
+    points = SparsePoints(
+        xy=yx[:, ::-1].astype(np.float32), depth=image.values[known], size=(height, width)
+    )
+    return points, image.reading
 
 
 def _load_list(path: Path) -> tuple[DepthFile, list[str] | None]:
@@ -287,18 +300,22 @@ def _load_list(path: Path) -> tuple[DepthFile, list[str] | None]:
 def _from_rows(
     path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
 ) -> tuple[Points, Reading]:
+    """The points of rows x, y, depth; those without depth or pixel are left out and counted."""
     if rows.dtype.kind != "f":
         raise InputError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
     if rows.shape[1] != 3:
-        fact = f"{rows.shape[1]} numbers a row are not x, y and depth"
-        raise InputError(f"{path}: {fact}; if they are x y z of a scan, give --calib")
+        raise InputError(
+            f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
+            " scan, give --calib"
+        )
     depth = known_metres(rows[:, 2])
     known = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
     if not known.any():
         raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
     if size is None:
         raise InputError(f"{path} is a list of points, which needs an image for the frame's size")
-    if lost := len(rows) - int(np.count_nonzero(known)):
+    lost = len(rows) - int(np.count_nonzero(known))
+    if lost:
         source += f", without {lost:,} rows that have no depth above 0 or no pixel"
     xy = rows[known, :2].astype(np.float32)
     return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
@@ -365,7 +382,8 @@ def describe_range(
         low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
         hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
     count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
-    low, high = metres(float(known.min())), metres(float(known.max()))
+    low = metres(float(known.min()))
+    high = metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"
     return f"{count}, {extent} {unit} ({source}{hint})"
 

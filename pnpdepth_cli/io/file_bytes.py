@@ -45,7 +45,8 @@ def read_bytes(path: Path) -> bytes:
         InputError: There is no such file; it is a folder, a device or a pipe; or it is empty, or
             larger than the budget.
     """
-    size, limit = size_of_regular_file(path), budget.max_file_bytes()
+    size = size_of_regular_file(path)
+    limit = budget.max_file_bytes()
     check_claim(f"{path} has {size:,} bytes", size, limit, way_out=_SMALLER)
     try:
         data = path.read_bytes()
@@ -169,9 +170,13 @@ class Fingerprint:
 def fingerprint(path: Path) -> Fingerprint:
     """Returns the fingerprint of a file. Raises InputError if it cannot be read."""
     status = _status(path)
-    size, times = status.st_size, (status.st_mtime_ns, status.st_ctime_ns)
-    sha256 = _digest(path, size, *times)
-    return Fingerprint(size=size, sha256=sha256, mtime_ns=times[0], ctime_ns=times[1])
+    sha256 = _digest(path, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    return Fingerprint(
+        size=status.st_size,
+        sha256=sha256,
+        mtime_ns=status.st_mtime_ns,
+        ctime_ns=status.st_ctime_ns,
+    )
 
 
 def is_unchanged(path: Path, known: Fingerprint) -> bool:
@@ -307,23 +312,32 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     Raises:
         InputError: A line is not made of as many numbers as the first.
     """
+    # A header is the first line, if it is one.
     numbered = list(numbered_lines(data))
-    header = [w.strip('"').lower() for w in _WORD.findall(numbered[0][1])] if numbered else []
-    header = header if header[:3] in _HEADERS else []
-    rows = list[list[float]]()
-    for number, text in numbered[bool(header) :]:
+    header: list[str] = []
+    if numbered:
+        _, first_line = numbered[0]
+        words = [word.strip('"').lower() for word in _WORD.findall(first_line)]
+        if words[:3] in _HEADERS:
+            header = words
+            numbered = numbered[1:]
+    # All other lines are numbers, as many as in the first of them.
+    rows: list[list[float]] = []
+    for number, text in numbered:
         words = _WORD.findall(text)
         count = len(rows[0]) if rows else max(3, len(words))
         if ";" in text and "," in text:
-            fact = f"{text[:80]!r} has decimal commas; write points"
-            raise InputError(f"{path}, line {number}: {fact}")
+            raise InputError(
+                f"{path}, line {number}: {text[:80]!r} has decimal commas; write points"
+            )
         try:
-            numbers = list(map(float, words))
+            numbers = [float(word) for word in words]
         except ValueError:
             numbers = []
         if len(numbers) != count:
-            fact = f"{' '.join(words)[:80]!r} is not {count} numbers"
-            fact += "" if rows or header else ", nor the header x y depth or x y z"
-            raise InputError(f"{path}, line {number}: {fact}")
+            or_header = "" if rows or header else ", nor the header x y depth or x y z"
+            raise InputError(
+                f"{path}, line {number}: {' '.join(words)[:80]!r} is not {count} numbers{or_header}"
+            )
         rows.append(numbers)
     return np.array(rows or np.empty((0, 3)), np.float64), header

@@ -92,9 +92,12 @@ def pose_of_quaternion(path: Path, numbers: list[float]) -> Extrinsics:
 def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> Extrinsics:
     """Returns the pose. Raises InputError if it holds no rotation, or is of no sensor."""
     if not is_rotation(rotation):
-        off, turns = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation) > 0
-        why = f"R·Rᵀ is off by {off:.2g}" if turns else "determinant −1: a left-handed scan?"
-        raise InputError(f"{path}: {name} is no rotation ({why}); correct it")
+        if not np.linalg.det(rotation) > 0:
+            raise InputError(
+                f"{path}: {name} is no rotation (determinant −1: a left-handed scan?); correct it"
+            )
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        raise InputError(f"{path}: {name} is no rotation (R·Rᵀ is off by {off:.2g}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
         raise InputError(f"{path}: a translation of {translation} m is of no sensor")
     return Extrinsics(rotation, translation)
@@ -183,14 +186,20 @@ def poses_of_frames(
     Raises:
         InputError: A row has other numbers or no rotation, or the rows do not fit the frames.
     """
+    # As the file has them.
     if path.suffix.lower() == ".json":
-        poses, how = _poses_of_nerfstudio(path, names), "joined by name"
+        poses = _poses_of_nerfstudio(path, names)
+        how = "joined by name"
         kind = kind or "opengl"
     else:
         poses, how = _poses_of_rows(path, names)
-    direction, axes = "from camera to world", "x right, y down, z forward"
+    # From a camera with x right, y down, z forward to the world.
+    direction = "from camera to world"
+    axes = "x right, y down, z forward"
     if kind == "opengl":
-        poses, axes = poses * (1, -1, -1, 1), "y up and z back (OpenGL)"
+        y_and_z_turned = np.array([1, -1, -1, 1])
+        poses = poses * y_and_z_turned
+        axes = "y up and z back (OpenGL)"
     elif kind == "world-to-camera":
         turns = poses[:, :, :3].transpose(0, 2, 1)
         poses = np.concatenate([turns, -turns @ poses[:, :, 3:]], axis=2)
@@ -202,19 +211,25 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     """The matrices (N, 3, 4) of the frames of these names in a transforms.json."""
     content = file_bytes.read_json(path)
     try:
-        listed: dict[str, list[tuple[str, object]]] = {}
-        for each in content["frames"]:
-            whole = PurePosixPath(each["file_path"]).with_suffix("")
-            entry = f"/{whole.as_posix()}", each["transform_matrix"]
-            listed.setdefault(whole.name, []).append(entry)
+        # Paths without suffix, and matrices, by the names of the files.
+        by_name: dict[str, list[tuple[str, object]]] = {}
+        for frame in content["frames"]:
+            file = PurePosixPath(frame["file_path"]).with_suffix("")
+            entry = (f"/{file.as_posix()}", frame["transform_matrix"])
+            by_name.setdefault(file.name, []).append(entry)
+        # The one of each frame.
         poses = np.empty((len(names), 3, 4))
         for index, name in enumerate(names):
-            found = listed.get(name.rpartition("/")[2], [])
-            if len(found) > 1:  # of several cameras, by their folders
-                found = [each for each in found if each[0].endswith(f"/{name}")]
-            if len(found) != 1:
-                raise InputError(f"{path} has {len(found)} frames of the name {name!r}, not one")
-            poses[index] = np.array(found[0][1], np.float64)[:3, :4]
+            entries = by_name.get(name.rpartition("/")[2], [])
+            if len(entries) > 1:  # of several cameras, by their folders
+                entries = [entry for entry in entries if entry[0].endswith(f"/{name}")]
+            if len(entries) != 1:
+                raise InputError(
+                    f"{path} has {len(entries)} frames of the name {name!r}, not one; give the"
+                    " transforms.json of these images"
+                )
+            _, matrix = entries[0]
+            poses[index] = np.array(matrix, np.float64)[:3, :4]
             if not np.isfinite(poses[index]).all() or not is_rotation(poses[index, :, :3]):
                 raise ValueError(f"the pose of {name} is no rotation")
     except (LookupError, TypeError, ValueError) as error:
@@ -228,22 +243,26 @@ def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
 
     rows, poses = _rows(path)
     dotted = [_BAG_TIME.sub(r"\1.\2", name) for name in names]
-    times, numbers = _last_numbers(dotted), _last_numbers(names)
+    times = _last_numbers(dotted)
+    numbers = _last_numbers(names)
     # Names that are times take the row of the nearest time.
     are_rows = rows.shape[1] == _TUM_COLUMNS and np.isfinite(rows[:, 0]).all()
     if len(times) == len(names) and are_rows:
         gaps, nearest = KDTree(rows[:, :1]).query(times[:, None])
-        # frames 1_000001 and 1_000002 may be of sequence 1 as well
-        are_times = dotted == list(names) or len({*nearest}) == len({*times})
-        if are_times and (largest := float(gaps.max())) <= LONGEST_GAP_S:
-            return poses[nearest], f"joined by time, at most {1000 * largest:.0f} ms apart"
+        # Frames 1_000001 and 1_000002 may be of sequence 1 as well.
+        are_times = dotted == list(names) or len(set(nearest)) == len(set(times))
+        largest_s = float(gaps.max())
+        if are_times and largest_s <= LONGEST_GAP_S:
+            return poses[nearest], f"joined by time, at most {1000 * largest_s:.0f} ms apart"
     # Else there is a row for each, or they are numbers of rows.
     if len(rows) == len(names):
         return poses, "row by row, in the order of the frames"
     if len(numbers) == len(names) and numbers.max() < len(rows):
         return poses[numbers.astype(int)], "the number in a name is that of its row, from 0"
-    fact = f"{path} has {len(rows)} poses for {len(names)} frames"
-    raise InputError(f"{fact}; give one for each, in their order, or times that are their names")
+    raise InputError(
+        f"{path} has {len(rows)} poses for {len(names)} frames; give one for each, in their order,"
+        " or times that are their names"
+    )
 
 
 def _last_numbers(names: Sequence[str]) -> Floats:

@@ -50,18 +50,23 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     """
     data = read_bytes(path)
     kind = kind_of(data)
+    # What the file is. HEIF and videos have one kind of container.
     if kind == "EXR":
         return _from_linear_light(path, data)
     if data[4:8] == b"ftyp":
         if data[8:11] in VIDEO_BRANDS:
             raise InputError(f"{path} is a video; `batch` takes videos, with depth of their frames")
         if data[8:12] in (b"avif", b"avis") or not _reads_heic():
-            hint = "pip install 'pnpdepth[heic]' reads HEIC, or save it as JPEG"
-            raise InputError(f"{path} is a HEIC or AVIF photo; {hint}")
+            raise InputError(
+                f"{path} is a HEIC or AVIF photo; pip install 'pnpdepth[heic]' reads HEIC, or save"
+                " it as JPEG"
+            )
         kind = "HEIF"
     if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
         raise InputError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
-    note, white = None, 255.0
+    # Its numbers, in 0…1.
+    note = None
+    white = 255.0
     with images.open_image(path, data, kind) as image:
         if kind == "TIFF" and image.mode in ("I", "F"):
             raise InputError(f"{path} is no image; save it with 8 or 16 bits, none below 0")
@@ -81,6 +86,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
             image.seek(0)
             pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
             values = np.divide(pixels, np.float32(255), dtype=np.float32)
+    # How it was held.
     if upright:
         values = _turn_upright(values, orientation)
     elif orientation in range(2, 9):

@@ -25,9 +25,11 @@ from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of, parse_npy
 
 _FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)  # the last are of painted points
-_USUAL, _LEAST_ROWS = 8, 100  # fields a point; more need so many points to be recognised
+_USUAL = 8  # fields a point, at most
+_LEAST_ROWS = 100  # points that a file must have to be recognised as one of more fields
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
-_EXACT_M, _EARTH_M = 1e-3, 1e8  # error of coordinates that counts; the largest of a place on earth
+_EXACT_M = 1e-3  # error of coordinates that counts
+_EARTH_M = 1e8  # larger than the coordinates of any place on earth
 _COLMAP_MAP = re.compile(rb"\d{1,6}&\d{1,6}&\d&")  # width, height, channels
 _SMALLEST = 1e-3  # numbers near 0 are alike
 _AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
@@ -80,11 +82,14 @@ def check_no_colmap_map(path: Path, data: bytes) -> None:
 
 
 def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
+    """The first columns of float32 numbers, of which a point has as many as the content tells."""
     check_no_colmap_map(path, data)
     fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
-        fact = f"{len(data):,} bytes are no multiple of {fields} float32 numbers a point"
-        raise InputError(f"{path}: {fact}; it is cut short, or points have other fields")
+        raise InputError(
+            f"{path}: {len(data):,} bytes are no multiple of {fields} float32 numbers a point; it"
+            " is cut short, or points have other fields: save its x, y, z as NPY (N, 3)"
+        )
     points = np.frombuffer(data, "<f4").reshape(-1, fields)
     return _first_columns(points), _BIN_SOURCES.get(fields, f"scan of {fields} fields a point")
 
@@ -93,18 +98,23 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
     """How many numbers a point has: those of one field are alike, those of two are not."""
     numbers = np.frombuffer(data, "<f4", len(data) // 4).astype(np.float64)
     numbers = np.where(np.isfinite(numbers), numbers, 0)
-    # by sign, order of magnitude, and whether it is a whole number, such as the index of a laser
+    # Alike by sign, order of magnitude, and whether it is a whole number, such as a laser's index.
     size = np.log10(np.abs(numbers) + _SMALLEST)
     features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
-    # beams without return say nothing: more zeros in a row than a point has numbers
-    zeros = np.convolve(numbers == 0, np.ones(max(_FIELD_COUNTS) + 1), "same")[: len(numbers)]
-    masked = np.ma.array(features, mask=np.broadcast_to(zeros > max(_FIELD_COUNTS), features.shape))
+    # Beams without return say nothing: more zeros in a row than a point has numbers.
+    most_fields = max(_FIELD_COUNTS)
+    zeros = np.convolve(numbers == 0, np.ones(most_fields + 1), "same")[: len(numbers)]
+    masked = np.ma.array(features, mask=np.broadcast_to(zeros > most_fields, features.shape))
+    # What the position in a point explains of these, by how many numbers a point would have.
     counts = [n for n in _FIELD_COUNTS if n <= _USUAL or len(numbers) >= _LEAST_ROWS * n]
     explained = {count: _explained_variance(masked, count) for count in counts}
-    most = max(explained.values())  # which multiples of the true count reach, too
+    most = max(explained.values())
     if most < _LEAST_EXPLAINED:
-        fact = f"which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point has"
-        raise InputError(f"{path} does not tell {fact}; save its x, y, z as NPY (N, 3)")
+        raise InputError(
+            f"{path} does not tell which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point"
+            " has; save its x, y, z as NPY (N, 3)"
+        )
+    # Multiples of the true count explain as much, so the first one is it.
     return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
@@ -128,8 +138,10 @@ def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
         raise InputError(f"{path} is not an NPY file; save it with numpy.save")
     array = parse_npy(path, data)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
-        fact = f"holds {array.dtype} of shape {array.shape}"
-        raise InputError(f"{path} {fact}; a scan is (N, 3 or more) floats, x y z first")
+        raise InputError(
+            f"{path} holds {array.dtype} of shape {array.shape}; a scan is (N, 3 or more) floats,"
+            " x y z first"
+        )
     return _first_columns(array), "NPY scan"
 
 
@@ -146,7 +158,8 @@ def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
         names, kinds, sizes = (entries[entry] for entry in ("FIELDS", "TYPE", "SIZE"))
         fields = zip(names, kinds, sizes, entries.get("COUNT", ["1"] * len(names)), strict=True)
         columns = [(name, _PCD_TYPES[kind + size], int(n)) for name, kind, size, n in fields]
-        number, stored = int(entries["POINTS"][0]), entries["DATA"][0].lower()
+        number = int(entries["POINTS"][0])
+        stored = entries["DATA"][0].lower()
         order = {"ascii": None, "binary": "<", "binary_compressed": "<"}[stored]
         # The rows.
         if stored == "binary_compressed":
@@ -173,14 +186,18 @@ def _decompress_rows(columns: list[Column], number: int, body: bytes) -> bytes:
     data = _lzf(body[8 : 8 + packed])
     if len(data) != claimed:
         raise ValueError("it cannot be decompressed")
-    parts = np.split(np.frombuffer(data, np.uint8), number * np.cumsum(sizes[:-1]))
-    fields = [part.reshape(number, size) for part, size in zip(parts, sizes, strict=True)]
-    return np.concatenate(fields, axis=1).tobytes()
+    # Field after field, put beside each other.
+    fields = np.split(np.frombuffer(data, np.uint8), number * np.cumsum(sizes[:-1]))
+    columns_of_bytes = [
+        field.reshape(number, size) for field, size in zip(fields, sizes, strict=True)
+    ]
+    return np.concatenate(columns_of_bytes, axis=1).tobytes()
 
 
 def _lzf(packed: bytes) -> bytes:
     """Decompresses LZF: literals, and copies of what is already there."""
-    out, rest = bytearray(), iter(packed)
+    out = bytearray()
+    rest = iter(packed)
     for control in rest:
         # A byte below 32 is followed by that many literals and one.
         if control < 32:
@@ -204,10 +221,13 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     try:
         header, body = _header(data, b"end_header")
         marks = [i for i, words in enumerate(header) if words[0] in ("element", "end_header")]
-        (_, element, number), stored = header[marks[0]], header[1][1]
+        _, element, number = header[marks[0]]
+        stored = header[1][1]
         if (header[0], header[1][0], element) != (["ply"], "format", "vertex"):
             raise ValueError("its first element is not vertex; save points first")
-        properties = [each for each in header[marks[0] : marks[1]] if each[0] == "property"]
+        # The properties of the first element, up to the next mark.
+        of_vertex = header[marks[0] : marks[1]]
+        properties = [words for words in of_vertex if words[0] == "property"]
         columns = [(name, _PLY_KINDS[kind], 1) for _, kind, name in properties]
         points = _xyz(columns, int(number), body, _PLY_ORDERS[stored])
     except (LookupError, ValueError) as error:
@@ -301,18 +321,27 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
     Raises:
         OutputError: The file cannot be written.
     """
-    count, properties = 0, _PROPERTIES[0][1]
+    count = 0
+    _, properties = _PROPERTIES[0]  # of a cloud without parts
     with atomic_path(path) as temporary, TemporaryFile(dir=temporary.parent) as body:
-        for part in parts:
-            zipped = zip(part, _PROPERTIES, strict=True)
-            columns = [(values, *kind) for values, kind in zipped if values is not None]
-            rows = [np.ascontiguousarray(v, kind).view(np.uint8) for v, kind, _ in columns]
-            body.write(np.hstack(rows).tobytes())
-            count += len(part[0])
-            properties = [each for _, _, names in columns for each in names]
+        for cloud in parts:
+            # The values that this cloud has, point after point.
+            properties = []
+            columns = []
+            for values, (kind, names) in zip(cloud, _PROPERTIES, strict=True):
+                if values is not None:
+                    columns.append(np.ascontiguousarray(values, kind).view(np.uint8))
+                    properties += names
+            body.write(np.hstack(columns).tobytes())
+            count += len(cloud[0])
         # The header has the number of points, which is known last.
-        header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-        header += [*(f"property {each}" for each in properties), "end_header\n"]
+        header = [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {count}",
+            *(f"property {name}" for name in properties),
+            "end_header\n",
+        ]
         body.seek(0)
         with temporary.open("wb") as file:
             file.write("\n".join(header).encode())

@@ -31,10 +31,15 @@ LOGARITHMIC_FROM = 8.0
 would have the colour of its far end."""
 
 # Pixels of a figure.
-FIGURE_WIDTH, MARGIN, GAP = 1600, 24, 20
-_TITLE_HEIGHT, _MAX_PANEL_HEIGHT = 34, 1100
-_BAR_WIDTH, _LEGEND_WIDTH = 22, 112
-_FONT_SIZE, _SMALL_FONT_SIZE = 19, 17
+FIGURE_WIDTH = 1600
+MARGIN = 24
+GAP = 20
+_TITLE_HEIGHT = 34
+_MAX_PANEL_HEIGHT = 1100
+_BAR_WIDTH = 22
+_LEGEND_WIDTH = 112
+_FONT_SIZE = 19
+_SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
 _LABELS = 9  # of the bar
@@ -78,7 +83,8 @@ def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
         return DepthScale(low_m=1.0, high_m=2.0)
     low, high = np.percentile(known.astype(np.float64), (2, 98)).tolist()
     if high - low < 0.01 * low:  # a single depth still needs a bar with two ends
-        low, high = 0.95 * low, 1.05 * high
+        low = 0.95 * low
+        high = 1.05 * high
     return DepthScale(low_m=low, high_m=high)
 
 
@@ -166,7 +172,8 @@ def _save_figure(
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = panels[0][2].shape[:2]
-    rows, row_height = -(-len(panels) // columns), _TITLE_HEIGHT + height
+    rows = math.ceil(len(panels) / columns)
+    row_height = _TITLE_HEIGHT + height
     width_px = 2 * MARGIN + columns * width + (columns - 1) * GAP + _LEGEND_WIDTH
     height_px = 2 * MARGIN + rows * row_height + (rows - 1) * (GAP // 2)
     figure = Image.new("RGB", (width_px, height_px), "white")
@@ -177,14 +184,16 @@ def _save_figure(
     boxes = {}
     for index, (title, remark, pixels) in enumerate(panels):
         row, column = divmod(index, columns)
-        x, y = MARGIN + column * (width + GAP), MARGIN + row * (row_height + GAP // 2)
+        x = MARGIN + column * (width + GAP)
+        y = MARGIN + row * (row_height + GAP // 2)
         draw.text((x, y + 4), title, font=font, fill=_INK)
         indent = draw.textlength(title, font=font) + 14
         draw.text((x + indent, y + 5), remark, font=small, fill=_FAINT_INK)
         figure.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y + _TITLE_HEIGHT))
         boxes[title] = (x, y + _TITLE_HEIGHT, width, height)
     # The bar, far at the top, as on an axis.
-    left, top = width_px - MARGIN - _LEGEND_WIDTH + GAP, MARGIN + _TITLE_HEIGHT
+    left = width_px - MARGIN - _LEGEND_WIDTH + GAP
+    top = MARGIN + _TITLE_HEIGHT
     length = height_px - MARGIN - top
     draw.text((left, MARGIN + 5), noun, font=font, fill=_INK)
     strip = Image.fromarray(np.ascontiguousarray(bar[::-1, None])).resize((_BAR_WIDTH, length))
@@ -228,11 +237,14 @@ def preview(
     height, width = before.shape
     columns = 1 if width > _WIDE * height else 2
     factor = _magnification(before.shape, columns=columns)
-    scale, grey = depth_scale(sparse_depth, before, after), _grey_of(rgb, before.shape)
+    scale = depth_scale(sparse_depth, before, after)
+    grey = _grey_of(rgb, before.shape)
+    # The change, where both depths are known.
     both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
     change = (after[both] - before[both]).astype(np.float64)
     pixels, strongest = _paint(change, both, grey, "change")
     remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g} {unit}"
+    # The panels, the image first.
     panels = [
         _points_panel(grey, sparse_xy, sparse_depth, scale, factor),
         ("Depth before", made_by[0], _resize(scale.paint(before), factor)),
@@ -250,7 +262,8 @@ def overlay(rgb: Array, xy: Array, depth: Array, path: Path) -> None:
 
     The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
     """
-    scale, grey = depth_scale(depth), _grey_of(rgb, rgb.shape)
+    scale = depth_scale(depth)
+    grey = _grey_of(rgb, rgb.shape)
     panel = _points_panel(grey, xy, depth, scale, _magnification(rgb.shape))
     _save_depth_figure(path, [panel], scale)
 
@@ -267,10 +280,16 @@ def _paint(
     values: NDArray[np.float64], where: NDArray[np.bool_], grey: Array, colors: str
 ) -> tuple[Pixels, float]:
     """A map of signed values in colours on the dark grey image, and the value of full colour."""
-    pixels, changed = _dim(np.asarray(0.6 * grey, np.float32)), np.abs(values[values != 0])
-    strongest = float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
+    strongest = _strongest(values)
+    pixels = _dim(np.asarray(0.6 * grey, np.float32))
     pixels[where] = _paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
     return pixels, strongest
+
+
+def _strongest(values: NDArray[np.float64]) -> float:
+    """The value of full colour: a high percentile of those that are not 0; 1 without any."""
+    changed = np.abs(values[values != 0])
+    return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
 
 
 def improvement(
@@ -299,12 +318,13 @@ def improvement(
     pixels, strongest = _paint(gains, known, _grey_of(rgb, truth.shape), "gain")
     pixels = _resize(pixels, _magnification(truth.shape))
     # The figure, and its texts for a report.
-    improved, worse = (100 * float(part.mean()) for part in (gains > 0, gains < 0))
+    improved = 100 * float((gains > 0).mean())
+    worse = 100 * float((gains < 0).mean())
     footer = f"{improved:.1f} % of {gains.size:,} pixels improved, {worse:.1f} % worse"
     unknown = None
     if not known.all():
         unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
-    remark = footer + (f"; dark: {unknown}" if unknown else "")
+    remark = f"{footer}; dark: {unknown}" if unknown else footer
     figure = _save_gains(path, [(_GAINS, remark, pixels)], strongest, unit)
     return replace(figure, unknown=unknown, footer=footer)
 
@@ -341,26 +361,31 @@ def improvement_at_points(
         OutputError: The file cannot be written.
     """
     columns = 1 if size[1] > _WIDE * size[0] else 2
-    grey, factor = _grey_of(rgb, size), _magnification(size, columns=columns)
+    grey = _grey_of(rgb, size)
+    factor = _magnification(size, columns=columns)
     shown = {_GAINS: points.after, "Linear interpolation": points.linear}
     gains = {name: gain(points.before, depth, points.truth) for name, depth in shown.items()}
     # One scale for both panels.
-    every = np.concatenate([values[np.isfinite(values)] for values in gains.values()])
-    changed = np.abs(every[every != 0])
-    strongest = float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
-    panels, texts = [], []
-    for name, values in gains.items():
-        known = np.isfinite(values)
-        own = values[known]
-        order = np.argsort(np.abs(own), kind="stable")
-        colours = _paint_signed(own[order] / strongest, np.full(len(own), 0.8), "gain")
-        improved, worse = (
-            100 * float(part.mean()) if len(own) else 0.0 for part in (own > 0, own < 0)
-        )
-        texts.append(f"{improved:.1f} % better, {worse:.1f} % worse")
-        panels.append((name, texts[-1], _dots(grey, points.xy[known][order], colours, factor)))
-    footer = f"at {np.isfinite(gains[_GAINS]).sum():,} {points.what}: {texts[0]}"
-    panels[0] = (_GAINS, footer, panels[0][2])
+    strongest = _strongest(
+        np.concatenate([values[np.isfinite(values)] for values in gains.values()])
+    )
+    panels = []
+    remarks = {}
+    for name, gains_at_points in gains.items():
+        known = np.isfinite(gains_at_points)
+        values = gains_at_points[known]
+        # The points in their colours, the largest change on top.
+        order = np.argsort(np.abs(values), kind="stable")
+        colours = _paint_signed(values[order] / strongest, np.full(len(values), 0.8), "gain")
+        dots = _dots(grey, points.xy[known][order], colours, factor)
+        better = 100 * float((values > 0).mean()) if len(values) else 0.0
+        worse = 100 * float((values < 0).mean()) if len(values) else 0.0
+        remarks[name] = f"{better:.1f} % better, {worse:.1f} % worse"
+        panels.append((name, remarks[name], dots))
+    # That of the result says how many points there are.
+    footer = f"at {np.isfinite(gains[_GAINS]).sum():,} {points.what}: {remarks[_GAINS]}"
+    title, _, dots = panels[0]
+    panels[0] = (title, footer, dots)
     return replace(_save_gains(path, panels, strongest, unit, columns), footer=footer)
 
 

@@ -69,7 +69,9 @@ class Bag:
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
-        wanted = [each for each in self.reader.connections if each.topic in topics]
+        wanted = [
+            connection for connection in self.reader.connections if connection.topic in topics
+        ]
         if not wanted:
             return
         with _as_our_errors(self.path):
@@ -128,23 +130,28 @@ def choose_topic(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], wha
     Raises:
         UsageError: There are several or none.
     """
-    # an image and its compressed copies are one camera
+    # An image and its compressed copies are one camera.
     copies = [n for n in topics if n.rpartition("/")[0] in topics and n.endswith(COMPRESSED)]
-    names = [n for n in wanted if n in topics] or [n for n in topics if n not in copies]
+    named = [name for name in wanted if name in topics]
+    names = named or [name for name in topics if name not in copies]
     if len(names) != 1:
         listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
-        fact = f"{bag.path} has {len(names)} topics of {what}, not one"
-        raise UsageError(f"{fact}; choose with --topic of `pnpdepth frames`: {listing or 'none'}")
+        raise UsageError(
+            f"{bag.path} has {len(names)} topics of {what}, not one; choose with --topic of"
+            f" `pnpdepth frames`: {listing or 'none'}"
+        )
     return names[0]
 
 
 def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
     """Raises UsageError for a topic that is not there, or not of these message types."""
     topics = bag.topics(kinds)
-    if other := [name for name in wanted if name not in topics]:
-        listing = ", ".join(topics) or "none"
-        fact = f"{bag.path} has no topic {other[0]} of images, points or poses"
-        raise UsageError(f"{fact}; there are {listing}")
+    missing = [name for name in wanted if name not in topics]
+    if missing:
+        raise UsageError(
+            f"{bag.path} has no topic {missing[0]} of images, points or poses; name one of"
+            f" {', '.join(topics) or 'none'}"
+        )
 
 
 @contextmanager
@@ -162,9 +169,10 @@ def _as_our_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (Reader1Error, Reader2Error, SerdeError, *others) as error:
-        why = f"{type(error).__name__}: {one_line(error)}"
-        hint = "repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
-        raise InputError(f"{path} cannot be read as a bag ({why}); if cut short, {hint}") from error
+        raise InputError(
+            f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if cut"
+            " short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
+        ) from error
 
 
 _CHUNK_BYTES = 1 << 28
@@ -184,7 +192,8 @@ def _check_bag(path: Path) -> None:
     """Raises InputError if a bag is compressed as a whole, or its database computes values."""
     files = [path]
     if path.is_dir():
-        files, metadata = sorted(path.glob("*.db3")), path / "metadata.yaml"
+        files = sorted(path.glob("*.db3"))
+        metadata = path / "metadata.yaml"
         if not metadata.is_file():
             raise InputError(f"{path} has no metadata.yaml of a ROS 2 bag; give its own folder")
         match parse_yaml(metadata, read_bytes(metadata).decode("utf-8", "replace")):
@@ -200,6 +209,7 @@ def _check_bag(path: Path) -> None:
 
 
 def _check_database(path: Path) -> None:
+    """Raises InputError if an SQLite database would compute what is read from it."""
     uri = f"{path.absolute().as_uri()}?immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as connection:
         computed = connection.execute(_COMPUTED).fetchone()

@@ -47,7 +47,11 @@ _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PN": ".png"}
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 _SENSOR = re.compile(r"/device_\d+/sensor_\d+")
 """Beginning of the topics of a sensor that librealsense recorded."""
-_COMPRESSED_DEPTH, _DEPTH_HEADER, _MM_PER_M = "compressedDepth", 12, 1000.0
+_COMPRESSED_DEPTH = "compressedDepth"
+"""In the format of a CompressedImage that is a depth image."""
+_DEPTH_HEADER = 12
+"""Bytes in front of its PNG."""
+_MM_PER_M = 1000.0
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -94,8 +98,10 @@ def _grid(message: Message, topic: str, layout: np.dtype[_Kind], row_bytes: int)
     height, width = int(message.height), int(message.width)
     data = np.frombuffer(message.data, np.uint8)
     if width * layout.itemsize > row_bytes or height * row_bytes > data.size:
-        what = f"{width}×{height} values of {layout.itemsize} bytes, {row_bytes} a row,"
-        raise InputError(f"{topic}: {what} have {data.size:,} bytes; the bag is damaged")
+        raise InputError(
+            f"{topic}: {width}×{height} values of {layout.itemsize} bytes, {row_bytes} a row, have"
+            f" {data.size:,} bytes; the bag is damaged"
+        )
     return np.ndarray((height, width), layout, data, 0, (row_bytes, layout.itemsize))
 
 
@@ -150,16 +156,21 @@ def depth_image(message: Message, topic: str, scale: float | None = None) -> NDA
     Raises:
         InputError: It is damaged, or compressed otherwise.
     """
+    # An Image holds the numbers themselves.
     if hasattr(message, "encoding"):
         order = ">" if message.is_bigendian else "<"
         number = np.dtype(order + _DEPTH[str(message.encoding)])
         values = _grid(message, topic, number, int(message.step))
         of_ros = 1.0 if number.kind == "f" else _MM_PER_M
         return known_metres(values / (scale or of_ros))
-    data, kind = bytes(message.data), str(message.format).partition(";")[0].strip()
+    # A CompressedImage holds a PNG of 16UC1, or of codes of 32FC1.
+    data = bytes(message.data)
+    kind = str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or kind_of(data[_DEPTH_HEADER:]) != "PNG":
-        kind = one_line(message.format)[:40]
-        raise InputError(f"{topic}: {kind!r} is no PNG of {' or '.join(_DEPTH)}")
+        raise InputError(
+            f"{topic}: {one_line(message.format)[:40]!r} is no PNG of {' or '.join(_DEPTH)}; name"
+            " another --topic"
+        )
     codes = read_png(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
         return known_metres(codes / (scale or _MM_PER_M))
@@ -179,7 +190,8 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
     if any(name not in fields or int(fields[name].datatype) not in _NUMBERS for name in "xyz"):
         raise InputError(f"{topic}: a cloud without numbers x y z; name another topic")
     # Where x, y and z lie in a point.
-    order, step = ">" if message.is_bigendian else "<", int(message.point_step)
+    order = ">" if message.is_bigendian else "<"
+    step = int(message.point_step)
     formats = [order + _NUMBERS[int(fields[name].datatype)] for name in "xyz"]
     offsets = [int(fields[name].offset) for name in "xyz"]
     try:
@@ -187,7 +199,9 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
             {"names": list("xyz"), "formats": formats, "offsets": offsets, "itemsize": step}
         )
     except ValueError as error:
-        raise InputError(f"{topic}: points of {step} bytes do not hold x y z") from error
+        raise InputError(
+            f"{topic}: points of {step} bytes do not hold x y z; the bag is damaged"
+        ) from error
     # The row's length may be 0 in a cloud of one row.
     row_bytes = int(message.row_step) if message.height > 1 else int(message.width) * step
     points = _grid(message, topic, layout, row_bytes).ravel()
@@ -268,12 +282,13 @@ def frame_of(message: Message) -> str:
 def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
     """Returns the scanner's pose in the camera's coordinates, by /tf_static; None without one."""
     # The transforms, each in both directions.
-    links = list[tuple[str, str, Extrinsics]]()
+    links: list[tuple[str, str, Extrinsics]] = []
     topics = [name for name in bag.topics(TRANSFORMS) if name.endswith("/tf_static")]
     for _, _, message in bag.messages(topics):
-        for each in message.transforms:
-            parent, child = frame_of(each), str(each.child_frame_id).lstrip("/")
-            pose = _pose_in(bag, each.transform.translation, each.transform.rotation)
+        for stamped in message.transforms:
+            parent = frame_of(stamped)
+            child = str(stamped.child_frame_id).lstrip("/")
+            pose = _pose_in(bag, stamped.transform.translation, stamped.transform.rotation)
             links += [(parent, child, pose), (child, parent, pose.inverse())]
     # The shortest chain of them.
     poses = {camera: SAME_PLACE}
@@ -287,8 +302,10 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
     """Returns the named topics of poses, else those of odometry, else of poses."""
-    odometry, poses = tuple(bag.topics(ODOMETRY)), tuple(bag.topics(POSES))
-    return tuple(name for name in wanted if name in odometry + poses) or odometry or poses
+    odometry = tuple(bag.topics(ODOMETRY))
+    poses = tuple(bag.topics(POSES))
+    named = tuple(name for name in wanted if name in odometry + poses)
+    return named or odometry or poses
 
 
 def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
@@ -297,7 +314,9 @@ def camera_trajectory(bag: Bag, topic: str, camera: str) -> Trajectory | None:
     An odometry message names the frame_id that it moves, and /tf_static gives the camera in it. A
     pose message names none, so its pose is the camera's own.
     """
-    times, poses, body = [], [], camera
+    times = []
+    poses = []
+    body = camera
     for _, logged_ns, message in bag.messages([topic]):
         body = str(getattr(message, "child_frame_id", "")).lstrip("/") or camera
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose

@@ -59,7 +59,7 @@ def _message(store: Typestore, kind: str, given: Mapping[str, Any]) -> Message:
     """A message of nested fields; what is not given is zero."""
     from rosbags.interfaces import Nodetype
 
-    values = dict[str, Any]()
+    values: dict[str, Any] = {}
     fields: Any = store.fielddefs[kind][1]  # nested pairs, which rosbags' types do not tell apart
     for name, (node, of) in fields:
         value = given.get(name)
@@ -68,7 +68,7 @@ def _message(store: Typestore, kind: str, given: Mapping[str, Any]) -> Message:
         elif node is Nodetype.BASE:
             values[name] = ("" if of[0] == "string" else 0) if value is None else value
         elif of[0][0] is Nodetype.NAME:
-            values[name] = [_message(store, of[0][1], each) for each in value or ()]
+            values[name] = [_message(store, of[0][1], element) for element in value or ()]
         else:
             values[name] = np.zeros(of[1]) if value is None else value
     return store.types[kind](**values)

@@ -42,13 +42,27 @@ LARGEST_CODE = SATURATED_CODE - 1
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HEADER_ERRORS = (
-    *(ValueError, TypeError, LookupError, SyntaxError, ArithmeticError, EOFError, struct.error),
-    *(tokenize.TokenError, RecursionError),
+    ValueError,
+    TypeError,
+    LookupError,
+    SyntaxError,
+    ArithmeticError,
+    EOFError,
+    struct.error,
+    tokenize.TokenError,
+    RecursionError,
 )
 """What NumPy raises as it evaluates a damaged header, or one of another version of the format."""
 _ARCHIVE_ERRORS = (
-    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError),
-    *(OverflowError, RuntimeError),  # the last if encrypted, or of another version
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    LookupError,
+    OverflowError,
+    RuntimeError,  # if encrypted, or of another version
 )
 """What zipfile raises on damaged archives."""
 _MOST_AXES = 32  # of an array of NumPy 1
@@ -65,7 +79,7 @@ class Reading(NamedTuple):
     """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
 
     def __str__(self) -> str:
-        return self.source + ", assumed" * self.assumed
+        return f"{self.source}, assumed" if self.assumed else self.source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,10 +117,14 @@ def format_of_content(data: bytes) -> DepthFormat | None:
 
 def format_of_suffix(path: Path) -> DepthFormat:
     """The format that is written for a suffix in any case. OutputError for an unknown one."""
-    known: dict[str, DepthFormat] = {s: each for each in FORMATS.values() for s in each.suffixes}
-    if path.suffix.lower() not in known:
-        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(known)}")
-    return known[path.suffix.lower()]
+    by_suffix: dict[str, DepthFormat] = {
+        suffix: depth_format
+        for depth_format in FORMATS.values()
+        for suffix in depth_format.suffixes
+    }
+    if path.suffix.lower() not in by_suffix:
+        raise OutputError(f"{path}: the suffix for depth is one of {', '.join(by_suffix)}")
+    return by_suffix[path.suffix.lower()]
 
 
 def kind_of(data: bytes) -> str | None:
@@ -169,11 +187,16 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
     if dtype.kind not in "fiub":
         raise InputError(f"{path} holds {dtype} values; save numbers")
     # The numbers that it claims.
-    count, start = math.prod(shape), stream.tell()
+    count = math.prod(shape)
+    start = stream.tell()
     check_value_count(path, count, value_bytes=dtype.itemsize)
     if len(data) - start < count * dtype.itemsize:
-        fact = f"{len(data) - start:,} bytes of data instead of {count * dtype.itemsize:,}"
-        raise damaged(path, kind, f"cannot be read ({fact})")
+        raise damaged(
+            path,
+            kind,
+            f"cannot be read ({len(data) - start:,} bytes of data instead of"
+            f" {count * dtype.itemsize:,})",
+        )
     array = np.frombuffer(data, dtype, count=count, offset=start)
     return array.reshape(shape, order="F" if is_fortran else "C")
 
@@ -204,17 +227,18 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
             if len(members) != 1:
-                listing = one_line(", ".join(each.filename for each in members)) or "none"
+                listing = one_line(", ".join(member.filename for member in members)) or "none"
                 raise InputError(f"{path} holds several arrays or none ({listing}); save one")
             (member,) = members
             array = _parse_member(path, archive, member)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
     name = member.filename.removesuffix(".npy")
-    if (other := _NO_DEPTH.search(name.lower())) is not None:
+    no_depth = _NO_DEPTH.search(name.lower())
+    if no_depth is not None:
         raise InputError(
-            f"{path} holds the array {name!r}, which is {other[0]} and no depth by its name; save"
-            " depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
+            f"{path} holds the array {name!r}, which is {no_depth[0]} and no depth by its name;"
+            " save depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
         )
     reading = Reading(f"{array.dtype} NPZ array {name}")
     return DepthFile(values=array, reading=reading, is_image=False)
@@ -226,8 +250,12 @@ def _parse_member(
     """The array of one member. InputError if it is compressed otherwise, or beyond the budget."""
     if member.compress_type not in COMPRESSIONS:
         raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
-    claim, most = f"{path} holds {member.file_size:,} bytes", max_image_bytes()
-    check_claim(claim, member.file_size, most, way_out="create it again")
+    check_claim(
+        f"{path} holds {member.file_size:,} bytes",
+        member.file_size,
+        max_image_bytes(),
+        way_out="create it again",
+    )
     return parse_npy(path, archive.read(member), "NPZ")
 
 
@@ -293,12 +321,16 @@ def read_pfm(path: Path, data: bytes) -> DepthFile:
     match = _PFM_HEADER.match(data)
     if match is None or float(match[3]) == 0:
         raise damaged(path, "PFM", "has no valid header of one channel (Pf)")
-    width, height, factor = int(match[1]), int(match[2]), float(match[3])
+    width, height = int(match[1]), int(match[2])
+    factor = float(match[3])
     check_pixel_count(path, width, height)
     body = data[match.end() :]
     if len(body) != 4 * width * height:
-        fact = f"holds {len(body):,} bytes where {width}x{height} needs {4 * width * height:,}"
-        raise damaged(path, "PFM", fact)
+        raise damaged(
+            path,
+            "PFM",
+            f"holds {len(body):,} bytes where {width}x{height} needs {4 * width * height:,}",
+        )
     values = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
     unused = "" if abs(factor) == 1 else f", scale factor {abs(factor):g} of its header not applied"
     values = np.ascontiguousarray(values[::-1], dtype=np.float32)  # stored from the bottom

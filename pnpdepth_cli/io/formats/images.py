@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,15 @@ if TYPE_CHECKING:
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
 IMAGE_ERRORS = (
-    *(OSError, SyntaxError, ValueError, EOFError, LookupError, ArithmeticError),
-    *(RuntimeError, struct.error, zlib.error),  # RuntimeError: libheif
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,  # of libheif
+    struct.error,
+    zlib.error,
 )
 """What Pillow and its plugins raise on damaged files."""
 _END_OF_PNG = b"\xaeB`\x82"
@@ -48,23 +55,27 @@ def check_tags(data: bytes) -> None:
         struct.error: A page or a tag lies outside the data.
     """
     order = "<" if data[:2] == b"II" else ">"
-    pages, seen = list(struct.unpack_from(f"{order}I", data, 4)), set[int]()
-    claimed = of_pages = 0
+    pages = list(struct.unpack_from(f"{order}I", data, 4))  # offsets, of which 0 is the end
+    seen: set[int] = set()
+    claimed_bytes = 0
+    page_bytes = 0
     while pages:
         start = pages.pop()
         if start == 0 or start in seen:
             continue
         seen.add(start)
+        # A page is the number of its tags, 12 bytes for each, and the offset of the next page.
         end = start + 2 + 12 * struct.unpack_from(f"{order}H", data, start)[0]
         pages += struct.unpack_from(f"{order}I", data, end)  # the list of tags is complete
-        of_pages += end - start
-        if of_pages > len(data):
+        page_bytes += end - start
+        if page_bytes > len(data):
             raise ValueError("its pages overlap")
         for tag, kind, number, value in struct.iter_unpack(f"{order}HHII", data[start + 2 : end]):
-            claimed += number * _BYTES_OF_TYPE.get(kind, 1)
-            if claimed > len(data):
+            claimed_bytes += number * _BYTES_OF_TYPE.get(kind, 1)
+            if claimed_bytes > len(data):
                 raise ValueError(f"its tags claim more than {len(data):,} bytes")
-            pages += [value] if tag in _POINTERS else []
+            if tag in _POINTERS:
+                pages.append(value)
 
 
 def check_exif(image: PIL.Image.Image) -> None:
@@ -96,16 +107,25 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
             if stream.read(4) != _END_OF_PNG:
                 raise damaged(path, kind, f"is cut short after {len(data):,} bytes")
         with Image.open(stream, formats=[kind]) as image:
-            # Pillow decodes three channels into four bytes
+            # Pillow decodes three channels into four.
             channels = 1 if len(image.getbands()) == 1 else 4
-            value_bytes = 4 if image.mode in "IF" else 2 if ";16" in raw_mode(image) else 1
+            if image.mode in ("I", "F"):
+                value_bytes = 4
+            elif ";16" in raw_mode(image):
+                value_bytes = 2
+            else:
+                value_bytes = 1
             pixel_bytes = channels * value_bytes
             check_pixel_count(path, *image.size, pixel_bytes=pixel_bytes, file_bytes=len(data))
             yield image
     except IMAGE_ERRORS as error:
-        # Pillow names the in-memory buffer, which means nothing to a reader
-        reason = "unknown content or type of pixels" if "BytesIO" in str(error) else error
-        raise damaged(path, kind, f"cannot be decoded ({reason})") from error
+        # Pillow names the in-memory buffer, which means nothing to a reader.
+        is_unknown = "BytesIO" in str(error)
+        raise damaged(
+            path,
+            kind,
+            f"cannot be decoded ({'unknown content or type of pixels' if is_unknown else error})",
+        ) from error
 
 
 def raw_mode(image: PIL.Image.Image) -> str:
@@ -212,19 +232,28 @@ def read_tiff(path: Path, data: bytes) -> DepthFile:
         raise no_depth(path, f"a TIFF of mode {image.mode}, not F or I;16")
 
 
-def _gdal_tags(path: Path, image: PIL.Image.Image) -> tuple[float, float, float | None]:
-    """Scale and offset to metres, and the number without data, of GDAL's tags; 1, 0 and None."""
+class _GdalTags(NamedTuple):
+    """What GDAL says of the numbers of a TIFF: metres = scale · number + offset."""
+
+    scale: float  # 1 if it says nothing
+    offset: float  # 0 if it says nothing
+    nothing: float | None  # the number that stands for no data, if there is one
+
+
+def _gdal_tags(path: Path, image: PIL.Image.Image) -> _GdalTags:
+    """What the tags of GDAL say. Raises InputError if they are no numbers."""
     tags: Mapping[int, object] = getattr(image, "tag_v2", {})
     found = dict(_GDAL_ITEM.findall(str(tags.get(_GDAL_METADATA, "")).lower()))
     words = str(tags.get(_GDAL_NODATA, "")).strip("\0 \n")
     try:
-        scale, offset = float(found.get("scale", 1)), float(found.get("offset", 0))
+        scale = float(found.get("scale", 1))
+        offset = float(found.get("offset", 0))
         nothing = float(words) if words else None
     except ValueError as error:
         raise damaged(path, "TIFF", f"has tags of GDAL that are no numbers ({error})") from error
     if not (0 < scale < math.inf and math.isfinite(offset)):
         raise damaged(path, "TIFF", f"has a scale of {scale:g}")
-    return scale, offset, nothing
+    return _GdalTags(scale, offset, nothing)
 
 
 def write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
@@ -264,22 +293,32 @@ def read_exr_channels(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]
             redirect_stdout(io.StringIO()),
             OpenEXR.File(str(path), separate_channels=True) as file,
         ):
-            return {name: np.asarray(each.pixels) for name, each in file.channels().items()}
+            channels = file.channels()
+            return {name: np.asarray(channel.pixels) for name, channel in channels.items()}
     except (RuntimeError, ValueError, LookupError, OSError) as error:  # as the binding has it
         raise damaged(path, "EXR", f"cannot be read ({error})") from error
 
 
 def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
     """Raises InputError for what is not one flat image of whole channels in the budget."""
-    header, channels = file.header(0), file.header(0)["channels"]
+    header = file.header(0)
+    channels = header["channels"]
     (left, top), (right, bottom) = np.array(header["dataWindow"]).tolist()
-    size, pixel_bytes = (right - left + 1, bottom - top + 1), 4 * len(channels)
-    check_pixel_count(path, *size, pixel_bytes=pixel_bytes, file_bytes=file_bytes)
-    cropped = not np.array_equal(header["dataWindow"], header["displayWindow"])
-    sampled = any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels)
-    if len(file.parts) > 1 or "deep" in str(header.get("type", "")) or cropped or sampled:
-        fact = "has several parts, or is deep, cropped or subsampled"
-        raise InputError(f"{path} {fact}; export one flat image of its whole frame")
+    check_pixel_count(
+        path,
+        right - left + 1,
+        bottom - top + 1,
+        pixel_bytes=4 * len(channels),
+        file_bytes=file_bytes,
+    )
+    is_deep = "deep" in str(header.get("type", ""))
+    is_cropped = not np.array_equal(header["dataWindow"], header["displayWindow"])
+    is_sampled = any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels)
+    if len(file.parts) > 1 or is_deep or is_cropped or is_sampled:
+        raise InputError(
+            f"{path} has several parts, or is deep, cropped or subsampled; export one flat image of"
+            " its whole frame"
+        )
 
 
 def write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
