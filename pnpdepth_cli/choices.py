@@ -1,7 +1,7 @@
 """Every list of names that a user can choose from. Imports nothing heavy.
 
-An `OpenList` is open: one function, or one file in a folder, adds one entry, and an entry point
-of an installed package adds another. Closed lists are tuples.
+An `OpenList` is open: one line here with the location of an object, or one file in a folder, adds
+an entry, and so does an entry point of an installed package. Closed lists are tuples.
 """
 
 from __future__ import annotations
@@ -14,41 +14,46 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pnpdepth_cli import measures, protocols
+from pnpdepth_cli import protocols
 from pnpdepth_cli.errors import UsageError
 
 
 class OpenList(Mapping[str, Any]):
     """The entries of an open list by name; listing the names imports none of them.
 
-    With `names`, an entry is `TABLE[name]` of the module. Without, the module is a package, and an
-    entry is a file of it, or the object `attribute` in the file. A "-" in a name is "_" in the
-    file. Files that start with "_", and subpackages, are no entries.
+    An entry is an object in a module, which its location names as an entry point does: the module,
+    or `module:object`. This package's own entries are stated, or are the files of a folder; those
+    of other packages are their entry points in the group `pnpdepth.<group>`. The own ones win.
 
-    An entry of another package is its entry point `<name>` in the group `pnpdepth.<group>`. The
-    package's own entries win. With `in_file`, the path of a user's Python file is a name, too, and
-    the entry is the object of that name in it.
+    Args:
+        group: What the entries are, in the plural.
+        names: Locations of this package's entries, by their names.
+        folder: A package each of whose files is an entry; `package:object` is an object in each
+            file. A "-" in a name is "_" in the file. Files that start with "_", and subpackages,
+            are no entries.
+        in_file: With it, the path of a user's Python file is a name too, and its entry is the
+            object of this name in the file.
     """
 
     def __init__(
         self,
-        module: str,
-        *,
         group: str,
-        names: tuple[str, ...] = (),
-        attribute: str | None = None,
+        *,
+        names: Mapping[str, str] | None = None,
+        folder: str | None = None,
         in_file: str | None = None,
     ) -> None:
-        self._module, self._group, self._names = module, group, names
-        self._attribute, self._in_file = attribute, in_file
+        self._group = group
+        self._names = names or {}
+        self._folder = folder
+        self._in_file = in_file
 
     def __getitem__(self, name: str) -> Any:
         """Returns the entry. Raises UsageError for an unknown name."""
         if name in self._entries:
-            entry = self._entries[name].load()
-            return entry[name] if name in self._names else entry
-        if name in self:
-            return _from_file(name, str(self._in_file))
+            return self._entries[name].load()
+        if self._in_file is not None and name in self:
+            return _from_file(name, self._in_file)
         raise UsageError(f"{name!r} is none of the {self._group} {', '.join(self)}")
 
     def __contains__(self, name: object) -> bool:
@@ -64,19 +69,23 @@ class OpenList(Mapping[str, Any]):
     @functools.cached_property
     def _entries(self) -> dict[str, EntryPoint]:
         """The package's own, in their order, then those of others by name."""
-        places = dict.fromkeys(self._names, f"{self._module}:TABLE")
-        if not self._names:
-            package = importlib.util.find_spec(self._module)
-            assert package is not None
-            for file in pkgutil.iter_modules(package.submodule_search_locations):
-                if not file.name.startswith("_") and not file.ispkg:
-                    place = f"{self._module}.{file.name}"
-                    if self._attribute is not None:
-                        place += f":{self._attribute}"
-                    places[file.name.replace("_", "-")] = place
+        places = {**self._names, **({} if self._folder is None else _files_of(self._folder))}
         own = {name: EntryPoint(name, place, self._group) for name, place in places.items()}
         others = {point.name: point for point in entry_points(group=f"pnpdepth.{self._group}")}
         return own | {name: others[name] for name in sorted(others.keys() - own.keys())}
+
+
+def _files_of(folder: str) -> dict[str, str]:
+    """The locations of the entries in the files of a package, by name."""
+    package, colon, attribute = folder.partition(":")
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        raise ModuleNotFoundError(f"there is no package {package}", name=package)
+    return {
+        file.name.replace("_", "-"): f"{package}.{file.name}{colon}{attribute}"
+        for file in pkgutil.iter_modules(spec.submodule_search_locations)
+        if not file.name.startswith("_") and not file.ispkg
+    }
 
 
 @functools.cache
@@ -86,67 +95,116 @@ def _from_file(path: str, attribute: str) -> object:
     try:
         exec(compile(Path(path).read_bytes(), path, "exec"), values)
     except Exception as error:
-        fact = f"{type(error).__name__}: {error}"
-        raise UsageError(f"{path} cannot be run: {fact}") from None
+        raise UsageError(f"{path} cannot be run: {type(error).__name__}: {error}") from None
     if not callable(values.get(attribute)):
         raise UsageError(f"{path} defines no function {attribute!r}")
     return values[attribute]
 
 
 LOSSES = OpenList(
-    "pnpdepth_cli.core.losses",
+    "losses",
+    names={
+        "l1": "pnpdepth_cli.core.losses:l1",
+        "l2": "pnpdepth_cli.core.losses:l2",
+        "huber": "pnpdepth_cli.core.losses:huber",
+        "berhu": "pnpdepth_cli.core.losses:berhu",
+        "cauchy": "pnpdepth_cli.core.losses:cauchy",
+    },
     in_file="loss",
-    group="losses",
-    names=("l1", "l2", "huber", "berhu", "cauchy"),
 )
 """L: (N,) predicted and (N,) measured depth to a scalar."""
 
 UPDATES = OpenList(
-    "pnpdepth_cli.core.update_rules",
+    "updates",
+    names={
+        "sign": "pnpdepth_cli.core.update_rules:sign",
+        "sgd": "pnpdepth_cli.core.update_rules:sgd",
+        "normalised": "pnpdepth_cli.core.update_rules:normalised",
+        "momentum": "pnpdepth_cli.core.update_rules:momentum",
+        "adam": "pnpdepth_cli.core.update_rules:adam",
+    },
     in_file="update_rule",
-    group="updates",
-    names=("sign", "sgd", "normalised", "momentum", "adam"),
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
 PROPAGATIONS = OpenList(
-    "pnpdepth_cli.completion.propagation", group="propagations", names=("gp", "local")
+    "propagations",
+    names={
+        "gp": "pnpdepth_cli.completion.propagation:by_gaussian_process",
+        "local": "pnpdepth_cli.completion.propagation:by_lines",
+    },
 )
 """How the residual at the points is propagated: `pnpdepth_cli.completion.propagation`."""
 
 BASELINES = OpenList(
-    "pnpdepth_cli.completion.baselines",
-    group="baselines",
-    names=(
-        *("nearest", "linear", "linear-log", "median", "scale", "affine"),
-        *("scale-disparity", "affine-disparity", "local"),
-    ),
+    "baselines",
+    names={
+        "nearest": "pnpdepth_cli.completion.baselines:by_nearest",
+        "linear": "pnpdepth_cli.completion.baselines:by_linear",
+        "linear-log": "pnpdepth_cli.completion.baselines:by_linear_log",
+        "median": "pnpdepth_cli.completion.baselines:by_median",
+        "scale": "pnpdepth_cli.completion.baselines:by_scale",
+        "affine": "pnpdepth_cli.completion.baselines:by_affine",
+        "scale-disparity": "pnpdepth_cli.completion.baselines:by_scale_of_disparity",
+        "affine-disparity": "pnpdepth_cli.completion.baselines:by_affine_of_disparity",
+        "local": "pnpdepth_cli.completion.baselines:align_locally",
+    },
 )
 """Dense depth without refinement: `pnpdepth_cli.completion.baselines`."""
 
-NETWORKS = OpenList("model_zoo_defs", group="models")
+NETWORKS = OpenList("models", folder="model_zoo_defs")
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
 
 FORMATS = OpenList(
-    "pnpdepth_cli.io.depth", group="formats", names=("png", "exr", "npy", "npz", "pfm", "tiff")
+    "formats",
+    names={
+        "png": "pnpdepth_cli.io.depth:PNG",
+        "exr": "pnpdepth_cli.io.depth:EXR",
+        "npy": "pnpdepth_cli.io.depth:NPY",
+        "npz": "pnpdepth_cli.io.depth:NPZ",
+        "pfm": "pnpdepth_cli.io.depth:PFM",
+        "tiff": "pnpdepth_cli.io.depth:TIFF",
+    },
 )
 """Depth file formats: `pnpdepth_cli.io.formats.DepthFormat`."""
 
 LAYOUTS = OpenList(
-    "pnpdepth_cli.dataset.layouts",
-    group="layouts",
-    names=(
-        *("manifest", "kitti-odometry", "kitti-object", "kitti-depth", "kitti-raw"),
-        *("tum", "7scenes", "eth3d", "colmap", "void", "diode", "ibims", "scannet"),
-        *("arkitscenes", "stray-scanner", "record3d", "pairs", "image-depth"),
-    ),
+    "layouts",
+    names={
+        "manifest": "pnpdepth_cli.dataset.layouts.manifest:MANIFEST",
+        "kitti-odometry": "pnpdepth_cli.dataset.layouts.kitti:ODOMETRY",
+        "kitti-object": "pnpdepth_cli.dataset.layouts:KITTI_OBJECT",
+        "kitti-depth": "pnpdepth_cli.dataset.layouts.kitti:DEPTH",
+        "kitti-raw": "pnpdepth_cli.dataset.layouts.kitti:RAW",
+        "tum": "pnpdepth_cli.dataset.layouts.indexed:TUM",
+        "7scenes": "pnpdepth_cli.dataset.layouts:SEVEN_SCENES",
+        "eth3d": "pnpdepth_cli.dataset.layouts:ETH3D",
+        "colmap": "pnpdepth_cli.dataset.layouts.indexed:COLMAP",
+        "void": "pnpdepth_cli.dataset.layouts:VOID",
+        "diode": "pnpdepth_cli.dataset.layouts:DIODE",
+        "ibims": "pnpdepth_cli.dataset.layouts:IBIMS",
+        "scannet": "pnpdepth_cli.dataset.layouts:SCANNET",
+        "arkitscenes": "pnpdepth_cli.dataset.layouts:ARKITSCENES",
+        "stray-scanner": "pnpdepth_cli.dataset.layouts.indexed:STRAY_SCANNER",
+        "record3d": "pnpdepth_cli.dataset.layouts.indexed:RECORD3D",
+        "pairs": "pnpdepth_cli.dataset.layouts:PAIRS",
+        "image-depth": "pnpdepth_cli.dataset.layouts:IMAGE_DEPTH",
+    },
 )
 """Data set layouts, in the order in which they are guessed (`dataset.layouts.Layout`)."""
 
-EXPORTS = OpenList("pnpdepth_cli.commands.exports", attribute="EXPORT", group="exports")
+EXPORTS = OpenList("exports", folder="pnpdepth_cli.commands.exports:EXPORT")
 """Files for reconstruction programs: `pnpdepth_cli.commands.exports.Export`."""
 
-MEASURES = OpenList("pnpdepth_cli.measures", group="measures", names=tuple(measures.TABLE))
+MEASURES = OpenList(
+    "measures",
+    names={
+        "boundary_f1": "pnpdepth_cli.measures:BOUNDARY_F1",
+        "boundary_f1_1px": "pnpdepth_cli.measures:BOUNDARY_F1_1PX",
+        "boundary_f1_2px": "pnpdepth_cli.measures:BOUNDARY_F1_2PX",
+        "boundary_f1_3px": "pnpdepth_cli.measures:BOUNDARY_F1_3PX",
+    },
+)
 """Measures that `eval` computes only on request: `pnpdepth_cli.measures.Measure`."""
 
 # The method
@@ -187,8 +245,14 @@ NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mea
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
 
 SENSORS = (
-    *("vlp-16", "vlp-32c", "hdl-32e", "hdl-64e"),
-    *("paper-vlp-16", "paper-vlp-32c", "paper-hdl-32e", "paper-hdl-64e"),
+    "vlp-16",
+    "vlp-32c",
+    "hdl-32e",
+    "hdl-64e",
+    "paper-vlp-16",
+    "paper-vlp-32c",
+    "paper-hdl-32e",
+    "paper-hdl-64e",
 )
 """LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.simulation`."""
 

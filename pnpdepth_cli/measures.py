@@ -1,7 +1,7 @@
 """The error measures of depth: what each is called, how it is shown, its formula, and of what.
 
-`MEASURES` are computed everywhere, `TABLE` has those that `eval --columns` computes on request. A
-measure is one entry of either, and nowhere else. A depth has errors at several stages of its
+`MEASURES` are computed everywhere; `choices.MEASURES` has those that `eval --columns` computes on
+request. A measure is one entry of either. A depth has errors at several stages of its
 refinement, on several bases; `score` measures one. Importing this module imports no library.
 
 Sources: Eigen et al. 2014 (RMSE, RMSE of the logarithm, AbsRel = MRE, SqRel, δ < 1.25^k, SILog),
@@ -292,22 +292,17 @@ def _weigh(hits: Floats, of: Floats, weights: Sequence[float]) -> float:
     return float(np.average(hits / np.where(of > 0, of, 1), weights=weights))
 
 
-TABLE = {
-    measure.key: measure
-    for measure in (
-        Measure("boundary_f1", "boundary F1", better="higher", formula=_boundary_f1),
-        *(
-            Measure(
-                f"boundary_f1_{radius}px",
-                f"boundary F1, {radius} px",
-                better="higher",
-                formula=partial(_boundary_f1_within, radius=radius),
-            )
-            for radius in (1, 2, 3)
-        ),
+# The measures that are computed on request alone.
+BOUNDARY_F1 = Measure("boundary_f1", "boundary F1", better="higher", formula=_boundary_f1)
+BOUNDARY_F1_1PX, BOUNDARY_F1_2PX, BOUNDARY_F1_3PX = (
+    Measure(
+        f"boundary_f1_{radius}px",
+        f"boundary F1, {radius} px",
+        better="higher",
+        formula=partial(_boundary_f1_within, radius=radius),
     )
-}
-"""The measures that are computed on request alone."""
+    for radius in (1, 2, 3)
+)
 
 
 def _within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:

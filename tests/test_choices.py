@@ -8,7 +8,6 @@ import pytest
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.choices import OpenList
-from pnpdepth_cli.completion import baselines, propagation
 from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
@@ -26,7 +25,7 @@ def test_folders_and_entry_points_are_read(tmp_path: Path, monkeypatch: pytest.M
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    table = OpenList("pnpdepth_cli.io", attribute="__name__", group="test_table")
+    table = OpenList("test_table", folder="pnpdepth_cli.io:__name__")
     names = list(table)
     assert names == [*sorted({*names} - {"elsewhere"}), "elsewhere"]
     assert "scans" in names
@@ -38,17 +37,30 @@ def test_folders_and_entry_points_are_read(tmp_path: Path, monkeypatch: pytest.M
         table["scanss"]
 
 
-def test_every_name_is_implemented_in_the_order_of_the_list_and_a_format_has_its_suffixes() -> None:
+@pytest.mark.parametrize(
+    "names", [name for name, value in vars(choices).items() if isinstance(value, OpenList)]
+)
+def test_every_location_is_that_of_an_entry(names: str) -> None:
+    entries = getattr(choices, names)
+    assert len(entries) == len([*entries.values()]) > 0
+
+
+def test_an_entry_is_the_object_at_its_location_and_a_format_has_its_suffixes() -> None:
+    assert choices.LOSSES["l1"] is losses.l1
+    assert choices.UPDATES["adam"] is update_rules.adam
+    for name, depth_format in choices.FORMATS.items():
+        assert {f".{name}"} <= set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)
+
+
+@pytest.mark.parametrize("key", [*choices.MEASURES])
+def test_a_measure_has_the_key_of_its_name(key: str) -> None:
+    assert choices.MEASURES[key].key == key
+
+
+def test_every_name_of_a_closed_list_is_implemented_in_its_order() -> None:
     for names, implemented in (
-        (choices.LOSSES, losses.TABLE),
-        (choices.UPDATES, update_rules.TABLE),
-        (choices.BASELINES, baselines.TABLE),
-        (choices.PROPAGATIONS, propagation.TABLE),
         (choices.SCHEDULES, update_rules.SCHEDULES),
         (choices.NORMALISATIONS, NORMALISATIONS),
         (choices.SENSORS, LIDARS),
     ):
         assert tuple(names) == tuple(implemented)
-    assert choices.LOSSES["l1"] is losses.TABLE["l1"]
-    for name, depth_format in choices.FORMATS.items():
-        assert {f".{name}"} <= set(depth_format.suffixes) <= set(DEPTH_SUFFIXES)

@@ -10,8 +10,9 @@ import pytest
 import torch
 from scipy.integrate import trapezoid
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.io.depth import read_depth
-from pnpdepth_cli.measures import MEASURES, OF_SIGMA, TABLE, by_depth, frame_means, score
+from pnpdepth_cli.measures import MEASURES, OF_SIGMA, by_depth, frame_means, score
 from tests.test_scores import brute
 
 SAMPLES = Path(__file__).parents[1] / "samples"
@@ -71,7 +72,7 @@ def frames() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def of(key: str, depth: np.ndarray, truth: np.ndarray) -> float:
-    return TABLE[key].formula(depth, truth)
+    return choices.MEASURES[key].formula(depth, truth)
 
 
 def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:
@@ -87,7 +88,12 @@ def test_boundary_f1_is_that_of_depth_pro_and_of_moge() -> None:
 def test_a_step_in_its_place_scores_one_and_a_shifted_or_a_missing_one_nothing() -> None:
     step = np.where(np.arange(20) < 10, np.float32(2), np.float32(3)) + np.zeros((9, 1), np.float32)
     # Depth Pro: the step is seen in one of four directions, and the others count as missed
-    assert [of(key, step, step) for key in TABLE if key.startswith("boundary")] == [0.25, 1, 1, 1]
+    assert [of(key, step, step) for key in choices.MEASURES if key.startswith("boundary")] == [
+        0.25,
+        1,
+        1,
+        1,
+    ]
     assert of("boundary_f1_1px", np.roll(step, 1, axis=1)[:, 1:], step[:, 1:]) == 0
     assert of("boundary_f1_1px", np.ones_like(step), step) == 0
     lone = np.where(np.arange(20) % 5 == 0, step, 0)

@@ -18,8 +18,10 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
 
-_MAX_LISTED = 5  # files named in messages; the rest is counted, and summary.json lists all
-_READERS = 8  # threads that read records, whose time on network storage is waiting
+_MAX_LISTED = 5
+"""Files named in messages; the rest is counted, and summary.json lists all."""
+_READERS = 8
+"""Threads that read records, whose time on network storage is waiting."""
 
 
 def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
@@ -39,7 +41,8 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
     # Which frames are refined, and how.
     refine = replace(request.refine, view_3d=request.html_3d)
     request = replace(request, refine=refine)
-    found, own = find_frames(request), Records(request)
+    found = find_frames(request)
+    own = Records(request)
     if request.html is not None:
         # Imported where it is used: what draws pages takes 50 ms.
         from pnpdepth_cli.commands.many_frames.batch_report import check_batch_report
@@ -108,8 +111,8 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
         yield found.poses
     if len(found.chosen) < len(frames):
         yield f"chosen: {count_of(len(found.chosen), 'frame')} of them"
-    for each in unmatched[:_MAX_LISTED]:
-        yield f"warning: {each}"
+    for line in unmatched[:_MAX_LISTED]:
+        yield f"warning: {line}"
     if (more := len(unmatched) - _MAX_LISTED) > 0:
         yield f"warning: {more:,} more files are in no frame; summary.json lists them"
 
@@ -117,7 +120,8 @@ def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
 def _plan(reasons: Sequence[str | None]) -> str:
     """How many of the frames are done, and why others are to do, given the reason of each."""
     kinds = Counter(filter(None, reasons))
-    frames, to_do = count_of(len(reasons), "frame"), kinds.total()
+    frames = count_of(len(reasons), "frame")
+    to_do = kinds.total()
     if not to_do:
         return f"{frames}, all of them done already"
     counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())

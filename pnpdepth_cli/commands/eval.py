@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
@@ -33,11 +34,14 @@ from pnpdepth_cli.points import METRES
 from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _LISTED = 3
+"""Frames that are named of those with one kind of note."""
 _COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "shift")
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
+"""What states the scale of a file."""
 _MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)
-# KITTI's selection names the kind of file in the middle.
+"""The end of the stem of a depth file, as `refine` and others write it."""
 _KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
+"""The kind of file, which KITTI's selection names in the middle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,33 +100,34 @@ def evaluate(
     Raises:
         PnpDepthError: For what concerns all frames, or if none could be scored.
     """
+    # Every frame is scored, or has a record that says why it is not.
     pairs, notes = _pair_frames(request.prediction, request.ground_truth, request.rules.part)
     rows: list[FrameRecord] = []
     for row in in_order(lambda pair: score_frame(*pair, request), pairs, THREADS):
         rows.append(row)
         on_frame(len(rows), len(pairs))
-    if not (scored := [row for row in rows if row.status == "done"]):
+    scored = [row for row in rows if row.status == "done"]
+    if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].message}")
-    # means, and how sure they are over frames that count as independent
+    # The values of each frame, by the measures that any of them has.
     scores = [scores_of(row) for row in scored]
     every = (*request.measures, *OF_SIGMA)
-    measures = tuple(m for m in every if any(m.key in each for each in scores))
-    measured = [{m.key: each.get(m.key) for m in measures} for each in scores]
-    mean, values = frame_means(measured), np.array([[*each.values()] for each in measured], float)
-    clusters = find_clusters([row.group or "" for row in scored], values)
+    measures = tuple(m for m in every if any(m.key in of_frame for of_frame in scores))
+    measured = [{m.key: of_frame.get(m.key) for m in measures} for of_frame in scores]
+    values = np.array([[*of_frame.values()] for of_frame in measured], float)
+    # Their means, and how sure these are over frames that count as independent.
+    mean = frame_means(measured)
     if request.is_devkit:
         exact = devkit_mean(values[:, : len(request.measures)]).tolist()
         mean |= dict(zip(mean, exact, strict=False))
-    ends = {}
-    for measure, column in zip(measures, values.T, strict=True):
-        if clusters.count >= MIN_CLUSTERS:
-            low, high = interval(lambda mean: mean, [column], clusters)
-            # within what the measure can be
-            ends[measure.key] = max(low, 0.0), min(high, 1.0 if measure.percent else math.inf)
+    clusters = find_clusters([row.group or "" for row in scored], values)
+    ends = _intervals(measures, values, clusters)
     notes += clusters.notes()
     if len(scored) > 1 and not ends:
-        few = f"{clusters.text} are too few to tell how sure the means are"
-        notes.append(f"no interval: {few}; {MIN_CLUSTERS} are needed")
+        notes.append(
+            f"no interval: {clusters.text} are too few to tell how sure the means are;"
+            f" {MIN_CLUSTERS} are needed"
+        )
     return Evaluation(
         request=request,
         frames=rows,
@@ -141,6 +146,27 @@ def evaluate(
     )
 
 
+def _intervals(
+    measures: Sequence[Measure], values: NDArray[np.float64], clusters: Clusters
+) -> dict[str, tuple[float, float]]:
+    """The ends of the 95 % interval of each mean, by key; empty with too few clusters.
+
+    Args:
+        measures: M measures.
+        values: (N, M) their values in N frames.
+        clusters: Which of the frames count as independent.
+    """
+    ends = dict[str, tuple[float, float]]()
+    if clusters.count < MIN_CLUSTERS:
+        return ends
+    for measure, column in zip(measures, values.T, strict=True):
+        low, high = interval(lambda mean: mean, [column], clusters)
+        # No error is below 0, and no fraction above 1.
+        highest = 1.0 if measure.percent else math.inf
+        ends[measure.key] = max(low, 0.0), min(high, highest)
+    return ends
+
+
 def _pair_frames(
     prediction: Path, ground_truth: Path, part: FramePart | None
 ) -> tuple[list[tuple[FrameFiles, ResultFrame | None]], list[str]]:
@@ -151,18 +177,24 @@ def _pair_frames(
             raise InputError(f"{path}: no such file or folder; check the path")
     layout, frames = _data_set(prediction, ground_truth)
     if prediction.is_dir() != (layout is not None or ground_truth.is_dir()):
-        given = f"{prediction}, {ground_truth}"
-        raise UsageError(f"give two files, two folders, or a folder and a data set: {given}")
+        raise UsageError(
+            "give two files, two folders, or a folder and a data set, not"
+            f" {prediction} and {ground_truth}"
+        )
     # The predictions by name, and the frames with ground truth.
     notes: list[str] = []
     predictions = _depth_files(prediction)
     if layout is not None:
         frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
         if not frames:
-            raise InputError(f"{ground_truth} looks like {layout!r}, without ground truth")
+            raise InputError(
+                f"{ground_truth} looks like {layout!r}, without ground truth; give its folder"
+            )
         cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
         note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
-        notes.append(note + (f", of which {cuts} is used" if cuts else ""))
+        if cuts:
+            note += f", of which {cuts} is used"
+        notes.append(note)
     elif ground_truth.is_dir():
         frames = [FrameFiles(name=name, gt=gt) for name, gt in _depth_files(ground_truth).items()]
     else:
@@ -171,12 +203,16 @@ def _pair_frames(
     names = [frame.name for frame in frames]
     extra = sorted(predictions.keys() - {*names})
     if len(extra) == len(predictions):
-        fact = "no prediction has the name of a ground truth file"
-        own, others = some_names(predictions), some_names(sorted(names))
-        raise InputError(f"{fact}: predictions are {own}; ground truth is {others}")
+        raise InputError(
+            "no prediction has the name of a ground truth file: predictions are"
+            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}; name both"
+            " alike"
+        )
     if extra:
-        fact = f"{len(extra):,} of {len(predictions):,} predictions have no ground truth"
-        notes.append(f"warning: {fact} and are not scored: {some_names(extra)}")
+        notes.append(
+            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth and"
+            f" are not scored: {some_names(extra)}"
+        )
     groups = groups_of(names, [frame.group for frame in frames])
     return [
         _pair(replace(frame, group=group), predictions.get(frame.name))
@@ -224,10 +260,12 @@ def _depth_files(folder: Path) -> dict[str, Path]:
     marked = {stem: path for stem, path in found.items() if _MARK.search(stem)} or found
     files, ambiguous = one_of_each((_frame_name(stem), path) for stem, path in marked.items())
     if lost := [*problems, *ambiguous]:
-        raise InputError("{} {}".format(*lost[0]))
+        path, why = lost[0]
+        raise InputError(f"{path} {why}")
     if not files:
-        suffixes = " ".join(DEPTH_SUFFIXES)
-        raise InputError(f"{folder} holds no depth file ({suffixes}); check the path")
+        raise InputError(
+            f"{folder} holds no depth file ({' '.join(DEPTH_SUFFIXES)}); check the path"
+        )
     return dict(sorted(files.items()))
 
 
@@ -246,12 +284,14 @@ def _numbers(rows: Sequence[FrameRecord], key: str) -> list[float]:
 def _notes_on_files(rows: Sequence[FrameRecord]) -> Iterator[str]:
     """How files were read, and which of them were not scored or changed."""
     for side, option in _OPTIONS.items():
-        texts = [
-            reading.source
-            + (f"; {option} to change" if reading.assumed else "")
-            + (f" ({count:,} of {len(rows):,})" if count < len(rows) else "")
-            for reading, count in _readings(rows, side)
-        ]
+        texts = []
+        for reading, count in _readings(rows, side):
+            text = reading.source
+            if reading.assumed:
+                text += f"; {option} to change"
+            if count < len(rows):
+                text += f" ({count:,} of {len(rows):,})"
+            texts.append(text)
         yield f"{side}: {some_names(texts)}"
     # Frames that are in no mean, and what was made of ground truth that is none.
     failed = [
@@ -271,22 +311,29 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
     # The pixels.
     known = sum(_numbers(scored, "known"))
     if empty := known - sum(_numbers(scored, "predicted")):
-        count = f"{count_of(empty, 'pixel')} ({empty / known:.2%})"
-        yield f"warning: {count} of the ground truth without prediction"
+        yield (
+            f"warning: {count_of(empty, 'pixel')} ({empty / known:.2%}) of the ground truth without"
+            " prediction"
+        )
     given = sum(_numbers(scored, "given"))
     if given and not request.rules.exclude_sparse:
-        hint = "--exclude-sparse leaves them out"
-        yield f"{given:,} of the scored pixels have a point of the sparse input; {hint}"
+        yield (
+            f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
+            " leaves them out"
+        )
     # How predictions were scaled, and what looks like a wrong scale.
     if factors := _numbers(scored, "factor"):
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
-        of = f"factor {median:.4g} (median of {len(factors):,} images)"
-        yield f"scale-by {request.scale_by}: {of}, standard deviation / median {spread:.3f}"
+        yield (
+            f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,} images),"
+            f" standard deviation / median {spread:.3f}"
+        )
     elif unscaled := [row.unit for row in scored if row.unit != METRES]:
-        fact = f"{count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres"
-        why = "errors against the ground truth show nothing; --scale-by median scales each image"
-        yield f"warning: {fact}, so {why}"
+        yield (
+            f"warning: {count_of(len(unscaled), 'prediction')} in {unscaled[0]}, not in metres, so"
+            " errors against the ground truth show nothing; --scale-by median scales each image"
+        )
     found = _agreement_of(scored)
     in_disparity = request.scale_by == "affine-disparity"
     if found.is_reversed and not in_disparity:
@@ -322,21 +369,28 @@ def _agreement_of(scored: Sequence[FrameRecord]) -> Agreement:
 
 def means_table(evaluation: Evaluation) -> Table:
     """Returns a row for each measure: its mean and the interval of it."""
-    intervals, counts = evaluation.interval, evaluation.counts
-    scored = f"{counts['scored']:,} of " if counts["scored"] < counts["frames"] else ""
-    title = f"Means and coverage over {scored}{count_of(counts['frames'], 'frame')}"
-    title += f", {count_of(counts['pixels'], 'pixel')}"
+    # What the means are over.
+    intervals = evaluation.interval
+    counts = evaluation.counts
+    frames = count_of(counts["frames"], "frame")
+    if counts["scored"] < counts["frames"]:
+        frames = f"{counts['scored']:,} of {frames}"
+    title = f"Means and coverage over {frames}, {count_of(counts['pixels'], 'pixel')}"
     columns = ["", "mean"]
     if intervals is not None:
         columns.append("95 %")
         title += f"; 95 % interval over {evaluation.clusters.text}"
+    if evaluation.request.rules.exclude_sparse:
+        title += WITHOUT_SPARSE
+    # The rows.
     rows = []
     mean = evaluation.mean | {COVERAGE.key: counts["coverage"]}
     for measure in (*evaluation.shown, COVERAGE):
-        ends = [] if intervals is None else [intervals.get(measure.key, ())]
-        texts = (" … ".join(map(measure.text, each)) for each in ends)
-        rows.append([measure.heading, measure.text(mean.get(measure.key)), *texts])
-    title += WITHOUT_SPARSE * evaluation.request.rules.exclude_sparse
+        row = [measure.heading, measure.text(mean.get(measure.key))]
+        if intervals is not None:
+            ends = intervals.get(measure.key, ())
+            row.append(" … ".join(measure.text(end) for end in ends))
+        rows.append(row)
     return Table(title=title, columns=columns, rows=rows)
 
 
@@ -344,10 +398,15 @@ def frames_table(evaluation: Evaluation) -> Table:
     """Returns a row for each frame: its files, its counts, and the measures as stored."""
     rows = []
     for frame in evaluation.frames:
-        files, scores = (frame.inputs.get(name) for name in FILES), plain(scores_of(frame))
-        row = [frame.name, frame.group, *(file and file.path for file in files)]
-        row += map(scores.get, (*_COUNTS, *(measure.key for measure in evaluation.shown)))
-        rows.append([*row, frame.message])
+        scores = plain(scores_of(frame))
+        row = [frame.name, frame.group]
+        for name in FILES:
+            file = frame.inputs.get(name)
+            row.append(None if file is None else file.path)
+        row += [scores.get(name) for name in _COUNTS]
+        row += [scores.get(measure.key) for measure in evaluation.shown]
+        row.append(frame.message)
+        rows.append(row)
     counts = [COVERAGE if name == COVERAGE.key else name for name in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)

@@ -1,6 +1,6 @@
 """Baselines: dense depth without refinement, to measure a refined network against.
 
-`pnpdepth_cli.choices.BASELINES` lists the names. "local" aligns a network's depth locally. A global
+`pnpdepth_cli.choices.BASELINES` has their names. "local" aligns a network's depth locally. A global
 alignment reads the network's numbers as a·x + b everywhere. Here a and b are fitted around
 each pixel, to its nearest points (`completion.propagation`).
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -66,21 +67,28 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     return torch.where(known, depth, 0.0).float().to(device)
 
 
-def _aligned(kind: str, reading: str = "depth") -> Baseline:
-    """The baseline that aligns the prediction."""
-    return lambda points, prediction: align_prediction(
-        prediction, points, kind=kind, reading=reading
-    )
+def _aligned(points: SparsePoints, prediction: Tensor, *, kind: str, reading: str) -> Tensor:
+    """The prediction, read as depth or disparity and aligned with the points."""
+    return align_prediction(prediction, points, kind=kind, reading=reading)
 
 
-TABLE: dict[str, Baseline] = {
-    "nearest": lambda points, _: nearest(points),
-    "linear": lambda points, _: linear(points),
-    "linear-log": lambda points, _: linear(points, space="log"),
-    "median": _aligned("median"),
-    "scale": _aligned("scale"),
-    "affine": _aligned("affine"),
-    "scale-disparity": _aligned("scale", "disparity"),
-    "affine-disparity": _aligned("affine", "disparity"),
-    "local": align_locally,
-}
+def by_nearest(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """Returns the depth of the nearest point everywhere."""
+    return nearest(points)
+
+
+def by_linear(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """Returns linear interpolation of depth between the points."""
+    return linear(points)
+
+
+def by_linear_log(points: SparsePoints, prediction: Tensor) -> Tensor:
+    """Returns linear interpolation of log depth between the points."""
+    return linear(points, space="log")
+
+
+by_median = partial(_aligned, kind="median", reading="depth")
+by_scale = partial(_aligned, kind="scale", reading="depth")
+by_affine = partial(_aligned, kind="affine", reading="depth")
+by_scale_of_disparity = partial(_aligned, kind="scale", reading="disparity")
+by_affine_of_disparity = partial(_aligned, kind="affine", reading="disparity")

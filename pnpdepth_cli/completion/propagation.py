@@ -1,6 +1,6 @@
 """Ways to predict the residual everywhere from the residual at the points (`--propagate`).
 
-They are the entries of `TABLE`, listed in `choices.PROPAGATIONS`; `completion.residual_field` calls
+They are the entries of `choices.PROPAGATIONS`; `completion.residual_field` calls
 them with the residuals at the inliers. "gp" is in `completion.gaussian_process`. "local" fits lines
 over the predicted log depth:
 
@@ -83,8 +83,8 @@ def _lines_at(
     return (mean_residual - slope * mean_z)[:, 0], slope[:, 0]
 
 
-def _by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
-    """The residual by lines over the predicted log depth."""
+def by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
+    """Returns the residual, (H, W) or (M,) float32, by lines over the predicted log depth."""
     log_depth = residuals.features[DEPTH]
     xy = None
     if queries is not None:
@@ -96,13 +96,6 @@ def _by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tens
     return (shift + slope * log_depth).float()
 
 
-def _by_gaussian_process(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
-    """The mean residual of a Gaussian process, whose kernel fits the points."""
+def by_gaussian_process(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
+    """Returns the mean residual, (H, W) or (M,), of a Gaussian process that fits the points."""
     return gaussian_process.predict(residuals.fitted, queries)
-
-
-TABLE = {"gp": _by_gaussian_process, "local": _by_lines}
-"""Functions of the residuals at the inliers, by the names in `choices.PROPAGATIONS`.
-
-They return the residual (H, W) float32 at every pixel, or (M,) at the coordinates of M points.
-"""

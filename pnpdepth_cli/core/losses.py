@@ -78,7 +78,3 @@ def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
     error = predicted.clamp_min(MIN_DEPTH).log() - true.log()
     c = (MAD_TO_STD * error.detach().abs().median()).clamp_min(MIN_CAUCHY_SCALE)
     return (c * (error / c).square().log1p()).mean()
-
-
-TABLE = {"l1": l1, "l2": l2, "huber": huber, "berhu": berhu, "cauchy": cauchy}
-"""The losses by name."""

@@ -1,8 +1,8 @@
 """U and α of equation 3: from the gradient at z to the direction and the size of its update.
 
-A function of `TABLE` makes a new rule. A rule is called with the gradients of one refinement, in
-order, and returns a direction of the same shape; z moves by −α × direction.
-`pnpdepth_cli.choices.UPDATES` lists the names. The gradient may be blurred before.
+A function of `pnpdepth_cli.choices.UPDATES` makes a new rule. A rule is called with the gradients
+of one refinement, in order, and returns a direction of the same shape; z moves by −α × direction.
+The gradient may be blurred before.
 """
 
 from __future__ import annotations
@@ -83,15 +83,6 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
 
     return update
 
-
-TABLE: dict[str, Callable[[], Update]] = {
-    "sign": sign,
-    "sgd": sgd,
-    "normalised": normalised,
-    "momentum": momentum,
-    "adam": adam,
-}
-"""Functions that make a rule, by name."""
 
 SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda done: 1.0,

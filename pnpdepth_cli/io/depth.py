@@ -15,21 +15,49 @@ from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, re
 from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, images
 from pnpdepth_cli.points import SparsePoints
 
-TABLE = {
-    name.lower(): formats.DepthFormat(
-        name=name, suffixes=suffixes, magic=magic, read=read, write=write, integer=name == "PNG"
-    )
-    for name, suffixes, magic, read, write in (
-        ("PNG", (".png",), (b"\x89PNG\r\n\x1a\n",), images.read_png, images.write_png),
-        ("EXR", (".exr",), (b"v/1\x01",), images.read_exr, images.write_exr),
-        ("NPY", (".npy",), (b"\x93NUMPY",), formats.read_npy, formats.write_npy),
-        # an archive with an array, and an empty one
-        ("NPZ", (".npz",), (b"PK\3\4", b"PK\5\6"), formats.read_npz, formats.write_npz),
-        ("PFM", (".pfm",), (b"Pf",), formats.read_pfm, formats.write_pfm),
-        ("TIFF", (".tif", ".tiff"), (b"II*\0", b"MM\0*"), images.read_tiff, images.write_tiff),
-    )
-}
-"""The formats of this package by their names in `choices.FORMATS`."""
+PNG = formats.DepthFormat(
+    name="PNG",
+    suffixes=(".png",),
+    magic=(b"\x89PNG\r\n\x1a\n",),
+    read=images.read_png,
+    write=images.write_png,
+    integer=True,
+)
+EXR = formats.DepthFormat(
+    name="EXR",
+    suffixes=(".exr",),
+    magic=(b"v/1\x01",),
+    read=images.read_exr,
+    write=images.write_exr,
+)
+NPY = formats.DepthFormat(
+    name="NPY",
+    suffixes=(".npy",),
+    magic=(b"\x93NUMPY",),
+    read=formats.read_npy,
+    write=formats.write_npy,
+)
+NPZ = formats.DepthFormat(
+    name="NPZ",
+    suffixes=(".npz",),
+    magic=(b"PK\3\4", b"PK\5\6"),  # an archive with an array, and an empty one
+    read=formats.read_npz,
+    write=formats.write_npz,
+)
+PFM = formats.DepthFormat(
+    name="PFM",
+    suffixes=(".pfm",),
+    magic=(b"Pf",),
+    read=formats.read_pfm,
+    write=formats.write_pfm,
+)
+TIFF = formats.DepthFormat(
+    name="TIFF",
+    suffixes=(".tif", ".tiff"),
+    magic=(b"II*\0", b"MM\0*"),
+    read=images.read_tiff,
+    write=images.write_tiff,
+)
 
 DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)
 """The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""

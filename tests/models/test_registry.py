@@ -32,7 +32,7 @@ def open_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(model_zoo_defs, "__path__", folders)
     monkeypatch.setattr(model_zoo_defs.__spec__, "submodule_search_locations", folders)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(choices, "NETWORKS", choices.OpenList("model_zoo_defs", group="models"))
+    monkeypatch.setattr(choices, "NETWORKS", choices.OpenList("models", folder="model_zoo_defs"))
     return tmp_path
 
 

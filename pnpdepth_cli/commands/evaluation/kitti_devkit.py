@@ -30,7 +30,8 @@ def fill_background(depth: Floats) -> Floats:
     Args:
         depth: (H, W) metres, 0 where unknown.
     """
-    filled, column = np.full_like(depth, -1), np.arange(depth.shape[1])
+    filled = np.full_like(depth, -1)
+    column = np.arange(depth.shape[1])
     rows = np.flatnonzero((depth > 0).any(axis=1))
     for row in rows:
         known = np.flatnonzero(depth[row] > 0)
@@ -57,12 +58,14 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     error = np.abs(g - p)
     with np.errstate(invalid="ignore"):
         # logarithms rounded once to single precision, as C's logf nearly always does
-        log_g, log_p = (np.log(each, dtype=np.float64).astype(np.float32) for each in (g, p))
+        log_g = np.log(g, dtype=np.float64).astype(np.float32)
+        log_p = np.log(p, dtype=np.float64).astype(np.float32)
         log_error = log_g - log_p
         inverse = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64)).astype(np.float32)
         # the errors in the kit's order
         count = np.float32(len(g))
-        log_squares, log_total = _sum(log_error**2) / count, _sum(log_error)
+        log_squares = _sum(log_error**2) / count
+        log_total = _sum(log_error)
         values = (
             _sum(error) / count,
             np.sqrt(_sum(error * error) / count),

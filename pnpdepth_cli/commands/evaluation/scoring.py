@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -58,8 +59,29 @@ _CROPS = {
 }
 
 
-_CUT, _WHOLE = (352, 1216), (375, 1242)
-"""(H, W) of KITTI's frames cut at the bottom, in the middle, and of most frames they are from."""
+_CUT = (352, 1216)
+"""(H, W) of KITTI's frames cut at the bottom, in the middle, as its depth benchmark has them."""
+_WHOLE = (375, 1242)
+"""(H, W) of most frames they are from."""
+
+
+class _Read(NamedTuple):
+    """A depth map that was read to be scored."""
+
+    values: Depth  # (H, W) metres, 0 = unknown
+    reading: Reading
+    notes: list[str]
+    added: float = 0.0
+    """What was added to all numbers to make them positive, which the fit of a shift removes."""
+
+
+class _Scored(NamedTuple):
+    """The scores of a frame, and how its files were read."""
+
+    scores: Scores
+    readings: dict[str, Reading]
+    """By the names of `FILES`."""
+    notes: list[str]
 
 
 def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequest) -> FrameRecord:
@@ -80,53 +102,54 @@ def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequ
         return replace(record, message="there is no prediction")
     record = replace(record, unit=result.record.unit)
     try:
-        scores, readings, notes = _score(files, result, request)
+        scored = _score(files, result, request)
     except PnpDepthError as error:
         return replace(record, message=str(error))
-    for name, each in zip(FILES, readings, strict=False):
+    for name, reading in scored.readings.items():
         inputs[name] = replace(
-            inputs[name], read_as=each.source, scale=each.scale, assumed=each.assumed
+            inputs[name], read_as=reading.source, scale=reading.scale, assumed=reading.assumed
         )
-    return replace(record, status="done", notes=notes, errors={GT: {AFTER: scores}})
+    return replace(record, status="done", notes=scored.notes, errors={GT: {AFTER: scored.scores}})
 
 
-def _score(
-    files: FrameFiles, result: ResultFrame, request: EvalRequest
-) -> tuple[Scores, tuple[Reading, Reading], list[str]]:
-    """The scores, how prediction and ground truth were read, and notes."""
-    # The ground truth that is scored, and the prediction as the protocol changes it.
+def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Scored:
+    """The scores of a result, how prediction and ground truth were read, and notes."""
     rules = request.rules
-    gt, of_gt, notes = _read_truth(files, result, request)
+    # The ground truth that is scored.
+    gt = _read_truth(files, result, request)
+    notes = [*gt.notes]
     try:
-        given = _given_points(files, result, gt)
+        given = _given_points(files, result, gt.values)
     except PnpDepthError:
         if rules.exclude_sparse:
             raise
         given = None
-    truth = np.where(_where_scored(gt, given, rules), gt, np.float32(0))
+    truth = np.where(_where_scored(gt.values, given, rules), gt.values, np.float32(0))
     if not truth.any():
-        raise InputError(f"{files.gt} has no known depth where protocol {request.protocol} scores")
-    values, of_prediction, added = _read_prediction(result.depth, truth.shape, request)
-    depth, fit = scale_prediction(values, truth, request.scale_by)
-    if fit is not None:
-        factor, shift = fit
-        fit = factor, shift + factor * added
-    if added:
-        notes.append(
-            f"{result.depth}: numbers of 0 and below are values, as --scale-by fits a shift"
+        raise InputError(
+            f"{files.gt} has no known depth where protocol {request.protocol} scores; choose"
+            " another --protocol"
         )
+    # The prediction, as the protocol changes it.
+    prediction = _read_prediction(result.depth, truth.shape, request)
+    notes += prediction.notes
+    depth, fit = scale_prediction(prediction.values, truth, request.scale_by)
     if rules.clip:
         depth = np.clip(depth, rules.min_depth, rules.max_depth).astype(np.float32)
-    both, known = (truth > 0) & (depth > 0), int((truth > 0).sum())
+    both = (truth > 0) & (depth > 0)
     if not both.any() and not request.is_devkit:
-        raise InputError(f"{result.depth} holds no valid depth where the truth is known")
-    # The measures, and the numbers of pixels.
+        raise InputError(
+            f"{result.depth} holds no valid depth where the truth is known; is it of this frame?"
+        )
+    # The measures, also of a standard deviation in the same unit.
     scores = _measure(depth, truth, request)
     if result.sigma is not None and fit is None:
         sigma = result.of_size(result.sigma, depth)
         scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
+    # The numbers of pixels, and how prediction and truth agree.
     agreement = compare_depths(np.where(both, depth, 0), truth)
-    predicted = int(((values > 0) & (truth > 0)).sum())
+    known = int((truth > 0).sum())
+    predicted = int(((prediction.values > 0) & (truth > 0)).sum())
     scores |= {
         "pixels": int(both.sum()),
         "known": known,
@@ -135,10 +158,15 @@ def _score(
         "given": None if given is None else int((given & both).sum()),
         "median_ratio": agreement.ratio if both.any() else None,
         "ratio_spread": agreement.spread if both.any() else None,
-        "rank_correlation": compare_depths(values, truth).rank,
+        "rank_correlation": compare_depths(prediction.values, truth).rank,
+        "factor": None,
+        "shift": None,
     }
-    scores["factor"], scores["shift"] = fit or (None, None)
-    return scores, (of_prediction, of_gt), notes
+    if fit is not None:
+        factor, shift = fit
+        scores["factor"] = factor
+        scores["shift"] = shift + factor * prediction.added
+    return _Scored(scores, {"prediction": prediction.reading, "gt": gt.reading}, notes)
 
 
 def scores_of(record: FrameRecord) -> Scores:
@@ -155,17 +183,20 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     return {**of_pixels, **of_images}
 
 
-def _read_truth(
-    frame: FrameFiles, result: ResultFrame, request: EvalRequest
-) -> tuple[Depth, Reading, list[str]]:
-    """The ground truth in the part of the frame that is kept, how it was read, and notes."""
+def _read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Read:
+    """The ground truth in the part of the frame that is kept."""
+    if frame.gt is None:
+        raise InputError(f"frame {frame.name} has no ground truth to score against; add it")
+    # Its numbers, which a user, a data set or the file say are depth or its inverse.
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
-    assert frame.gt is not None
     file = raw_depth(frame.gt, frame.image) or _read(frame.gt, scale, request)
     kind = request.gt_kind or frame.kind_of_gt
     if (factor := inverse_factor("--gt-kind", kind)) is not None:
-        file, scale = depth_of_inverse(file, factor, scale), None
-    values, reading = apply_masks(file.values, frame.masks), file.reading
+        file = depth_of_inverse(file, factor, scale)
+        scale = None
+    # Depth in metres, as all numbers of sensors pass one gate; then the part that is kept.
+    reading = file.reading
+    values = apply_masks(file.values, frame.masks)
     of_layout = request.gt_scale is None and not frame.scales_stated
     values, notes = plausible_map(
         values,
@@ -179,22 +210,25 @@ def _read_truth(
     if request.gt_range:
         gt = _depth_of_distances(gt, frame, result, (values.shape[0], values.shape[1]))
         reading = reading._replace(source=f"{reading.source}, distances")
-    return gt, reading, notes
+    return _Read(gt, reading, notes)
 
 
 def _depth_of_distances(
     gt: Depth, files: FrameFiles, result: ResultFrame, whole: tuple[int, int]
 ) -> Depth:
     """Depth z of distances from the camera of the data set, else of the prediction's record."""
-    size, camera = (gt.shape[0], gt.shape[1]), None
+    size = (gt.shape[0], gt.shape[1])
+    camera = None
     if files.calib is not None:
         found, _ = camera_of_file(files.calib, files.camera, whole, files.image_file)
         camera = files.part.camera_in_crop(found, whole)
     elif result.size == size:
         camera, _ = result.camera_and_pose
     if camera is None:
-        fact = f"frame {files.name} has none in the data set or the record beside the prediction"
-        raise InputError(f"--gt-range needs a camera, but {fact}; add the column calib to a list")
+        raise InputError(
+            f"--gt-range needs a camera, but frame {files.name} has none in the data set or the"
+            " record beside the prediction; add the column calib to a list"
+        )
     rays = rays_of_image(camera, size)
     return known_metres(gt / np.sqrt(1 + (rays**2).sum(axis=2)))
 
@@ -208,14 +242,13 @@ def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
     return scored & ~given if given is not None and rules.exclude_sparse else scored
 
 
-def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Depth, Reading, float]:
-    """The prediction at the ground truth's size, 0 where unknown, and how it was read.
-
-    Of a prediction that is known up to scale and shift, numbers below 0 are values. The last is
-    what was added to all numbers to make them positive, which the fit of a shift removes.
-    """
+def _read_prediction(path: Path, size: Size, request: EvalRequest) -> _Read:
+    """The prediction at the ground truth's size."""
     file = _read(path, request.pred_scale, request)
-    values, added = file.values, 0.0
+    values = file.values
+    notes = list[str]()
+    # Of a prediction that is known up to scale and shift, numbers below 0 are values.
+    added = 0.0
     stored = load_stored(path).values
     if request.scale_by.startswith("affine") and stored.shape == values.shape:
         known = np.isfinite(stored)
@@ -223,19 +256,25 @@ def _read_prediction(path: Path, size: Size, request: EvalRequest) -> tuple[Dept
         if least < 0:
             added = 1 - least
             values = np.where(known, stored + added, 0).astype(np.float32)
+            notes.append(f"{path}: numbers of 0 and below are values, as --scale-by fits a shift")
     if file.reading.scale is None and request.pred_scale is not None:  # floats
         values = values / np.float32(request.pred_scale)
         source = f"{file.reading.source} ÷ {request.pred_scale:g}"
         file = replace(file, reading=file.reading._replace(source=source))
     if values.shape != size and not request.resize:
-        advice = "; --resize scales predictions if both show the same view"
-        raise unequal_sizes(f"prediction {path}", values.shape, "the ground truth", size, advice)
+        raise unequal_sizes(
+            f"prediction {path}",
+            values.shape,
+            "the ground truth",
+            size,
+            "; --resize scales predictions if both show the same view",
+        )
     if values.shape != size:
         known = (values > 0).astype(np.float32)
-        total, weight = (cv2.resize(part, (size[1], size[0])) for part in (values, known))
+        total, weight = (cv2.resize(image, (size[1], size[0])) for image in (values, known))
         # a resized pixel is known where most of its interpolation weight is on known pixels
         values = np.where(weight > 0.5, total / np.maximum(weight, 0.5), np.float32(0))
-    return values, file.reading, added
+    return _Read(values, file.reading, notes, added)
 
 
 def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
@@ -251,7 +290,8 @@ def _read(path: Path, scale: float | None, request: EvalRequest) -> DepthFile:
 
 def _given_points(frame: FrameFiles, result: ResultFrame, gt: Depth) -> Mask:
     """(H, W) true at the network's sparse points. Raises PnpDepthError if they are not known."""
-    size, sparse = (gt.shape[0], gt.shape[1]), result.record.inputs.get("sparse")
+    size = (gt.shape[0], gt.shape[1])
+    sparse = result.record.inputs.get("sparse")
     drawn = None if sparse is None else sparse.sampled
     # Points that were drawn from the ground truth are drawn again.
     if drawn is not None and result.size == size:
@@ -267,8 +307,10 @@ def _given_points(frame: FrameFiles, result: ResultFrame, gt: Depth) -> Mask:
                 raise unequal_sizes(f"sparse depth {frame.sparse}", own, "the ground truth", size)
         xy = points.xy
     else:
-        fact = f"frame {frame.name} has no sparse depth file to exclude"
-        raise InputError(f"{fact} in the data set or the record beside the prediction")
+        raise InputError(
+            f"frame {frame.name} has no sparse depth file to exclude in the data set or the record"
+            " beside the prediction; add it, or score without excluding it"
+        )
     given = np.zeros(size, bool)
     given.flat[pixel_index(xy[in_frame(xy, size)], size)] = True
     return given
@@ -282,14 +324,17 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     """
     height, width = size
     if crop == "nyu" and size != (480, 640):
-        fact = f"crop nyu is for frames of 640×480 but this one is {width}×{height}"
-        raise InputError(f"{fact}; --protocol paper scores any size")
+        raise InputError(
+            f"crop nyu is for frames of 640×480 but this one is {width}×{height}; --protocol paper"
+            " scores any size"
+        )
     top, bottom, left, right = _CROPS[crop]
     # Frames that were cut to KITTI's usual part have the crop of the whole frame they are from.
     cut_rows = cut_columns = 0
     if size == _CUT and crop in ("garg", "eigen"):
         height, width = _WHOLE
-        cut_rows, cut_columns = height - size[0], (width - size[1]) // 2
+        cut_rows = height - size[0]
+        cut_columns = (width - size[1]) // 2
     rows = [int(end * height) - cut_rows for end in (top, bottom)]
     columns = [int(end * width) - cut_columns for end in (left, right)]
     return slice(*np.clip(rows, 0, size[0])), slice(*np.clip(columns, 0, size[1]))
@@ -316,12 +361,15 @@ def scale_prediction(values: Depth, gt: Depth, scale_by: str) -> tuple[Depth, Fi
     """
     if scale_by == "none":
         return values, None
-    both, in_disparity = (gt > 0) & (values > 0), scale_by == "affine-disparity"
+    both = (gt > 0) & (values > 0)
+    in_disparity = scale_by == "affine-disparity"
     if np.count_nonzero(both) < 2:
         raise InputError(f"--scale-by {scale_by} needs 2 pixels with ground truth and prediction")
-    p, g = values[both].astype(np.float64), gt[both].astype(np.float64)
+    p = values[both].astype(np.float64)
+    g = gt[both].astype(np.float64)
     if scale_by == "median":
-        factor, shift = float(np.median(g) / np.median(p)), 0.0
+        factor = float(np.median(g) / np.median(p))
+        shift = 0.0
     elif p.min() == p.max():
         raise InputError("the prediction is constant, so that no scale and shift can be fitted")
     else:

@@ -41,9 +41,12 @@ def with_adapted_weights(
         UsageError: The network takes no points.
         KeyboardInterrupt: The listener stops the batch.
     """
-    request, result = own.request, dict[str, Records]()
+    request = own.request
+    result = dict[str, Records]()
     for sequence, indices in sequences_of(frames).items():
-        weights = request.output / "adapted" / f"{quote(sequence, safe='') or 'frames'}.safetensors"
+        # A sequence is learnt from once, and its weights lie in a file of its name.
+        name = quote(sequence, safe="") or "frames"
+        weights = request.output / "adapted" / f"{name}.safetensors"
         named = f"{sequence}: " if sequence else ""
         spread = np.linspace(0, len(indices) - 1, min(len(indices), MOST_FRAMES)).round()
         lessons = [request_of(request, frames[indices[int(number)]]) for number in spread]
@@ -51,12 +54,13 @@ def with_adapted_weights(
             why = _learn_once(own, lessons, weights, listener)
         except (InputError, DivergedError) as error:
             why = str(error)
-        records, said = own, f"the network's own weights are used: {why}"
         if why is None:
-            said = f"{len(indices):,} frames are refined with {weights}"
+            listener.say(f"adapt: {named}{len(indices):,} frames are refined with {weights}")
             refine = replace(request.refine, checkpoint=weights)
             records = Records(replace(request, refine=refine))
-        listener.say(f"adapt: {named}{said}")
+        else:
+            listener.say(f"adapt: {named}the network's own weights are used: {why}")
+            records = own
         result |= dict.fromkeys([frames[index].name for index in indices], records)
     return result
 
@@ -65,9 +69,13 @@ def _learn_once(
     own: Records, lessons: Sequence[RefineRequest], weights: Path, listener: Listener
 ) -> str | None:
     """Writes adapted weights unless these are there; returns why they are not used."""
-    files = [{part: fingerprint(p).sha256 for part, p in input_files(each)} for each in lessons]
+    # They are there if they were learnt with these settings, from these files.
+    files = [
+        {name: fingerprint(path).sha256 for name, path in input_files(lesson)} for lesson in lessons
+    ]
     text = json.dumps([own.settings, files], sort_keys=True)
-    digest, file = hashlib.sha256(text.encode()).hexdigest(), weights.with_suffix(".json")
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    file = weights.with_suffix(".json")
     record: dict[str, str | None] = read_json(file) if file.exists() else {}
     if record.get("digest") != digest or not (record.get("why") or weights.exists()):
         record = {"digest": digest, "why": _learn(lessons, weights, listener)}
@@ -90,12 +98,13 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
             raise KeyboardInterrupt
 
     # The network learns from the frames, if they are enough.
-    asked, first = lessons[0], read_requested(lessons[0])
+    asked = lessons[0]
+    first = read_requested(asked)
     if why := too_little(len(lessons), first):
         return why
     network = load_network(asked.model, asked.checkpoint, asked.device)
     network = resolve_definition(network, first.registered())
-    frames = ((each.files.name, read_requested(each)) for each in lessons)
+    frames = ((lesson.files.name, read_requested(lesson)) for lesson in lessons)
     try:
         learnt = learn(network, frames, seed=asked.method.seed, on_step=check)
     except UsageError as error:

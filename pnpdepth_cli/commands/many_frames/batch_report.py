@@ -47,9 +47,18 @@ _LABELS = {
 """Titles of the panels of a figure, by the view of the page."""
 _CHANGE = "change"
 _SETTINGS = (
-    *("model", "layer", "iterations", "lr", "loss", "update", "align", "propagate", "holdout"),
+    "model",
+    "layer",
+    "iterations",
+    "lr",
+    "loss",
+    "update",
+    "align",
+    "propagate",
+    "holdout",
     "seed",
 )
+"""The settings that the page lists, in this order."""
 
 
 def check_batch_report(request: BatchRequest, folder: Path) -> None:
@@ -59,13 +68,12 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
         request: Request of the batch.
         folder: Folder of the report.
     """
-    inside = Path(os.path.realpath(folder))
-    output = Path(os.path.realpath(request.output))
-    if output.is_relative_to(inside):
-        own = request.output / "report"
-        raise OutputError(f"{folder} holds the results; name another folder, such as {own}")
-    source, overwrite = _source(request, folder), request.refine.overwrite
-    report.check_report_folder(folder, source, overwrite=overwrite)
+    if Path(os.path.realpath(request.output)).is_relative_to(os.path.realpath(folder)):
+        raise OutputError(
+            f"{folder} holds the results; name another folder, such as {request.output / 'report'}"
+        )
+    source = _source(request, folder)
+    report.check_report_folder(folder, source, overwrite=request.refine.overwrite)
 
 
 def write_batch_report(
@@ -79,21 +87,25 @@ def write_batch_report(
         summary: The batch's summary.
         records: The records of the frames.
     """
+    # What is measured, and on what.
     results = [(frame, frame.result) for frame in records if frame.result is not None]
     basis = next(iter(bases_of(summary.errors)), USED)
-    columns, notes = _columns(basis, summary.unit), [*summary.notes]
+    columns = _columns(basis, summary.unit)
+    notes = [*summary.notes]
     if summary.unmatched:
-        unmatched = f"{len(summary.unmatched):,} files"
-        notes.append(f"warning: {unmatched} are in no frame; summary.json has them")
+        notes.append(
+            f"warning: {len(summary.unmatched):,} files are in no frame; summary.json has them"
+        )
     if results and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
+    # What the page shows of all frames, and what its script sorts and draws by.
     keys = [measure.key for measure in columns]
     page = {
         "title": summary.output,
         "facts": _facts(summary, results[0][1].settings if results else {}),
         "notes": notes,
         "tables": means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
-        "without": [(each.name, each.message or "") for each in records if each.result is None],
+        "without": [(frame.name, frame.message or "") for frame in records if frame.result is None],
     }
     data = {
         "columns": [measure.to_json() for measure in columns],
@@ -102,6 +114,7 @@ def write_batch_report(
         "unit": summary.unit,
     }
 
+    # A frame a time, so that memory does not grow with their number.
     def entries(images: Path) -> Iterator[dict[str, object]]:
         for frame, result in results:
             views = _views(frame.name, result, request, images)
@@ -166,13 +179,16 @@ def _views(
 def _columns(basis: str, unit: str) -> list[Measure]:
     """Errors before and after on a basis; with changes unless it is the points used."""
     columns = []
-    for m in choose_measures(MEASURES, ("mae",) if basis == VALIDATION else ("rmse", "mae")):
-        change, *stages = (
-            replace(m, key=f"{m.key}_{part}", title=f"{m.title} {part}", unit=unit)
-            for part in (_CHANGE, BEFORE, AFTER)
+    for measure in choose_measures(MEASURES, ("mae",) if basis == VALIDATION else ("rmse", "mae")):
+        change, before, after = (
+            replace(
+                measure, key=f"{measure.key}_{column}", title=f"{measure.title} {column}", unit=unit
+            )
+            for column in (_CHANGE, BEFORE, AFTER)
         )
-        change = replace(change, unit="", percent=True, decimals=1)
-        columns += stages if basis == USED else [change, *stages]
+        if basis != USED:
+            columns.append(replace(change, unit="", percent=True, decimals=1))
+        columns += [before, after]
     return columns
 
 

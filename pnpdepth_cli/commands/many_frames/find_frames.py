@@ -14,7 +14,13 @@ import numpy as np
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset import frame_files
-from pnpdepth_cli.dataset.frame_files import FrameFiles, Neighbour, as_pose, groups_of
+from pnpdepth_cli.dataset.frame_files import (
+    FrameFiles,
+    Neighbour,
+    Unmatched,
+    as_pose,
+    groups_of,
+)
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.file_record import file_and_part
@@ -24,8 +30,10 @@ from pnpdepth_cli.io.file_bytes import one_line
 from pnpdepth_cli.io.poses import POSES_FILE, poses_of_frames
 from pnpdepth_cli.protocols import find_protocol
 
-CSV, JSON = "summary.csv", "summary.json"
-_SEARCHED = 3  # frames of a sequence, of which it is searched how image and points belong together
+CSV = "summary.csv"
+JSON = "summary.json"
+_SEARCHED = 3
+"""Frames of a sequence of which it is searched how image and points belong together."""
 ESTIMATED = "estimated from the images"
 """Where the motion of frames without poses is from."""
 
@@ -52,29 +60,13 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         UsageError: If none has sparse depth.
         OutputError: If the output is a file, or holds the frames.
     """
-    # The frames of the layout; the output must be a folder beside them.
+    # The frames of the layout, which have what a refinement needs; the output is a folder beside.
     source, output = request.source, request.output
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     layout, frames, lost = list_frames(source, request.layout)
-    parts = (part for frame in frames for part in (frame.image, frame.sparse, frame.gt))
-    folders = {source, *(frame_files.file_of(part).parent for part in parts if part is not None)}
-    if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
-        own = output / "out"
-        raise OutputError(f"{output} holds the frames; name a folder of its own, such as {own}")
-    # There must be some, with sparse depth and names that are fit for results.
-    if not frames:
-        first = " ({} {})".format(*lost[0]) if lost else ""
-        known = ", ".join(LAYOUTS)
-        raise InputError(f"{source} looks like {layout!r} but has no frame{first}; known: {known}")
-    if request.reading.sample is None and all(frame.sparse is None for frame in frames):
-        way_out = "--sample 500 draws so many points from the ground truth"
-        if all(frame.gt is None for frame in frames):
-            way_out = "nor has it ground truth to draw points from; add one of them"
-        raise UsageError(f"{source} looks like {layout!r}, which has no sparse depth; {way_out}")
-    masked = any(frame.sparse_mask is not None for frame in frames)
-    if request.refine.files.min_confidence is not None and not masked:
-        raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")
+    _check_folder(source, output, frames)
+    _check_usable(request, layout, frames, lost)
     _check_names(frames, request.refine)
     # What is read of each; poses and neighbours, of all frames.
     frames, poses = _with_poses(request, [_as_requested(request, frame) for frame in frames])
@@ -85,8 +77,9 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     number, of = request.shard or (1, 1)
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
     if not chosen:
-        fact = f"no frame of {source} has a name like {request.names!r}"
-        raise UsageError(f"{fact}; the first is {frames[0].name}")
+        raise UsageError(
+            f"no frame of {source} has a name like {request.names!r}; the first is {frames[0].name}"
+        )
     chosen = chosen[:: request.every][: request.limit][number - 1 :: of]
     if request.depth is not None:
         with_depths = _with_depths(request.depth, chosen)
@@ -100,6 +93,44 @@ def find_frames(request: BatchRequest) -> BatchFrames:
         unmatched=[f"{path} {why}" for path, why in lost if not _is_inside(path, output)],
         poses=poses,
     )
+
+
+def _check_folder(source: Path, output: Path, frames: Sequence[FrameFiles]) -> None:
+    """Raises OutputError if the output holds the frames or their files."""
+    read = (file for frame in frames for file in (frame.image, frame.sparse, frame.gt))
+    folders = {source, *(frame_files.file_of(file).parent for file in read if file is not None)}
+    if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
+        raise OutputError(
+            f"{output} holds the frames; name a folder of its own, such as {output / 'out'}"
+        )
+
+
+def _check_usable(
+    request: BatchRequest, layout: str, frames: Sequence[FrameFiles], lost: Sequence[Unmatched]
+) -> None:
+    """Raises InputError if there is no frame, and UsageError if none has what is asked for."""
+    source = request.source
+    if not frames:
+        first = ""
+        if lost:
+            path, why = lost[0]
+            first = f" ({path} {why})"
+        raise InputError(
+            f"{source} looks like {layout!r} but has no frame{first}; known: {', '.join(LAYOUTS)}"
+        )
+    if request.reading.sample is None and all(frame.sparse is None for frame in frames):
+        if all(frame.gt is None for frame in frames):
+            raise UsageError(
+                f"{source} looks like {layout!r}, which has no sparse depth; nor has it ground"
+                " truth to draw points from; add one of them"
+            )
+        raise UsageError(
+            f"{source} looks like {layout!r}, which has no sparse depth; --sample 500 draws so many"
+            " points from the ground truth"
+        )
+    has_masks = any(frame.sparse_mask is not None for frame in frames)
+    if request.refine.files.min_confidence is not None and not has_masks:
+        raise UsageError(f"no frame of {source} has a confidence mask; leave out --min-confidence")
 
 
 def _with_depths(folder: Path, frames: Sequence[FrameFiles]) -> list[FrameFiles]:
@@ -128,7 +159,8 @@ def _with_poses(
 ) -> tuple[list[FrameFiles], str | None]:
     """The frames with their poses and neighbours, and where the poses are from, as a line."""
     # Poses of a file, or the frames' own.
-    path, beside = request.poses, request.source / POSES_FILE  # as `pnpdepth frames` writes it
+    path = request.poses
+    beside = request.source / POSES_FILE  # as `pnpdepth frames` writes it
     if path is None and not any(f.pose for f in frames) and beside.is_file():
         path = beside
     source = "the layout's"
@@ -170,9 +202,9 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
         for number, index in enumerate(sequence):
             near = range(max(0, number - reach), min(number + reach + 1, len(sequence)))
             neighbours = [
-                _neighbour(frames[index], frames[sequence[other]], abs(other - number), source)
-                for other in near
-                if other != number
+                _neighbour(frames[index], frames[sequence[place]], abs(place - number), source)
+                for place in near
+                if place != number
             ]
             result[index] = replace(frames[index], neighbours=tuple(neighbours))
     return result
@@ -180,17 +212,25 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
 
 def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) -> Neighbour:
     """The other frame as a neighbour, with the motion that poses from the source give."""
-    if (other.sparse or other.gt) is None or (other.sparse is not None and other.sparse.is_dir()):
-        given = "images alone" if other.sparse is None else "a COLMAP model"
-        raise UsageError(f"{other.name}: --accumulate takes depth maps or scans, not {given}")
+    if other.sparse is not None and other.sparse.is_dir():
+        raise UsageError(
+            f"{other.name}: --accumulate takes depth maps or scans, not a COLMAP model; leave it"
+            " out"
+        )
+    if other.sparse is None and other.gt is None:
+        raise UsageError(
+            f"{other.name}: --accumulate takes depth maps or scans, not images alone; leave it out"
+        )
     if frame.pose is None or other.pose is None:
         if other.image is None:
             raise UsageError(f"{other.name}: --accumulate of frames without images needs --poses")
         return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
-    pose, other_pose = np.array(frame.pose), np.array(other.pose)
-    other_pose[:, 3] -= pose[:, 3]
-    motion = as_pose(pose[:, :3].T @ other_pose)
-    return Neighbour(files=other, motion=motion, poses=source, apart=apart)
+    # The motion is from the neighbour's coordinates to the frame's.
+    pose = np.array(frame.pose)
+    motion = np.array(other.pose)
+    motion[:, 3] -= pose[:, 3]
+    motion = pose[:, :3].T @ motion
+    return Neighbour(files=other, motion=as_pose(motion), poses=source, apart=apart)
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
@@ -222,22 +262,24 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
     # The points of its neighbours, and the images by which a motion is estimated.
-    for each in files.neighbours:
-        if (points := each.files.sparse or each.files.gt) is not None:
+    for neighbour in files.neighbours:
+        points = neighbour.files.sparse or neighbour.files.gt
+        if points is not None:
             sources[f"sparse of {points.stem}"] = points
-            sources[f"image of {points.stem}"] = each.files.image if each.motion is None else None
+            if neighbour.motion is None:
+                sources[f"image of {points.stem}"] = neighbour.files.image
     # Masks, and what calibrates the camera.
     if files.gt is not None:
         sources |= {f"mask {number}": path for number, path in enumerate(files.masks)}
     sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}
     # Of a folder, a COLMAP model or KITTI's calibrations, each file.
-    for part, source in sources.items():
+    for name, source in sources.items():
         path = None if source is None else frame_files.file_of(source)
         if path is not None and path.is_dir():
-            inside = model_files(path) if part == "sparse" else sorted(path.glob("calib_*.txt"))
-            yield from ((f"{part} {file.name}", file) for file in inside)
+            inside = model_files(path) if name == "sparse" else sorted(path.glob("calib_*.txt"))
+            yield from ((f"{name} {file.name}", file) for file in inside)
         elif path is not None:
-            yield part, path
+            yield name, path
 
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
@@ -246,7 +288,8 @@ def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
     owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
     for frame in frames:
         # Names that differ in Unicode normalisation only are one file on macOS.
-        name, shown = unicodedata.normalize("NFC", frame.name), one_line(repr(frame.name))
+        name = unicodedata.normalize("NFC", frame.name)
+        shown = one_line(repr(frame.name))
         files = [name + ending for ending in endings]
         problem = frame_files.name_problem(frame.name)
         if name.startswith(".batch"):

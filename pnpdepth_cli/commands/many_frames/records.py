@@ -35,9 +35,24 @@ from pnpdepth_cli.version import __version__
 _IMAGES = ("preview", "improvement")
 """Kinds of outputs for a person, which may be deleted."""
 _NO_SETTINGS = (
-    *("name", "group", "image", "sparse", "sparse_mask", "gt", "masks", "calib", "extrinsics"),
-    *("pose", "neighbours", "model", "more_models", "checkpoint", "output", "overwrite"),
-    *("view_3d", "is_first"),
+    "name",
+    "group",
+    "image",
+    "sparse",
+    "sparse_mask",
+    "gt",
+    "masks",
+    "calib",
+    "extrinsics",
+    "pose",
+    "neighbours",
+    "model",
+    "more_models",
+    "checkpoint",
+    "output",
+    "overwrite",
+    "view_3d",
+    "is_first",
 )
 """Fields that say where something lies, whose content is compared instead, or that add a file or a
 line."""
@@ -72,13 +87,16 @@ class Records:
         results = (path for frame in frames for path in self.outputs_of(frame).values())
         for path in (output / CSV, output / JSON, *results):
             if path.exists():
-                hint = "--overwrite replaces such files, -o names another folder"
-                raise OutputError(f"{path} exists, and no batch wrote it; {hint}")
+                raise OutputError(
+                    f"{path} exists, and no batch wrote it; --overwrite replaces such files, -o"
+                    " names another folder"
+                )
 
     def find(self, frame: FrameFiles) -> FrameRecord | str:
         """Returns the record of a frame with its present settings, or why there is none."""
         outputs = self.outputs_of(frame)
         if not outputs["record"].exists():
+            # The record is removed before the other files are written again.
             return "interrupted" if any(path.exists() for path in outputs.values()) else "new"
         try:
             record = FrameRecord.read(outputs["record"])
@@ -95,22 +113,24 @@ class Records:
         if record.batch is None or record.status == "failed":
             return "failed before"
         # The files that were read, and those that were written.
-        inputs, known = dict(input_files(request_of(self.request, frame))), record.batch.inputs
-        if known.keys() != inputs.keys():
+        inputs = dict(input_files(request_of(self.request, frame)))
+        read = record.batch.inputs
+        if read.keys() != inputs.keys():
             return "other input files"
-        if not all(is_unchanged(path, known[part]) for part, path in inputs.items()):
+        if not all(is_unchanged(path, read[name]) for name, path in inputs.items()):
             return "input changed"
         written = [path for kind, path in self.outputs_of(frame).items() if kind not in _IMAGES]
         return None if all(path.exists() for path in written) else "result missing"
 
     def state(self, request: RefineRequest) -> BatchState:
         """Returns by what a frame is known to be done: its settings, and the files as they are."""
-        inputs = {part: fingerprint(path) for part, path in input_files(request)}
+        inputs = {name: fingerprint(path) for name, path in input_files(request)}
         return BatchState(settings=self._digest(request), inputs=inputs)
 
     def fail(self, request: RefineRequest, error: Exception | None) -> FrameRecord:
         """Writes a record that says why a frame failed, and returns it."""
-        files, message = request.files, str(error)
+        files = request.files
+        message = str(error)
         if error is not None and not isinstance(error, PnpDepthError):
             line = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(line.filename).name}, line {line.lineno}"
@@ -121,7 +141,7 @@ class Records:
             status="failed",
             message=message,
             batch=BatchState(settings=self._digest(request)),
-            inputs={part: FileRecord(path=str(path)) for part, path in input_files(request)},
+            inputs={name: FileRecord(path=str(path)) for name, path in input_files(request)},
         )
         path = self.outputs_of(files)["record"]
         make_folder(path.parent, below=self.request.output)
@@ -130,10 +150,12 @@ class Records:
 
     def _digest(self, request: RefineRequest) -> str:
         """The SHA-256 of the settings that decide the frame's result."""
-        own = self.settings | _settings_of(request)
-        if request.files.pose is not None:  # to a micrometre, as processors round differently
-            own["pose"] = [[round(value, 6) + 0.0 for value in row] for row in request.files.pose]
-        text = json.dumps(own, sort_keys=True)
+        settings = self.settings | _settings_of(request)
+        pose = request.files.pose
+        if pose is not None:
+            # To a micrometre, as processors round differently; + 0.0 makes 0 of −0.
+            settings["pose"] = [[round(value, 6) + 0.0 for value in row] for row in pose]
+        text = json.dumps(settings, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -144,7 +166,7 @@ def _settings_of(request: RefineRequest) -> dict[str, object]:
         values |= vars(value) if name in GROUPS else {name: value}
     values = {name: value for name, value in values.items() if name not in _NO_SETTINGS}
     if neighbours := request.files.neighbours:
-        values["neighbours"] = [(other.motion, other.apart) for other in neighbours]
+        values["neighbours"] = [(neighbour.motion, neighbour.apart) for neighbour in neighbours]
     # Devices of one kind give equal results, so shards may use one each.
     values["device"] = request.device.split(":")[0]
     scan = asdict(request.reading.scan).items()

@@ -41,10 +41,13 @@ DECIDING = 16
 """Number of frames that decide together how images are moved to the points."""
 
 _CONNECT_S = 5.0
+"""Seconds for a cluster to answer."""
 _FRAMES_OF_A_CALL = 8
 """Frames that are read and written beside the network; fewer where that leaves workers idle."""
-_TRIES = 3  # how often a frame is tried whose worker dies
-_DEATHS = 2 * _TRIES  # so many deaths before any frame is refined end the batch
+_TRIES = 3
+"""How often a frame is tried whose worker dies."""
+_DEATHS = 2 * _TRIES
+"""Deaths of workers, before any frame is refined, that end the batch."""
 
 
 def refine_all(
@@ -152,6 +155,7 @@ def _refine_frames(
     the settings before any frame was refined.
     """
 
+    # In threads: read a frame, with what identifies its files.
     def read(files: FrameFiles) -> _Work:
         work = _Work(request=request_of(records.request, files))
         with work.step("read"):
@@ -159,6 +163,7 @@ def _refine_frames(
             work.frame = read_requested(work.request)
         return work
 
+    # In this thread: refine it. Once a frame was refined, no error of another is of all.
     def refine(reading: Iterable[_Work]) -> Iterator[_Work]:
         proven = worked or method is None
         for work in reading:
@@ -175,6 +180,7 @@ def _refine_frames(
                 raise work.error
             yield work
 
+    # In threads again: write the result, or why there is none.
     def write(work: _Work) -> FrameRecord:
         request, error = work.request, work.error
         if work.refined is not None and work.frame is not None and method is not None:
@@ -222,13 +228,22 @@ class Worker:
         request = self.records.request
         for path in (self.folder / request.source, self.folder / request.output):
             if not path.exists():
-                node = socket.gethostname()
-                raise DeviceError(f"node {node} does not see {path}; all nodes must share it")
+                raise DeviceError(
+                    f"node {socket.gethostname()} does not see {path}; all nodes must share it"
+                )
         os.chdir(self.folder)
         torch.set_num_threads(self.threads)
         cv2.setNumThreads(self.threads)
         set_max_pixels(self.max_pixels)
         return self.stack.enter_context(_open_method(request, self.deciding))
+
+
+@dataclass(kw_only=True)
+class _Call:
+    """Frames that one worker refines, and how often a worker died of them."""
+
+    frames: Sequence[FrameFiles]
+    deaths: int = 0
 
 
 def _refine_on_workers(
@@ -243,20 +258,19 @@ def _refine_on_workers(
     A worker that dies is replaced, and its frames are tried again one by one, by any worker.
     """
     with _connected(records.request.ray or LOCAL) as ray:
-        count, start = _plan(ray, deciding, records)
-        count = min(count, len(to_do))
+        devices, start = _plan(ray, deciding, records)
+        count = min(devices, len(to_do))
         listener.say(f"Ray: {count:,} workers")
-        # The parts of a call, and how often their worker died. The first is a single frame.
-        size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * count)))
-        parts = [to_do[:1], *(to_do[i : i + size] for i in range(1, len(to_do), size))]
-        waiting = deque((part, 0) for part in parts)
-        idle, deaths = [start() for _ in range(count)], 0
-        running = dict[Any, tuple[Any, Sequence[FrameFiles], int]]()
+        waiting = deque(_calls(to_do, count))
+        idle = [start() for _ in range(count)]
+        running = dict[Any, tuple[Any, _Call]]()
+        deaths = 0
         while True:
             # Until a frame is refined, only one worker has a call, as its error may be of all.
             while idle and waiting and (worked or not running) and not listener.stopped():
-                worker, (part, tries) = idle.pop(), waiting.popleft()
-                running[worker.refine.remote(part, worked)] = worker, part, tries
+                worker = idle.pop()
+                call = waiting.popleft()
+                running[worker.refine.remote(call.frames, worked)] = worker, call
             if not running:
                 return
             # Workers without a call end, and leave their device to those that have one.
@@ -264,24 +278,46 @@ def _refine_on_workers(
                 ray.kill(idle.pop())
             # The end of any call.
             (ended, *_), _ = ray.wait([*running])
-            worker, part, tries = running.pop(ended)
+            worker, call = running.pop(ended)
             try:
                 done = ray.get(ended)
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from None
             except ray.exceptions.RayError as error:
-                reason, deaths = one_line(error), deaths + 1
+                # The worker died: another one takes its place, and its frames wait again.
+                reason = one_line(error)
+                deaths += 1
                 if deaths == _DEATHS and not worked:
                     raise DeviceError(f"Ray workers die: {reason}") from None
                 listener.say(f"warning: a worker died ({reason})")
-                worker, tries = start(), tries + (len(part) == 1)
-                waiting.extend(([frame], tries) for frame in part if tries < _TRIES)
-                why = DeviceError(f"its worker died {tries} times: {reason}")
-                request = request_of(records.request, part[0])
-                done = [records.fail(request, why)] if tries == _TRIES else []
+                worker = start()
+                again, done = _after_death(call, records, reason)
+                waiting.extend(again)
             idle.append(worker)
             worked |= any(record.status != "failed" for record in done)
             yield from done
+
+
+def _calls(to_do: Sequence[FrameFiles], workers: int) -> Iterator[_Call]:
+    """Yields the frames in parts of a few; the first is one frame, which proves the network."""
+    size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * workers)))
+    yield _Call(frames=to_do[:1])
+    for first in range(1, len(to_do), size):
+        yield _Call(frames=to_do[first : first + size])
+
+
+def _after_death(
+    call: _Call, records: Records, reason: str
+) -> tuple[list[_Call], list[FrameRecord]]:
+    """The calls that follow when a worker died, and the record of a frame that is given up.
+
+    Only a frame that was alone in its call is known to be what the worker died of.
+    """
+    deaths = call.deaths + 1 if len(call.frames) == 1 else call.deaths
+    if deaths < _TRIES:
+        return [_Call(frames=[frame], deaths=deaths) for frame in call.frames], []
+    error = DeviceError(f"its worker died {deaths} times: {reason}")
+    return [], [records.fail(request_of(records.request, call.frames[0]), error)]
 
 
 def _plan(
@@ -289,7 +325,8 @@ def _plan(
 ) -> tuple[int, Callable[[], Any]]:
     """Returns the number of devices of the cluster, and a function that starts a worker on one."""
     # A GPU has its share of the cores; Ray has libraries use as many threads.
-    device, total = records.request.refine.device, ray.cluster_resources()
+    device = records.request.refine.device
+    total = ray.cluster_resources()
     gpus = device == "cuda"
     devices = int(total.get("GPU" if gpus else "CPU", 0))
     if not devices:
@@ -323,9 +360,10 @@ def _connected(address: str) -> Iterator[ModuleType]:
             socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (Exception, SystemExit) as error:
-        hint = "check the address, start it with `ray start --head`, or leave the address out"
-        why = one_line(error)
-        raise DeviceError(f"Ray cluster {address!r} cannot be used: {why}; {hint}") from None
+        raise DeviceError(
+            f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"
+            " it with `ray start --head`, or leave the address out"
+        ) from None
     try:
         yield ray
     finally:

@@ -36,8 +36,10 @@ def parse_address(text: str) -> str:
     """Returns the address of a cluster. Raises UsageError for a text that is none."""
     if text in (LOCAL, "auto") or _ADDRESS.fullmatch(text):
         return text
-    hint = "give --ray=auto, --ray=HOST:PORT, or --ray as the last option for this machine"
-    raise UsageError(f"{text!r} is no address of a Ray cluster; {hint}")
+    raise UsageError(
+        f"{text!r} is no address of a Ray cluster; give --ray=auto, --ray=HOST:PORT, or --ray as"
+        " the last option for this machine"
+    )
 
 
 @dataclass

@@ -25,6 +25,7 @@ from pnpdepth_cli.settings import option
 WITHOUT_SPARSE = "; without the pixels of sparse points"
 """What titles of tables say where the pixels of input points are excluded."""
 _DELTA = 1.25
+"""D of the usual thresholds D, D², D³ of δ1…δ3 (Eigen et al. 2014)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,4 +155,5 @@ class EvalRequest:
         changed = self.rules != find_protocol(self.protocol) or self.delta != _DELTA
         rules = self.scoring.items()
         texts = (f"{name} {value}" for name, value in rules if value not in (None, False, "none"))
-        return f"{self.protocol}{' (changed)' * changed}: {', '.join(texts)}; mean over the images"
+        name = f"{self.protocol} (changed)" if changed else self.protocol
+        return f"{name}: {', '.join(texts)}; mean over the images"

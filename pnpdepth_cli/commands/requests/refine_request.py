@@ -94,16 +94,18 @@ class RefineRequest:
         changes = {}
         for group in GROUPS:
             own = getattr(self, group)
-            names = values.keys() & {each.name for each in fields(own)}
+            names = values.keys() & {declared.name for declared in fields(own)}
             changes[group] = replace(own, **{name: values.pop(name) for name in names})
         return replace(self, **changes, **values)
 
     def outputs_in(self, folder: Path, name: str) -> Outputs:
         """Returns the files of a result in a folder; slashes in the name are subfolders."""
-        asked = {"view": self.view_3d}
-        asked |= dict.fromkeys(("sigma", "valid"), self.uncertainty)
-        endings = endings_of(f".{self.format}")
-        return {k: folder / f"{name}{end}" for k, end in endings.items() if asked.get(k, True)}
+        asked = {"view": self.view_3d, "sigma": self.uncertainty, "valid": self.uncertainty}
+        return {
+            kind: folder / f"{name}{end}"
+            for kind, end in endings_of(f".{self.format}").items()
+            if asked.get(kind, True)
+        }
 
 
 def endings_of(suffix: str) -> dict[str, str]:

@@ -1,10 +1,11 @@
-"""Data set layouts: which one a folder is, and its frames; `TABLE` has them by name.
+"""Data set layouts: which one a folder is, and its frames.
 
     layout, frames, unmatched = list_frames(Path("KITTI/object"))     # layout guessed
     layout, frames, unmatched = list_frames(Path("frames"), "pairs")  # layout named
 
-A new layout is a row of `TABLE`, or another `Layout` in it, with its name in `choices.LAYOUTS`; or
-an entry point of the group `pnpdepth.layouts`. docs/guides/many-frames.md shows the folders of all.
+`choices.LAYOUTS` says where each is. A new layout is a row here, or a `Layout` in a file of this
+folder, and its line there; or an entry point of the group `pnpdepth.layouts`.
+docs/guides/many-frames.md shows the folders of all.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from pathlib import Path
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, check_path
-from pnpdepth_cli.dataset.layouts import indexed, kitti, manifest
 from pnpdepth_cli.dataset.layouts.layout import Layout, row
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import read_bytes
@@ -38,96 +38,92 @@ def _of_void(place: Path) -> Callable[[FrameFiles], FrameFiles | None]:
     return lambda frame: frame if frame.name in wanted else None
 
 
-TABLE: dict[str, Layout] = {
-    "manifest": manifest.MANIFEST,
-    "kitti-odometry": kitti.ODOMETRY,
-    "kitti-depth": kitti.DEPTH,
-    "kitti-raw": kitti.RAW,
-    "tum": indexed.TUM,
-    "colmap": indexed.COLMAP,
-    "stray-scanner": indexed.STRAY_SCANNER,
-    "record3d": indexed.RECORD3D,
-    "7scenes": row(
-        {"image": r"(frame-[^.]+)\.color.IMAGE", "gt": r"(frame-[^.]+)\.depth.png"},
-        below="|seq-*/",
-        marks=("frame-*.color.*",),
-        name=_prefix_with_place("_"),
-        calib="camera-intrinsics.txt",
-        shared=FrameFiles(gt_scale=1000.0),
-    ),
-    "arkitscenes": row(
-        {
-            "image": "wide|color|lowres_wide/*.png",
-            "sparse": "lowres_depth/*.png",
-            "sparse_mask": "confidence/*.png?",
-            "gt": "highres_depth/*.png?",
-        },
-        below="|*/|*/*/",
-        name=_prefix_with_place("/"),
-        shared=FrameFiles(sparse_scale=1000.0, gt_scale=1000.0, gt_other_size=True, one_view=True),
-    ),
-    "diode": row(
-        {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
-        below="|*/|*/*/|*/*/*/|*/*/*/*/",
-        marks=("*_depth_mask.npy", "*_depth.npy"),
-    ),
-    "eth3d": row(
-        {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
-        below="|*/|*/*/",
-        marks=("ground_truth_depth",),
-        name=_prefix_with_place("/"),
-    ),
-    "ibims": row(
-        {
-            "image": "rgb/*.png",
-            "gt": "depth/*.png",
-            "mask": "mask_invalid/*.png?",
-            "mask of transparent things": "mask_transp/*.png?",
-        },
-        marks=("mask_invalid", "mask_transp"),
-        shared=FrameFiles(gt_scale=65535 / 50),
-    ),
-    "image-depth": row(
-        {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"}, calib="calib.txt"
-    ),
-    "kitti-object": row(
-        {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
-        below="|training/|testing/",
-        name=_prefix_with_place("_"),
-        shared=FrameFiles(camera=2),
-    ),
-    "pairs": row(
-        {
-            "image": "rgb/**.IMAGE",
-            "sparse": "sparse/**.SPARSE",
-            "gt": "gt/**.DEPTH?",
-            "calib": "calib/**.CALIB?",
-        },
-        calib="calib.txt",
-    ),
-    "scannet": row(
-        {"image": "color/*.IMAGE", "gt": "depth/*.png"},
-        below="|*/|*/*/",
-        marks=("intrinsic",),
-        name=_prefix_with_place("/"),
-        calib="intrinsic/intrinsic_color.txt",
-        shared=FrameFiles(gt_scale=1000.0, gt_other_size=True),
-    ),
-    "void": row(
-        {
-            "image": "image/*.png",
-            "sparse": "sparse_depth/*.png",
-            "sparse_mask": "validity_map/*.png?",
-            "gt": "ground_truth/*.png?",
-        },
-        below="|*/|data/*/|*/data/*/",
-        marks=("sparse_depth", "ground_truth"),
-        calib="K.txt",
-        more=_of_void,
-        shared=FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True),
-    ),
-}
-"""The layouts of this package, which `choices.LAYOUTS` lists in the order of guessing."""
+SEVEN_SCENES = row(
+    {"image": r"(frame-[^.]+)\.color.IMAGE", "gt": r"(frame-[^.]+)\.depth.png"},
+    below="|seq-*/",
+    marks=("frame-*.color.*",),
+    name=_prefix_with_place("_"),
+    calib="camera-intrinsics.txt",
+    shared=FrameFiles(gt_scale=1000.0),
+)
+
+ARKITSCENES = row(
+    {
+        "image": "wide|color|lowres_wide/*.png",
+        "sparse": "lowres_depth/*.png",
+        "sparse_mask": "confidence/*.png?",
+        "gt": "highres_depth/*.png?",
+    },
+    below="|*/|*/*/",
+    name=_prefix_with_place("/"),
+    shared=FrameFiles(sparse_scale=1000.0, gt_scale=1000.0, gt_other_size=True, one_view=True),
+)
+
+DIODE = row(
+    {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
+    below="|*/|*/*/|*/*/*/|*/*/*/*/",
+    marks=("*_depth_mask.npy", "*_depth.npy"),
+)
+
+ETH3D = row(
+    {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
+    below="|*/|*/*/",
+    marks=("ground_truth_depth",),
+    name=_prefix_with_place("/"),
+)
+
+IBIMS = row(
+    {
+        "image": "rgb/*.png",
+        "gt": "depth/*.png",
+        "mask": "mask_invalid/*.png?",
+        "mask of transparent things": "mask_transp/*.png?",
+    },
+    marks=("mask_invalid", "mask_transp"),
+    shared=FrameFiles(gt_scale=65535 / 50),
+)
+
+IMAGE_DEPTH = row({"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"}, calib="calib.txt")
+
+KITTI_OBJECT = row(
+    {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
+    below="|training/|testing/",
+    name=_prefix_with_place("_"),
+    shared=FrameFiles(camera=2),
+)
+
+PAIRS = row(
+    {
+        "image": "rgb/**.IMAGE",
+        "sparse": "sparse/**.SPARSE",
+        "gt": "gt/**.DEPTH?",
+        "calib": "calib/**.CALIB?",
+    },
+    calib="calib.txt",
+)
+
+SCANNET = row(
+    {"image": "color/*.IMAGE", "gt": "depth/*.png"},
+    below="|*/|*/*/",
+    marks=("intrinsic",),
+    name=_prefix_with_place("/"),
+    calib="intrinsic/intrinsic_color.txt",
+    shared=FrameFiles(gt_scale=1000.0, gt_other_size=True),
+)
+
+VOID = row(
+    {
+        "image": "image/*.png",
+        "sparse": "sparse_depth/*.png",
+        "sparse_mask": "validity_map/*.png?",
+        "gt": "ground_truth/*.png?",
+    },
+    below="|*/|data/*/|*/data/*/",
+    marks=("sparse_depth", "ground_truth"),
+    calib="K.txt",
+    more=_of_void,
+    shared=FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True),
+)
 
 
 def list_frames(

@@ -1,6 +1,6 @@
 """What a depth file format is, and the plain arrays NPY, NPZ and PFM.
 
-`TABLE` of `pnpdepth_cli.io.depth` has all. What a file claims is checked before memory is taken.
+`pnpdepth_cli.choices.FORMATS` has all. What a file claims is checked before memory is taken.
 """
 
 from __future__ import annotations
