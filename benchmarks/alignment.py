@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.alignment_outputs import as_outputs, simulated_depth
-from benchmarks.frames import MORE_SETS, OUTLIERS, SETS, EvalFrame, opened, print_row
+from benchmarks.frames import OUTLIERS, EvalFrame, frames_of, opened, print_row
+from benchmarks.simulated import as_outputs, weakened
 from pnpdepth_cli.completion import alignment, robust_line
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates, to_space
 from pnpdepth_cli.errors import PnpDepthError
@@ -50,9 +50,6 @@ FRAMES = {
 }
 ERRORS = (0.02, 0.04, 0.09)
 """Of the simulated networks."""
-
-FARTHEST_M = 60.0
-"""7-Scenes has 65.535 m where depth is unknown."""
 
 STATED = {
     "disparity": ("inverse", "affine"),
@@ -122,16 +119,19 @@ def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated:
     return case.mae(fit.depth(torch.from_numpy(case.x)).numpy())
 
 
-def cases(data: Path, rendered: Path | None) -> Iterator[Case]:
-    """All networks on all frames."""
-    frames = {name: frames_of(name, data, count) for name, count in FRAMES.items()}
+def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterator[Case]:
+    """All networks on all frames, on at most so many of each set."""
+    frames = {
+        name: frames_of(name, data, count if most is None else min(count, most))
+        for name, count in FRAMES.items()
+    }
     if rendered is not None:
-        frames["rendered"] = list(frames_of_shards(rendered))
+        frames["rendered"] = list(frames_of_shards(rendered))[:most]
     for name, of_set in frames.items():
         for number, frame in enumerate(of_set):
             for error in ERRORS:
                 rng = np.random.default_rng([number, round(100 * error)])
-                outputs = as_outputs(simulated_depth(frame.gt, error, rng), rng)
+                outputs = as_outputs(weakened(frame.gt, error, rng), rng)
                 for output, x in outputs.items():
                     yield case_of(name, f"simulated {error:.0%}", output, x, frame.gt, rng)
     for network_name, output in SHIPPED.items():
@@ -167,15 +167,6 @@ def _drawn(known: NDArray[np.bool_], rng: np.random.Generator) -> tuple[NDArray,
     rows, columns = np.nonzero(known)
     chosen = rng.choice(len(rows), min(PIXELS, len(rows)), replace=False)
     return rows[chosen], columns[chosen]
-
-
-def frames_of(name: str, data: Path, count: int) -> list[EvalFrame]:
-    """`count` evenly spaced frames of a set."""
-    frames = list((SETS | MORE_SETS)[name](data))
-    if name == "7scenes":
-        for frame in frames:
-            frame.gt[frame.gt > FARTHEST_M] = 0
-    return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
 
 
 def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
@@ -296,11 +287,13 @@ def _without_power(
 TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
     "bounds": (alignment, "BEYOND", {"2": 2.0, "3": 3.0, "5": 5.0, "10": 10.0}),
     "width of the loss": (
-        *(robust_line, "_CAUCHY"),
+        robust_line,
+        "_CAUCHY",
         {"0.5": 0.5, "1": 1.0, "1.5": 1.5, "2.385": 2.385, "1000 (least squares)": 1000.0},
     ),
     "price of a parameter": (
-        *(alignment, "_bic"),
+        alignment,
+        "_bic",
         {
             "BIC": SHIPPED_BIC,
             "half of it": _bic(0.5),
@@ -309,7 +302,8 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
         },
     ),
     "stated kinds": (
-        *(alignment, "candidates"),
+        alignment,
+        "candidates",
         {"with a power": candidates, "without": _without_power},
     ),
 }
@@ -336,10 +330,10 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
                 inside = {n for n, case in enumerate(of) if getattr(case, field) == left_out}
                 mean = {
                     name: [
-                        np.mean([v for key, v in each.items() if (key[1] in inside) == is_inside])
+                        np.mean([v for key, v in logs.items() if (key[1] in inside) == is_inside])
                         for is_inside in (False, True)
                     ]
-                    for name, each in found.items()
+                    for name, logs in found.items()
                 }
                 chosen = min(mean, key=lambda name: mean[name][0])
                 cost = math.exp(mean[chosen][1] - mean[shipped][1])
@@ -357,9 +351,10 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, help="folder of rendered shards")
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--trial", nargs="+", choices=TRIALS, help="choose these constants again")
+    parser.add_argument("--frames", type=int, help="at most so many frames of each set")
     parser.add_argument("--every", type=int, default=1, help="only every nth case")
     args = parser.parse_args()
-    of = list(cases(args.data, args.rendered))[:: args.every]
+    of = list(cases(args.data, args.rendered, args.frames))[:: args.every]
     if args.trial:
         trial(of, args.trial, (None, args.outliers) if args.outliers else (None,))
     else:

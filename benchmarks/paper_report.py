@@ -147,7 +147,9 @@ def _steps(rows: Sequence[Result]) -> str:
         paper, tuned = (row["settings"][state] for state in STATES)
         fraction = 100 * paper["lr"] / row["std_z"]
         cells = (
-            *(f"`{row['network']}`", f"`{paper['layer']}`", f"{row['std_z']:.3g}"),
+            f"`{row['network']}`",
+            f"`{paper['layer']}`",
+            f"{row['std_z']:.3g}",
             f"{fraction:.2g} %" if fraction < 10 else f"{fraction:.0f} %",
             *(f"{how['loss_before']:.3f} → {how['loss_after']:.3f}" for how in (paper, tuned)),
             " / ".join(f"{how['frames_with_lower_mae']:.0%}" for how in (paper, tuned)),

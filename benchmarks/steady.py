@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from benchmarks.frames import MORE_SETS, SETS, EvalFrame, print_row
+from benchmarks.frames import ALL_SETS, EvalFrame, print_row
 from benchmarks.simulated import weakened
 from pnpdepth_cli.completion import gaussian_process
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates
@@ -306,7 +306,7 @@ class TiedLines:
 
 def sequence_of(name: str, data: Path, count: int | None) -> list[EvalFrame]:
     """Returns the first frames of a set, in order, of fewer rows and columns."""
-    frames = list((SETS | MORE_SETS)[name](data))[:count]
+    frames = list(ALL_SETS[name](data))[:count]
     thin = (slice(THINNED // 2, None, THINNED),) * 2
     return [
         EvalFrame(
