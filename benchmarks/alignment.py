@@ -127,6 +127,7 @@ def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterato
     }
     if rendered is not None:
         frames["rendered"] = list(frames_of_shards(rendered))[:most]
+    # Simulated networks, of every error and every kind of output.
     for name, of_set in frames.items():
         for number, frame in enumerate(of_set):
             for error in ERRORS:
@@ -134,6 +135,7 @@ def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterato
                 outputs = as_outputs(weakened(frame.gt, error, rng), rng)
                 for output, x in outputs.items():
                     yield case_of(name, f"simulated {error:.0%}", output, x, frame.gt, rng)
+    # Shipped networks, their numbers sampled at the pixels with truth.
     for network_name, output in SHIPPED.items():
         network = opened(network_name, data)
         for name, of_set in frames.items():
@@ -149,6 +151,7 @@ def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterato
                 at = prepared.points.sample(raw).double().numpy()
                 seen = prepared.points.depth.double().numpy()
                 yield Case(set=name, network=network_name, output=output, x=at, depth=seen)
+    # Stored predictions.
     for folder, output, x, gt in strong(data / "strong"):
         yield case_of("strong", folder, output, x, gt, np.random.default_rng(0))
 
@@ -186,7 +189,9 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
     def png(name: str, scale: float) -> NDArray:
         return read_depth(root / name, scale=scale).values
 
+    # 1/disparity of a network of a room.
     yield "prior_da", "inverted", npy("prior_da_nyu/0_pred.npy"), png("prior_da_nyu/0_gt.png", 1000)
+    # Disparity, as given and as its inverse was stored.
     for path in sorted((root / "weison_kitti_dav2").glob("*_pred.npy")):
         frame = path.name.removesuffix("_pred.npy")
         disparity = np.load(path).astype(float)
@@ -200,6 +205,7 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
     for path in sorted((root / "mmaj1_synthetic_dptlarge").glob("*_pred.npy")):
         gt = np.load(path.with_name(path.name.replace("pred", "gt")))
         yield "DPT-Large", "disparity", np.load(path).astype(float), gt
+    # Grey levels of pictures, clipped at both ends.
     for path in sorted((root / "nuscenes_composites").glob("*_pred_*.png")):
         frame, _, network = path.stem.split("_")
         levels = np.asarray(Image.open(path)).astype(float)
@@ -314,6 +320,7 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
     """Prints the value of each constant that is chosen with each set and network left out."""
     of = [case for case in of if case.set != "strong" and not case.set.startswith("tum")]
     print_row("constant", "value", "ratio to the shipped value, by left out", head=True)
+    # The log ratios of every case with each value of the constant.
     for constant in constants:
         module, attribute, values = TRIALS[constant]
         found = dict[str, dict[tuple, float]]()
@@ -324,6 +331,7 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
                     for kind in outliers
                     for key, ratio in ratios(of, COUNTS[:-1], 1, kind).items()
                 }
+        # Of each set and network: what the other ones choose, and what that costs on it.
         shipped = next(name for name, v in values.items() if v == getattr(module, attribute))
         for field in ("set", "network"):
             for left_out in sorted({getattr(case, field) for case in of}):

@@ -209,6 +209,7 @@ def main() -> None:
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     args = parser.parse_args()
+    # Each case in turn, its line printed as it comes.
     print_row(*HEAD, head=True)
     networks: dict[str, Network] = {}
     second = list[tuple[Any, ...]]()
@@ -238,6 +239,7 @@ def main() -> None:
             f"{means['warned']:.0%}",
             f"{means['cpu_s']:.1f}",
         )
+    # What is said of σ.
     print()
     print_row(*UNCERTAINTY_HEAD, head=True)
     for cells in second:

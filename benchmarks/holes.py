@@ -120,6 +120,7 @@ def filled(method: str, frame: EvalFrame, data: Path) -> Depth | Refined:
 
 def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores:
     """The scores of a method on frames of a set."""
+    # One thread, so that seconds of the processor can be compared.
     torch.set_num_threads(1)
     errors: dict[int, list[Depth]] = {size: [] for size in SIZES}
     within: dict[int, list[Depth]] = {size: [] for size in SIZES}
@@ -129,6 +130,7 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
     wall = 0.0
     frames = frames_of(name, data, count, half)
     for number, frame in enumerate(frames):
+        # Holes are cut, and filled by the method.
         size_of = cut_holes(frame.gt, number)
         holed = replace(frame, gt=np.where(size_of > 0, 0, frame.gt))
         start = time.process_time()
@@ -136,6 +138,7 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
         result = filled(method, holed, data)
         cpu += time.process_time() - start
         wall += time.perf_counter() - start_wall
+        # The errors in the holes, by size, and in standard deviations.
         depth = result.depth if isinstance(result, Refined) else result
         error = np.abs(depth - frame.gt)
         for size in SIZES:
@@ -146,6 +149,7 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
                 known = (size_of == size) & (frame.gt > 0)
                 within[size].append(error[known] / certain.sigma[known])
                 valid.append(certain.valid[known])
+        # What became of the measured pixels.
         difference = np.abs(depth - holed.gt)[holed.gt > 0]
         changed.append(float((difference > CHANGED).mean()))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
