@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.alignment_outputs import as_outputs, simulated_depth
-from benchmarks.frames import MORE_SETS, OUTLIERS, SETS, EvalFrame, opened, print_row
+from benchmarks.frames import OUTLIERS, EvalFrame, frames_of, opened, print_row
+from benchmarks.simulated import as_outputs, weakened
 from pnpdepth_cli.completion import alignment, robust_line
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates, to_space
 from pnpdepth_cli.errors import PnpDepthError
@@ -50,9 +50,6 @@ FRAMES = {
 }
 ERRORS = (0.02, 0.04, 0.09)
 """Of the simulated networks."""
-
-FARTHEST_M = 60.0
-"""7-Scenes has 65.535 m where depth is unknown."""
 
 STATED = {
     "disparity": ("inverse", "affine"),
@@ -122,18 +119,23 @@ def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated:
     return case.mae(fit.depth(torch.from_numpy(case.x)).numpy())
 
 
-def cases(data: Path, rendered: Path | None) -> Iterator[Case]:
-    """All networks on all frames."""
-    frames = {name: frames_of(name, data, count) for name, count in FRAMES.items()}
+def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterator[Case]:
+    """All networks on all frames, on at most so many of each set."""
+    frames = {
+        name: frames_of(name, data, count if most is None else min(count, most))
+        for name, count in FRAMES.items()
+    }
     if rendered is not None:
-        frames["rendered"] = list(frames_of_shards(rendered))
+        frames["rendered"] = list(frames_of_shards(rendered))[:most]
+    # Simulated networks, of every error and every kind of output.
     for name, of_set in frames.items():
         for number, frame in enumerate(of_set):
             for error in ERRORS:
                 rng = np.random.default_rng([number, round(100 * error)])
-                outputs = as_outputs(simulated_depth(frame.gt, error, rng), rng)
+                outputs = as_outputs(weakened(frame.gt, error, rng), rng)
                 for output, x in outputs.items():
                     yield case_of(name, f"simulated {error:.0%}", output, x, frame.gt, rng)
+    # Shipped networks, their numbers sampled at the pixels with truth.
     for network_name, output in SHIPPED.items():
         network = opened(network_name, data)
         for name, of_set in frames.items():
@@ -149,6 +151,7 @@ def cases(data: Path, rendered: Path | None) -> Iterator[Case]:
                 at = prepared.points.sample(raw).double().numpy()
                 seen = prepared.points.depth.double().numpy()
                 yield Case(set=name, network=network_name, output=output, x=at, depth=seen)
+    # Stored predictions.
     for folder, output, x, gt in strong(data / "strong"):
         yield case_of("strong", folder, output, x, gt, np.random.default_rng(0))
 
@@ -169,15 +172,6 @@ def _drawn(known: NDArray[np.bool_], rng: np.random.Generator) -> tuple[NDArray,
     return rows[chosen], columns[chosen]
 
 
-def frames_of(name: str, data: Path, count: int) -> list[EvalFrame]:
-    """`count` evenly spaced frames of a set."""
-    frames = list((SETS | MORE_SETS)[name](data))
-    if name == "7scenes":
-        for frame in frames:
-            frame.gt[frame.gt > FARTHEST_M] = 0
-    return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
-
-
 def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
     """Every second rendered frame."""
     for path in sorted(folder.glob("*.npz")):
@@ -195,7 +189,9 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
     def png(name: str, scale: float) -> NDArray:
         return read_depth(root / name, scale=scale).values
 
+    # 1/disparity of a network of a room.
     yield "prior_da", "inverted", npy("prior_da_nyu/0_pred.npy"), png("prior_da_nyu/0_gt.png", 1000)
+    # Disparity, as given and as its inverse was stored.
     for path in sorted((root / "weison_kitti_dav2").glob("*_pred.npy")):
         frame = path.name.removesuffix("_pred.npy")
         disparity = np.load(path).astype(float)
@@ -209,6 +205,7 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
     for path in sorted((root / "mmaj1_synthetic_dptlarge").glob("*_pred.npy")):
         gt = np.load(path.with_name(path.name.replace("pred", "gt")))
         yield "DPT-Large", "disparity", np.load(path).astype(float), gt
+    # Grey levels of pictures, clipped at both ends.
     for path in sorted((root / "nuscenes_composites").glob("*_pred_*.png")):
         frame, _, network = path.stem.split("_")
         levels = np.asarray(Image.open(path)).astype(float)
@@ -296,11 +293,13 @@ def _without_power(
 TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
     "bounds": (alignment, "BEYOND", {"2": 2.0, "3": 3.0, "5": 5.0, "10": 10.0}),
     "width of the loss": (
-        *(robust_line, "_CAUCHY"),
+        robust_line,
+        "_CAUCHY",
         {"0.5": 0.5, "1": 1.0, "1.5": 1.5, "2.385": 2.385, "1000 (least squares)": 1000.0},
     ),
     "price of a parameter": (
-        *(alignment, "_bic"),
+        alignment,
+        "_bic",
         {
             "BIC": SHIPPED_BIC,
             "half of it": _bic(0.5),
@@ -309,7 +308,8 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
         },
     ),
     "stated kinds": (
-        *(alignment, "candidates"),
+        alignment,
+        "candidates",
         {"with a power": candidates, "without": _without_power},
     ),
 }
@@ -320,6 +320,7 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
     """Prints the value of each constant that is chosen with each set and network left out."""
     of = [case for case in of if case.set != "strong" and not case.set.startswith("tum")]
     print_row("constant", "value", "ratio to the shipped value, by left out", head=True)
+    # The log ratios of every case with each value of the constant.
     for constant in constants:
         module, attribute, values = TRIALS[constant]
         found = dict[str, dict[tuple, float]]()
@@ -330,16 +331,17 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
                     for kind in outliers
                     for key, ratio in ratios(of, COUNTS[:-1], 1, kind).items()
                 }
+        # Of each set and network: what the other ones choose, and what that costs on it.
         shipped = next(name for name, v in values.items() if v == getattr(module, attribute))
         for field in ("set", "network"):
             for left_out in sorted({getattr(case, field) for case in of}):
                 inside = {n for n, case in enumerate(of) if getattr(case, field) == left_out}
                 mean = {
                     name: [
-                        np.mean([v for key, v in each.items() if (key[1] in inside) == is_inside])
+                        np.mean([v for key, v in logs.items() if (key[1] in inside) == is_inside])
                         for is_inside in (False, True)
                     ]
-                    for name, each in found.items()
+                    for name, logs in found.items()
                 }
                 chosen = min(mean, key=lambda name: mean[name][0])
                 cost = math.exp(mean[chosen][1] - mean[shipped][1])
@@ -357,9 +359,10 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, help="folder of rendered shards")
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--trial", nargs="+", choices=TRIALS, help="choose these constants again")
+    parser.add_argument("--frames", type=int, help="at most so many frames of each set")
     parser.add_argument("--every", type=int, default=1, help="only every nth case")
     args = parser.parse_args()
-    of = list(cases(args.data, args.rendered))[:: args.every]
+    of = list(cases(args.data, args.rendered, args.frames))[:: args.every]
     if args.trial:
         trial(of, args.trial, (None, args.outliers) if args.outliers else (None,))
     else:

@@ -30,15 +30,15 @@ import numpy as np
 import torch
 
 from benchmarks.frames import (
-    MORE_SETS,
+    HALVES,
     OUTLIERS,
     REGISTRATIONS,
-    SETS,
     Depth,
     EvalFrame,
     by_default,
     drawn_inputs,
     errors_of,
+    frames_of,
     opened,
     print_row,
     registered,
@@ -56,8 +56,13 @@ NETWORKS = {
     "7scenes": ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny"),
     "icl_nuim": ("fastdepth", "compact", "fcrn-tiny", "eigen-tiny"),
     "kitti_dc": (
-        *("fastdepth", "compact", "sparse2dense-tiny-kitti", "sfmlearner-tiny"),
-        *("pncnn", "nconv"),  # trained for KITTI's scanner
+        "fastdepth",
+        "compact",
+        "sparse2dense-tiny-kitti",
+        "sfmlearner-tiny",
+        # Trained for KITTI's scanner.
+        "pncnn",
+        "nconv",
     ),
     "tum_fr1_rpy": ("fastdepth", "compact"),
     "tum_fr3_cabinet": ("fastdepth", "compact"),
@@ -71,12 +76,27 @@ WRONG = 0.2  # fraction of the points, with `--outliers`
 LARGE_ERROR = 0.25  # of the depth
 MASKED = 0.05  # of the ground truth
 HEAD = (
-    *("network", "set, runs", "points", *STAGES, "after / linear", "worse", "weight", "no part"),
-    *("warned", "CPU s"),
+    "network",
+    "set, runs",
+    "points",
+    *STAGES,
+    "after / linear",
+    "worse",
+    "weight",
+    "no part",
+    "warned",
+    "CPU s",
 )
 UNCERTAINTY_HEAD = (
-    *("network", "set, runs", "points", *(f"within ± {k} σ" for k in MULTIPLES), "≥ 60, ≥ 90 %"),
-    *("large errors", "of these masked", "kept", "masked at 95 % kept"),
+    "network",
+    "set, runs",
+    "points",
+    *(f"within ± {k} σ" for k in MULTIPLES),
+    "≥ 60, ≥ 90 %",
+    "large errors",
+    "of these masked",
+    "kept",
+    "masked at 95 % kept",
 )
 
 
@@ -85,10 +105,13 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
     for name, networks in NETWORKS.items():
         for count in (None,) if name == "kitti_dc" else COUNTS:
             for network in networks:
-                wanted = (args.networks, network), (args.sets, name)
-                wanted += () if count is None else ((args.points, count),)
-                if all(not chosen or one in chosen for chosen, one in wanted):
-                    yield network, name, count
+                if args.networks and network not in args.networks:
+                    continue
+                if args.sets and name not in args.sets:
+                    continue
+                if args.points and count is not None and count not in args.points:
+                    continue
+                yield network, name, count
 
 
 def measure(
@@ -117,8 +140,8 @@ def measure(
 def weight_of(network: Network, refined: Refined) -> float:
     """The weight of a network in the result, its depth as another one's prior included."""
     name = network.definition.name
-    own = (name, f"compact with {name}")
-    return sum(weight for expert, weight in refined.weights.items() if expert in own)
+    experts = (name, f"compact with {name}")
+    return sum(weight for expert, weight in refined.weights.items() if expert in experts)
 
 
 def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
@@ -126,7 +149,8 @@ def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
     assert refined.sigma is not None
     assert refined.valid is not None
     known = (gt > 0) & (refined.depth > 0)
-    error, sigma = np.abs(gt - refined.depth)[known], refined.sigma[known]
+    error = np.abs(gt - refined.depth)[known]
+    sigma = refined.sigma[known]
     relative = sigma / refined.depth[known]
     large = error > LARGE_ERROR * gt[known]
     masked = ~refined.valid[known]
@@ -142,12 +166,12 @@ def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
 
 def uncertainty_cells(rows: list[dict[str, Any]]) -> list[str]:
     """The cells of a case in the second table."""
-    of = [row["uncertainty"] for row in rows]
-    within = np.array([each["within"] for each in of])
+    of_frames = [row["uncertainty"] for row in rows]
+    within = np.array([of_frame["within"] for of_frame in of_frames])
     held = ((within[:, 0] >= 0.6) & (within[:, 1] >= 0.9)).mean()
 
     def mean(name: str) -> str:
-        values = [each[name] for each in of if each[name] is not None]
+        values = [of_frame[name] for of_frame in of_frames if of_frame[name] is not None]
         return f"{np.mean(values):.1%}" if values else ""
 
     masks = (mean(name) for name in ("large", "caught", "kept", "ranked"))
@@ -157,11 +181,14 @@ def uncertainty_cells(rows: list[dict[str, Any]]) -> list[str]:
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Means over the frames of a case."""
     errors = [row["errors"] for row in rows]
-    names = [name for name in errors[0] if all(name in each for each in errors)]
+    # A stage that some frame lacks has no mean.
+    stages = [stage for stage in errors[0] if all(stage in of_frame for of_frame in errors)]
+    means = {stage: np.mean([of_frame[stage] for of_frame in errors], axis=0) for stage in stages}
+    worse = [of_frame[AFTER][0] > of_frame[LINEAR][0] for of_frame in errors]
     return {
         "frames": len(rows),
-        "mean": {n: tuple(np.mean([each[n] for each in errors], axis=0).tolist()) for n in names},
-        "worse": float(np.mean([each[AFTER][0] > each[LINEAR][0] for each in errors])),
+        "mean": {stage: tuple(mean.tolist()) for stage, mean in means.items()},
+        "worse": float(np.mean(worse)),
         "weight": float(np.mean([row["weight"] for row in rows])),
         "no_part": float(np.mean([row["weight"] < LEAST_PART for row in rows])),
         "warned": float(np.mean([row["warned"] for row in rows])),
@@ -169,17 +196,11 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def frames_of(name: str, data: Path, half: str, count: int) -> list[EvalFrame]:
-    """`count` evenly spaced frames of one half of a set."""
-    frames = list((SETS | MORE_SETS)[name](data))[{"even": 0, "odd": 1}[half] :: 2]
-    return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
-
-
 def main() -> None:
     """Measure, and print a table as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--half", choices=("even", "odd"), default="odd")
+    parser.add_argument("--half", choices=HALVES, default="odd")
     parser.add_argument("--frames", type=int, default=3, help="frames of each set")
     parser.add_argument("--seeds", type=int, default=1, help="draws of the points of each frame")
     parser.add_argument("--networks", nargs="+", help="only these")
@@ -188,30 +209,37 @@ def main() -> None:
     parser.add_argument("--outliers", choices=OUTLIERS, help="make a fifth of the points wrong")
     parser.add_argument("--registration", choices=REGISTRATIONS, default="frame")
     args = parser.parse_args()
+    # Each case in turn, its line printed as it comes.
     print_row(*HEAD, head=True)
     networks: dict[str, Network] = {}
     second = list[tuple[Any, ...]]()
     for name, set_name, count in cases(args):
         network = networks.setdefault(name, opened(name, args.data))
-        frames = frames_of(set_name, args.data, args.half, args.frames)
+        frames = frames_of(set_name, args.data, args.frames, args.half)
         rows = [
             measure(network, frame, count, seed, args.outliers)
             for seed in range(args.seeds if count else 1)
             for frame in registered(frames, count, seed, args.registration)
         ]
-        of = summary(rows)
+        means = summary(rows)
         *errors, result = (
             f"{mae:.4f} / {rmse:.3f}" if mae is not None else ""
-            for mae, rmse in (of["mean"].get(stage, (None, None)) for stage in STAGES)
+            for mae, rmse in (means["mean"].get(stage, (None, None)) for stage in STAGES)
         )
-        case = (name, f"{set_name}, {of['frames']}", count or "LiDAR")
+        case = (name, f"{set_name}, {means['frames']}", count or "LiDAR")
         second.append((*case, *uncertainty_cells(rows)))
         print_row(
-            *(*case, *errors, f"**{result}**"),
-            f"{of['mean'][AFTER][0] / of['mean'][LINEAR][0]:.3f}",
-            *(f"{of['worse']:.0%}", f"{of['weight']:.0%}", f"{of['no_part']:.0%}"),
-            *(f"{of['warned']:.0%}", f"{of['cpu_s']:.1f}"),
+            *case,
+            *errors,
+            f"**{result}**",
+            f"{means['mean'][AFTER][0] / means['mean'][LINEAR][0]:.3f}",
+            f"{means['worse']:.0%}",
+            f"{means['weight']:.0%}",
+            f"{means['no_part']:.0%}",
+            f"{means['warned']:.0%}",
+            f"{means['cpu_s']:.1f}",
         )
+    # What is said of σ.
     print()
     print_row(*UNCERTAINTY_HEAD, head=True)
     for cells in second:

@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,8 +44,16 @@ COMPARED = ("by hand", "ours", "ours, one frame", "by hook", "paper's code")
 Inputs = tuple[Tensor, ...]
 
 
-def setup(case: Case) -> tuple[nn.Module, Inputs, SparsePoints]:
-    """The network in eval mode, its inputs, and points of them."""
+class Prepared(NamedTuple):
+    """What all variants refine."""
+
+    network: nn.Module  # in eval mode
+    inputs: Inputs
+    points: SparsePoints
+
+
+def setup(case: Case) -> Prepared:
+    """The network, its inputs, and points of them."""
     torch.manual_seed(0)
     network = case.network()
     height, width = case.size
@@ -58,7 +67,7 @@ def setup(case: Case) -> tuple[nn.Module, Inputs, SparsePoints]:
         points.scatter() if channels == 1 else torch.rand(1, channels, *case.size)
         for channels in case.channels
     )
-    return network, inputs, points
+    return Prepared(network, inputs, points)
 
 
 def output_points(case: Case, points: SparsePoints) -> Callable[[Tensor], Tensor]:
@@ -166,10 +175,12 @@ def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
 def measure(case: Case, runs: int) -> dict[str, float | str]:
     """Medians of every variant, taken in turn, and the ratios."""
     with variants(case) as todo:
+        # All variants give the same, bit for bit.
         results = [todo[name]() for name in COMPARED]
         for name, result in zip(COMPARED, results, strict=True):
             assert torch.equal(results[0], result), f"{case.name}: {name} differs"
         spent = in_turn(todo, runs)
+    # Times over that of a forward pass, and paired with each other.
     median = {name: statistics.median(times) for name, times in spent.items()}
     limit = (median["front"] + (2 * ITERATIONS + 1) * median["rear"]) / (
         median["front"] + median["rear"]

@@ -87,10 +87,11 @@ def written_folder(folder: Path, kind: str, config: dict[str, Any], processing: 
     settings = transformers.AutoConfig.for_model(kind, **config)
     network = transformers.AutoModelForDepthEstimation.from_config(settings)
     last = None
-    for part in network.modules():
-        if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
-            part.reset_parameters()
-            last = part if isinstance(part, nn.Conv2d) and part.out_channels == 1 else last
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            layer.reset_parameters()
+        if isinstance(layer, nn.Conv2d) and layer.out_channels == 1:
+            last = layer
     assert last is not None
     nn.init.constant_(last.bias, HEAD_BIAS)
     network.save_pretrained(folder)
@@ -132,10 +133,14 @@ class Block(nn.Module):
         inner = 6 * inputs
         self.skips = inputs == outputs and stride == 1
         self.body = nn.Sequential(
-            *(nn.Conv2d(inputs, inner, 1, bias=False), nn.BatchNorm2d(inner), nn.ReLU6()),
+            nn.Conv2d(inputs, inner, 1, bias=False),
+            nn.BatchNorm2d(inner),
+            nn.ReLU6(),
             nn.Conv2d(inner, inner, 3, stride, 1, groups=inner, bias=False),
-            *(nn.BatchNorm2d(inner), nn.ReLU6()),
-            *(nn.Conv2d(inner, outputs, 1, bias=False), nn.BatchNorm2d(outputs)),
+            nn.BatchNorm2d(inner),
+            nn.ReLU6(),
+            nn.Conv2d(inner, outputs, 1, bias=False),
+            nn.BatchNorm2d(outputs),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -252,11 +257,11 @@ def main() -> None:
     median: Callable[[list[float]], float] = statistics.median
     with tempfile.TemporaryDirectory() as name:
         for case in cases(Path(name), args.fastdepth):
-            if args.only and not any(part in case.name for part in args.only):
+            if args.only and not any(word in case.name for word in args.only):
                 continue
             spent = measure(case, Path(name), args.runs)
-            cpu = {kind: median([each.cpu_s for each in all_]) for kind, all_ in spent.items()}
-            wall = median([each.wall_s for each in spent["first"]])
+            cpu = {kind: median([of_run.cpu_s for of_run in runs]) for kind, runs in spent.items()}
+            wall = median([of_run.wall_s for of_run in spent["first"]])
             texts = [f"{cpu[kind]:.2f} s" for kind in ("bare", "first", "second")]
             print_row(case.name, *texts, f"{cpu['first'] / cpu['bare']:.1f}", f"{wall:.1f} s")
 

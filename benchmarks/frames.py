@@ -105,6 +105,23 @@ MORE_SETS: dict[str, Callable[[Path], Iterator[EvalFrame]]] = {
     "realsense": rgbd("realsense_unregistered", 1000),
 }
 """Sets on which nothing was chosen."""
+ALL_SETS = SETS | MORE_SETS
+HALVES = {"even": slice(0, None, 2), "odd": slice(1, None, 2)}
+"""Constants were chosen on the even frames of a set; the odd ones are for reporting."""
+
+
+def frames_of(name: str, data: Path, count: int, half: str | None = None) -> list[EvalFrame]:
+    """`count` evenly spaced frames of a set, or of one of its `HALVES`; none if it is not there."""
+    if not (data / name).is_dir():
+        return []
+    frames = list(ALL_SETS[name](data))
+    return evenly(frames if half is None else frames[HALVES[half]], count)
+
+
+def evenly(frames: Sequence[EvalFrame], count: int) -> list[EvalFrame]:
+    """`count` evenly spaced frames, the first and the last among them; all if they are fewer."""
+    places = np.linspace(0, len(frames) - 1, min(count, len(frames)))
+    return [frames[round(place)] for place in places]
 
 
 def without_occluded(frame: EvalFrame) -> EvalFrame:
@@ -130,12 +147,14 @@ def registered(
     """The frames with how their images are moved into the frame of these points by the program."""
     if how == "off":
         return list(frames)
-    known = [evidence(each.rgb, each.points(count, seed).tensors()) for each in frames]
+    seen = [evidence(frame.rgb, frame.points(count, seed).tensors()) for frame in frames]
     if how == "set":
-        found = [estimate_registration([known[i] for i in spread(len(known))])] * len(frames)
+        together = estimate_registration([seen[number] for number in spread(len(seen))])
+        found = [together] * len(frames)
     else:
-        found = [estimate_registration([each]) for each in known]
-    return [replace(frame, register=one) for frame, one in zip(frames, found, strict=True)]
+        found = [estimate_registration([of_frame]) for of_frame in seen]
+    pairs = zip(frames, found, strict=True)
+    return [replace(frame, register=registration) for frame, registration in pairs]
 
 
 def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:

@@ -124,7 +124,8 @@ def adnn_front(network: Adnn, sparse: Tensor) -> Any:
 
 
 def adnn_rear(network: Adnn, z: Tensor, kept: Any) -> Tensor:
-    for kernel, size in zip(*(reversed(part) for part in kept), strict=True):
+    kernels, sizes = kept
+    for kernel, size in zip(reversed(kernels), reversed(sizes), strict=True):
         z = adnn.synthesised(z, kernel, size)
     return z
 

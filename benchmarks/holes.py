@@ -30,8 +30,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.default import frames_of
-from benchmarks.frames import Depth, EvalFrame, drawn_inputs, opened, print_row
+from benchmarks.frames import (
+    HALVES,
+    Depth,
+    EvalFrame,
+    drawn_inputs,
+    frames_of,
+    opened,
+    print_row,
+)
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
@@ -113,6 +120,7 @@ def filled(method: str, frame: EvalFrame, data: Path) -> Depth | Refined:
 
 def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores:
     """The scores of a method on frames of a set."""
+    # One thread, so that seconds of the processor can be compared.
     torch.set_num_threads(1)
     errors: dict[int, list[Depth]] = {size: [] for size in SIZES}
     within: dict[int, list[Depth]] = {size: [] for size in SIZES}
@@ -120,8 +128,9 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
     changed = list[float]()
     cpu = 0.0
     wall = 0.0
-    frames = frames_of(name, data, half, count)
+    frames = frames_of(name, data, count, half)
     for number, frame in enumerate(frames):
+        # Holes are cut, and filled by the method.
         size_of = cut_holes(frame.gt, number)
         holed = replace(frame, gt=np.where(size_of > 0, 0, frame.gt))
         start = time.process_time()
@@ -129,6 +138,7 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
         result = filled(method, holed, data)
         cpu += time.process_time() - start
         wall += time.perf_counter() - start_wall
+        # The errors in the holes, by size, and in standard deviations.
         depth = result.depth if isinstance(result, Refined) else result
         error = np.abs(depth - frame.gt)
         for size in SIZES:
@@ -139,6 +149,7 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
                 known = (size_of == size) & (frame.gt > 0)
                 within[size].append(error[known] / certain.sigma[known])
                 valid.append(certain.valid[known])
+        # What became of the measured pixels.
         difference = np.abs(depth - holed.gt)[holed.gt > 0]
         changed.append(float((difference > CHANGED).mean()))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
@@ -160,17 +171,18 @@ def coverage(of: Scores) -> list[str]:
     if not of.within:
         return ["—"] * (len(SIZES) + 2)
     every = np.concatenate(list(of.within.values()))
-    return [
-        f"{(part <= 1).mean():.0%}, {(part <= 2).mean():.0%}"
-        for part in (*of.within.values(), every)
-    ] + [f"{of.valid.mean():.1%}"]
+    cells = [
+        f"{(deviations <= 1).mean():.0%}, {(deviations <= 2).mean():.0%}"
+        for deviations in (*of.within.values(), every)
+    ]
+    return [*cells, f"{of.valid.mean():.1%}"]
 
 
 def main() -> None:
     """Measure, and print a table as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--half", choices=("even", "odd"), default="odd")
+    parser.add_argument("--half", choices=HALVES, default="odd")
     parser.add_argument("--frames", type=int, default=3, help="frames of each set")
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.frames import SETS, EvalFrame, drawn_inputs, opened, without_occluded
+from benchmarks.frames import (
+    EvalFrame,
+    drawn_inputs,
+    frames_of,
+    opened,
+    print_row,
+    without_occluded,
+)
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.measures import score
 from pnpdepth_cli.models.network import Network
@@ -66,31 +73,39 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=100, help="points of a room")
     parser.add_argument("--networks", nargs="*", help="only these networks")
     args = parser.parse_args()
-    ratios = defaultdict[tuple[str, str, str], list[float]](list)
+    print_row("set", "network", "method", "setting", "MAE / MAE without", head=True)
     for name, networks in NETWORKS.items():
-        frames = list(SETS[name](args.data))
-        count = None if name == "kitti_dc" else args.points
-        if count is None:
+        frames = frames_of(name, args.data, args.frames)
+        count = args.points
+        if name == "kitti_dc":
             frames = [without_occluded(frame) for frame in frames]
-        for known in networks:
-            if args.networks and known not in args.networks:
+            count = None
+        for network_name in networks:
+            if args.networks and network_name not in args.networks:
                 continue
-            network = opened(known, args.data)
-            for frame in frames[:: max(1, len(frames) // args.frames)][: args.frames]:
-                for method in METHODS:
-                    plain = Settings(method=method)
-                    before = mae_of(network, frame, count, plain)
-                    for changed in settings_of(network):
-                        after = mae_of(network, frame, count, replace(plain, **changed))
-                        ((setting, value),) = changed.items()
-                        ratio = np.nan if None in (before, after) else after / before  # type: ignore[operator]
-                        ratios[known, method, f"{setting} {value}"].append(ratio)
-            for (network_name, method, setting), values in ratios.items():
-                if network_name == known:
-                    print(f"{name:9} {known:24} {method:6} {setting:18} {np.mean(values):.3f}")
-            print(flush=True)
-            for key in [key for key in ratios if key[0] == known]:
-                del ratios[key]
+            network = opened(network_name, args.data)
+            for (method, setting), ratios in ratios_of(network, frames, count).items():
+                print_row(name, network_name, method, setting, f"{np.mean(ratios):.3f}")
+
+
+def ratios_of(
+    network: Network, frames: Sequence[EvalFrame], count: int | None
+) -> dict[tuple[str, str], list[float]]:
+    """MAE with a setting over MAE without any, of each frame, by method and setting.
+
+    NaN where the refinement diverged.
+    """
+    ratios = defaultdict[tuple[str, str], list[float]](list)
+    for frame in frames:
+        for method in METHODS:
+            plain = Settings(method=method)
+            before = mae_of(network, frame, count, plain)
+            for changed in settings_of(network):
+                after = mae_of(network, frame, count, replace(plain, **changed))
+                ((setting, value),) = changed.items()
+                ratio = np.nan if before is None or after is None else after / before
+                ratios[method, f"{setting} {value}"].append(ratio)
+    return ratios
 
 
 if __name__ == "__main__":

@@ -25,12 +25,12 @@ def markdown(table: Table) -> str:
     """A set's table with the paper's figures beside ours, the δ at 1.01^k, and the steps."""
     rows, beside = table["rows"], table["beside_paper"]
     title = f"## {heading(table)}\n\n{_sample_line(table)}\n"
-    parts = [title, _measures(rows, table["street"], beside=beside)]
+    texts = [title, _measures(rows, table["street"], beside=beside)]
     if any(row["fine"] for row in rows):
-        parts.append(_fine(rows, beside=beside))
+        texts.append(_fine(rows, beside=beside))
     notes = [*table["notes"], *remarks(rows)]
-    parts += [_steps(rows), "\n" + "\n".join(f"- {note}" for note in notes)]
-    return "\n".join(part for part in parts if part) + "\n"
+    texts += [_steps(rows), "\n" + "\n".join(f"- {note}" for note in notes)]
+    return "\n".join(text for text in texts if text) + "\n"
 
 
 def heading(table: Table) -> str:
@@ -54,6 +54,7 @@ def paper_row(row: Result, street: bool) -> PaperRow:
 def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
     lines = [table_row("network", "input", "points", "frames", "", *TITLES, head=True)]
     for row in rows:
+        # The paper's two lines.
         published = paper_row(row, street)
         if beside:
             fine = published.fine
@@ -66,8 +67,10 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
             lines.append(table_row(*start, *_cells(before, fine=fine)))
             after_cells = _cells(after, before, fine=fine, printed=published.gains)
             lines.append(table_row("", "", points, "", "after", *after_cells))
+        # Ours: before, with each setting, and the points without any network.
         start = (f"`{row['network']}`", row["kind"], "", row["frames"], "before")
-        scores, before = row["scores"], row["scores"]["before"]
+        scores = row["scores"]
+        before = scores["before"]
         lines.append(table_row(*start, *_cells(before)))
         start = ("", "", f"{row['points']:.0f}", "")
         for state, title in STATES.items():
@@ -81,10 +84,10 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
 
 def described(settings: dict[str, dict[str, Any]]) -> str:
     """Our setting in a few words."""
-    setting, paper = settings["tuned"], settings["paper"]
-    if all(
-        setting[part] == paper[part] for part in ("layer", "lr", "update", "iterations", "loss")
-    ):
+    setting = settings["tuned"]
+    paper = settings["paper"]
+    names = ("layer", "lr", "update", "iterations", "loss")
+    if all(setting[name] == paper[name] for name in names):
         return "the same"
     lr = str(setting["lr"]).replace("%", " %")
     loss = "" if setting["loss"] == "l1" else f", {setting['loss']}"
@@ -147,7 +150,9 @@ def _steps(rows: Sequence[Result]) -> str:
         paper, tuned = (row["settings"][state] for state in STATES)
         fraction = 100 * paper["lr"] / row["std_z"]
         cells = (
-            *(f"`{row['network']}`", f"`{paper['layer']}`", f"{row['std_z']:.3g}"),
+            f"`{row['network']}`",
+            f"`{paper['layer']}`",
+            f"{row['std_z']:.3g}",
             f"{fraction:.2g} %" if fraction < 10 else f"{fraction:.0f} %",
             *(f"{how['loss_before']:.3f} → {how['loss_after']:.3f}" for how in (paper, tuned)),
             " / ".join(f"{how['frames_with_lower_mae']:.0%}" for how in (paper, tuned)),
@@ -188,6 +193,7 @@ def plot(tables: Sequence[Table], path: Path) -> None:
     tables = [table for table in tables if table["rows"]]
     if not tables:
         raise UsageError("--plot: there is no table to draw")
+    # A panel for each table, a group of bars for each network.
     figure = Figure(figsize=(9, 2.4 * len(tables) + 0.4), layout="constrained")
     drawn: dict[str, Any] = {}
     panels = figure.subplots(len(tables), squeeze=False)[:, 0]
@@ -198,6 +204,7 @@ def plot(tables: Sequence[Table], path: Path) -> None:
             offset = (number - (len(bars) - 1) / 2) * width
             positions = [index + offset for index in range(len(heights))]
             drawn[title] = axes.bar(positions, heights, width, color=COLOURS[title], label=title)
+        # Names below the groups.
         labels = [f"{row['network']}\n{row['points']:.0f} points" for row in table["rows"]]
         axes.set_xticks(range(len(labels)), labels, fontsize=8)
         axes.axhline(0, color="black", linewidth=0.8)

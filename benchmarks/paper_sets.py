@@ -122,10 +122,12 @@ def shared(root: Path, most: int) -> list[FrameSet]:
     """The real frames at hand, at most so many of each, evenly taken."""
     sets = []
     for name, read in SETS.items():
-        if not (every := [_shared_frame(frame) for frame in read(root)]):
+        every = [_shared_frame(frame) for frame in read(root)]
+        if not every:
             continue
         count = min(most, len(every))
-        chosen = [every[i] for i in np.linspace(0, len(every) - 1, count).astype(int)]
+        # Rounded down, unlike `frames.evenly`: the published figures are of these frames.
+        chosen = [every[place] for place in np.linspace(0, len(every) - 1, count).astype(int)]
         street = every[0].sensor is not None
         frames = partial(iter, chosen)
         sets.append(FrameSet(name, street, count, frames, beside_paper=False))

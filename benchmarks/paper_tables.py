@@ -137,13 +137,14 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
             values = [value[key] for value in values]
         return float(np.mean(values))
 
+    # Scores of every state, and how each setting changed the loss and the errors.
     states = {
         state: {name: mean("scores", state, name) for name in measured}
         for state, measured in frames[0]["scores"].items()
     }
     settings = {}
     for state, (layer, how) in entry.settings.items():
-        won = [f["scores"][state]["mae"] < f["scores"]["before"]["mae"] for f in frames]
+        won = [frame["scores"][state]["mae"] < frame["scores"]["before"]["mae"] for frame in frames]
         settings[state] = {
             "layer": layer,
             **asdict(how),

@@ -32,15 +32,15 @@ def main(data: Path, output: Path) -> None:
 
     # The frame, refined.
     network = opened("fastdepth", data)
-    frame = next(each for each in SETS["icl_nuim"](data) if each.name == FRAME)
+    frame = next(frame for frame in SETS["icl_nuim"](data) if frame.name == FRAME)
     inputs = drawn_inputs(frame, COUNT, SEED)
     refined = by_default(network, inputs, SEED)
     own = network.definition.name
-    part = sum(weight for name, weight in refined.weights.items() if own in name)
+    weight = sum(weight for name, weight in refined.weights.items() if own in name)
     columns = {
         "FastDepth aligned": refined.before,
         "z updated, propagated": refined.stages[PROPAGATED],
-        f"fused (FastDepth {100 * part:.0f} %)": refined.depth,
+        f"fused (FastDepth {100 * weight:.0f} %)": refined.depth,
     }
     # One scale for all depths, one for all errors.
     depth = inputs.points.depth.numpy()
@@ -62,9 +62,9 @@ def main(data: Path, output: Path) -> None:
         wrong = below.imshow(error, **of_error)
         above.set_title(title)
         below.set_title(f"error: MAE {error[frame.gt > 0].mean():.3f} m")
-    for each in axes.flat:
-        each.set_xticks([])
-        each.set_yticks([])
+    for panel in axes.flat:
+        panel.set_xticks([])
+        panel.set_yticks([])
     figure.colorbar(shown, ax=axes[0, 3], label="m")
     figure.colorbar(wrong, ax=axes[1, 3], label="m")
     figure.savefig(output)

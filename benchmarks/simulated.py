@@ -203,10 +203,11 @@ def _fault(log_depth: Depth, rng: Generator) -> Depth:
     addends = rng.standard_normal(REGIONS).astype(np.float32)[region]
     # A gamma, which a line through inverse depth does not undo.
     gamma = centred * rng.choice((-1, 1))
-    parts = rng.uniform(0.3, 1.0, 3)
+    # Each with mean 0 and standard deviation 1, and with a proportion of its own.
+    proportions = rng.uniform(0.3, 1.0, 3)
     fault = sum(
-        part * (each - each.mean()) / max(float(each.std()), 1e-6)
-        for part, each in zip(parts, (field, addends, gamma), strict=True)
+        proportion * (values - values.mean()) / max(float(values.std()), 1e-6)
+        for proportion, values in zip(proportions, (field, addends, gamma), strict=True)
     )
     return (fault / fault.std()).astype(np.float32)
 
@@ -214,6 +215,28 @@ def _fault(log_depth: Depth, rng: Generator) -> Depth:
 def _blurred(log_depth: Depth, blur_px: float) -> Depth:
     """Log depth (H, W) with its edges blurred."""
     return cv2.GaussianBlur(log_depth, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
+
+
+def as_outputs(depth: Depth, rng: Generator) -> dict[str, NDArray[np.float64]]:
+    """What networks of this depth (H, W) give, by what their numbers are.
+
+    Factors and shifts are drawn where such a network knows none.
+    """
+    metres = depth.astype(np.float64)
+    inverse = 1 / metres
+    factor = np.exp(rng.normal())
+    shift = rng.uniform(-1, 1) * inverse.min()
+    disparity = factor * (inverse - shift)
+    # As tools add it, so that nothing is divided by 0.
+    tiny = 1e-3 * factor * inverse.min()
+    return {
+        "disparity": disparity,
+        "metric": 1.15 * metres,
+        "relative": np.exp(rng.normal()) * (metres + rng.uniform(-0.5, 1) * np.median(metres)),
+        "log": np.exp(rng.normal()) * (np.log(metres) + rng.normal()),
+        "sqrt": np.exp(rng.normal()) * np.sqrt(metres),
+        "inverted": 1 / (disparity + tiny),
+    }
 
 
 def relative_inverse(depth: Depth) -> NDArray[np.float16]:

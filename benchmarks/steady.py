@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from benchmarks.frames import MORE_SETS, SETS, EvalFrame, print_row
+from benchmarks.frames import ALL_SETS, EvalFrame, print_row
 from benchmarks.simulated import weakened
 from pnpdepth_cli.completion import gaussian_process
 from pnpdepth_cli.completion.alignment import Candidate, align, candidates
@@ -169,11 +169,11 @@ def aligned_pooled(sequence: Sequenced, reach: int) -> list[Tensor]:
     depths = list[Tensor]()
     for number, x in enumerate(maps):
         near = range(max(0, number - reach), min(len(maps), number + reach + 1))
-        order = [number, *(other for other in near if other != number)]
+        neighbours = [neighbour for neighbour in near if neighbour != number]
         together = sequence.points[number]
-        for other in order[1:]:
-            together = together.joined(sequence.points[other])
-        values = torch.cat([at_points[other] for other in order])
+        for neighbour in neighbours:
+            together = together.joined(sequence.points[neighbour])
+        values = torch.cat([at_points[frame] for frame in (number, *neighbours)])
         fit = align(values, together, [Candidate("disparity", "affine", 1)])
         depths.append(fit.depth(x))
     return depths
@@ -276,10 +276,11 @@ class TiedLines:
         number = np.arange(count)
         steps = np.minimum(number[:, None], number[None])
         factor = np.zeros((2 * count, 2 * count))
-        for part in (0, 1):
-            covariance = DIFFUSE + variance[part] * steps
-            covariance = covariance + (variance[2 + part] + LEAST_VARIANCE) * np.eye(count)
-            factor[part::2, part::2] = np.linalg.cholesky(covariance)
+        # Level and slope.
+        for parameter in (0, 1):
+            covariance = DIFFUSE + variance[parameter] * steps
+            covariance = covariance + (variance[2 + parameter] + LEAST_VARIANCE) * np.eye(count)
+            factor[parameter::2, parameter::2] = np.linalg.cholesky(covariance)
         matrix = self._matrix[: 2 * count, : 2 * count] / variance[4]
         side = self._side[: 2 * count] / variance[4]
         root = np.linalg.cholesky(np.eye(2 * count) + factor.T @ matrix @ factor)
@@ -306,7 +307,7 @@ class TiedLines:
 
 def sequence_of(name: str, data: Path, count: int | None) -> list[EvalFrame]:
     """Returns the first frames of a set, in order, of fewer rows and columns."""
-    frames = list((SETS | MORE_SETS)[name](data))[:count]
+    frames = list(ALL_SETS[name](data))[:count]
     thin = (slice(THINNED // 2, None, THINNED),) * 2
     return [
         EvalFrame(

@@ -65,6 +65,7 @@ Run = dict[str, Any]
 
 def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
     """The run of one frame with so many points; None: scan lines."""
+    # The result, and what `compact` makes of the aligned network.
     frame = case.frame if count is not None else with_lines(case.frame)
     inputs = drawn_inputs(frame, count, seed)
     start = time.process_time()
@@ -72,6 +73,7 @@ def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
         refined = method.refine(inputs, with_stages=True)
         seconds = time.process_time() - start
         prior = depth_with_prior(method, inputs, refined)
+    # All stages, scored on the same pixels.
     depths = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
     depths.setdefault(UPDATED, depths[BEFORE])  # of a network whose z was not updated
     depths |= {
@@ -138,7 +140,7 @@ def print_tables(runs: Sequence[Run]) -> None:
         cases[run["row"], run["set"], run["points"]].append(run)
     # Rows of several sets have a line of all their frames, too.
     for row in {row for row, _, _ in cases}:
-        names = {name for other, name, _ in cases if other == row}
+        names = {name for row_of_case, name, _ in cases if row_of_case == row}
         for run in [run for run in runs if run["row"] == row and len(names) > 1]:
             cases[row, ALL, run["points"]].append(run)
     order = {number: place for place, number in enumerate((*COUNTS, LINES))}
@@ -184,6 +186,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError("--figure needs matplotlib: pip install matplotlib") from None
+    # A panel for each number of points, a bar for each network.
     rows = list(dict.fromkeys(run["row"] for run in runs))
     figure = Figure(figsize=(9, 0.5 * len(rows) + 1.4), layout="constrained")
     panels = figure.subplots(1, len(DRAWN), sharex=True, sharey=True)
@@ -198,12 +201,14 @@ def draw(runs: Sequence[Run], path: Path) -> None:
             axes.text(ratio / 1.06, place, f"{ratio:.2f}", va="center", ha="right", color="white")
             of_linear = geometric_mean(some, LINEAR) / own
             axes.plot(of_linear, place, marker="D", color="tab:orange", linestyle="none")
+        # The network as it is: 1.
         axes.axvline(1, color="black", linewidth=0.8)
         axes.set_title(f"{count} points", fontsize=10)
         axes.set_xscale("log")
         axes.set_xlim(0.02, 5)
         axes.set_xticks([0.05, 0.2, 1, 4], ["0.05", "0.2", "1", "4"])
         axes.minorticks_off()
+    # The names, with the number of maps.
     maps = {row: len({run["frame"] for run in runs if run["row"] == row}) for row in rows}
     panels[0].set_yticks(range(len(rows)), [f"{row} ({maps[row]})" for row in rows])
     panels[0].invert_yaxis()
@@ -223,6 +228,7 @@ def count_of(text: str) -> int | None:
 def main() -> None:
     """Measure, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    # What is measured.
     parser.add_argument("--data", type=Path, help="the folder of real frames")
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=GROUPS)
     parser.add_argument("--sets", nargs="+", help="only these")
@@ -230,6 +236,7 @@ def main() -> None:
     parser.add_argument("--points", nargs="+", default=[*map(str, COUNTS), LINES])
     parser.add_argument("--frames", type=int, default=3, help="frames of each set with truth")
     parser.add_argument("--seeds", type=int, default=1, help="draws of the points of each frame")
+    # What becomes of it.
     parser.add_argument("--json", type=Path, help="file that every run is written to")
     parser.add_argument("--tables", type=Path, nargs="+", help="print the runs of such files only")
     parser.add_argument("--figure", type=Path, help="image file of the gain over each network")
@@ -239,6 +246,7 @@ def main() -> None:
         return
     if args.data is None:
         parser.error("--data is needed to measure")
+    # Every run is written at once, so that a stopped benchmark leaves what it has.
     runs = list[Run]()
     for case in strong_frames(args.data, args.groups, args.sets, args.frames):
         if args.rows and case.row not in args.rows:

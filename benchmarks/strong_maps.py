@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.frames import MORE_SETS, SETS, EvalFrame, opened, without_occluded
+from benchmarks import frames
+from benchmarks.frames import EvalFrame, opened, without_occluded
 from benchmarks.simulated import simulated_network, stored_network
 from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.io.depth import read_depth
@@ -117,7 +118,10 @@ def strong_frames(
     for name in (*RENDERED, *TRUTH_SETS):
         if sets is not None and name not in sets:
             continue
-        for frame in frames_of(name, data, count):
+        of_set = frames.frames_of(name, data, count)
+        if name in RENDERED:
+            of_set = rendered(RENDERED[name], count)
+        for frame in of_set:
             for make in makers:
                 for row, network in make(frame, data):
                     yield StrongFrame(set=name, row=row, frame=frame, network=network)
@@ -159,14 +163,6 @@ def stored_frames(folder: Path) -> Iterator[StrongFrame]:
             network = stored_network(file.stem, values, stored.kind, stored.scale)
             named = replace(frame, name=file.stem)
             yield StrongFrame(set=folder.name, row=stored.row, frame=named, network=network)
-
-
-def frames_of(name: str, data: Path, count: int) -> list[EvalFrame]:
-    """`count` evenly spaced frames of a set with truth; none where the set is not there."""
-    if name in RENDERED:
-        return rendered(RENDERED[name], count)
-    frames = list((SETS | MORE_SETS)[name](data)) if (data / name).is_dir() else []
-    return [frames[round(i)] for i in np.linspace(0, len(frames) - 1, min(count, len(frames)))]
 
 
 def rendered(kind: str, count: int) -> list[EvalFrame]:

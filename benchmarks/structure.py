@@ -141,7 +141,7 @@ def neighbours(graph: Graph, word: str) -> Iterator[str]:
     """Yields what the files of this name, or in that folder, import, and what imports them."""
     for node in sorted(graph):
         if word in node.split("."):
-            importers = sorted(other for other, imported in graph.items() if node in imported)
+            importers = sorted(name for name, imported in graph.items() if node in imported)
             yield node
             yield f"    imports      {', '.join(sorted(graph[node])) or '–'}"
             yield f"    imported by  {', '.join(importers) or '–'}"

@@ -75,7 +75,7 @@ class Step(nn.Module):
         self, state: State, sparse: Tensor, known: Three, kernels: Three, biases: Three
     ) -> State:
         """Returns the state after the iteration; `known` (1 or 0) masks what each layer fits."""
-        codes, copies, multipliers = (list(part) for part in state)
+        codes, copies, multipliers = (list(of_layers) for of_layers in state)
         for i, kernel in enumerate(kernels):
             target = known[i] * copies[i - 1] if i else sparse
             start = copies[i] - multipliers[i]
@@ -199,8 +199,8 @@ def _definition(name: str, summary: str) -> ModelDefinition:
 
 
 definitions: dict[str, ModelDefinition] = {
-    one.name: one
-    for one in (
+    definition.name: definition
+    for definition in (
         _definition("adnn", "codes of convolutional dictionaries, found by ADMM"),
         _definition("adnn-tiny", "adnn, trained on rendered scenes"),
     )

@@ -194,6 +194,7 @@ class Compact(nn.Module):
 
     def _levels(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None) -> Iterator[Level]:
         """The decoder, level by level; full size has the features and hints of 1/2."""
+        # Features of the image and of the points; planes at 1/16 are the first depth.
         image = self.encoder(rgb)
         start = self.start(self._started, rgb, sparse, prior, image["s16"], image["s32"])
         moments, fit, guide = start.moments, start.fit, start.guide
@@ -201,6 +202,7 @@ class Compact(nn.Module):
         depth = fit.estimates.mean(1, keepdim=True)
         extra = [fit.estimates - depth, fit.distance]
         for level, stride in STRIDES.items():
+            # The depth so far, and the depths that a cell chooses among.
             size = image[level].shape[-2:]
             if level == "s16":
                 before = depth
@@ -208,25 +210,30 @@ class Compact(nn.Module):
             else:
                 before = resize(depth, size)
                 candidates = F.interpolate(neighbours(depth), scale_factor=2.0, mode="nearest")
+            # What the points say against it.
             residual = residual_of(moments, before, stride)
             density = torch.log1p(residual.density * stride * stride)
             hints = [before, residual.mean, residual.std, density]
             parts = [resize(features, size), image[level], *hints, *extra]
             inputs = [torch.cat([x.to(features.dtype) for x in parts], 1)]
+            # What the prior says, if there is one.
             of_prior = None
             if guide is not None and fit.of_prior is not None:
                 hints_of_prior = prior_hints(guide, fit.of_prior, before, level)
                 inputs.append(hints_of_prior.to(features.dtype))
                 of_prior = prior_candidates(guide, fit.of_prior, depth, level)
+            # The depth of this level, spread to neighbours at the finer ones.
             features = self.decoder[level](*inputs)
             depth = self.heads[level](features, before, candidates, residual, of_prior)
             if level in self.propagation:
                 depth = self.propagation[level](features, depth, moments, stride)
             yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
+            # Further inputs of the next level.
             extra = [resize(fit.distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
                 extra = [F.pixel_unshuffle(rgb, 2)]
                 features = self.narrow(features)
+        # Full size.
         depth = self._enlarge(features, depth, guide, fit.of_prior)
         yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
 

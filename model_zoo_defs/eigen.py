@@ -109,9 +109,9 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         ValueError: One of the two files is missing, or there are two of a kind.
     """
     if "fc1.weight" in state or "conv3.weight" in state:
-        part = "coarse" if "fc1.weight" in state else "fine"
+        there = "coarse" if "fc1.weight" in state else "fine"
         raise ValueError(
-            f"this is the {part} network only; name a folder with one file coarse*.pth and one"
+            f"this is the {there} network only; name a folder with one file coarse*.pth and one"
             " fine*.pth in it"
         )
     renamed: dict[str, Tensor] = {}
@@ -153,4 +153,4 @@ _TINY = replace(
     checkpoint=TINY,
     read_checkpoint=None,
 )
-definitions = {one.name: one for one in (_NYU, _TINY)}
+definitions = {definition.name: definition for definition in (_NYU, _TINY)}

@@ -247,4 +247,4 @@ _TINY = replace(
     checkpoint=TINY,
     read_checkpoint=None,
 )
-definitions = {one.name: one for one in (_NYU, _TINY)}
+definitions = {definition.name: definition for definition in (_NYU, _TINY)}

@@ -164,7 +164,9 @@ class Stage(nn.Module):
 
     def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
         for cell in self.cells:
-            earlier, later = later, cell(earlier, later)
+            both = cell(earlier, later)
+            earlier = later
+            later = both
         return earlier, later
 
 
@@ -273,8 +275,8 @@ def _definition(name: str, summary: str, width: int, cells: int) -> ModelDefinit
 
 
 definitions: dict[str, ModelDefinition] = {
-    one.name: one
-    for one in (
+    definition.name: definition
+    for definition in (
         _definition("latefusion", "two NASNet-A encoders, fused late, own building", 44, 4),
         _definition(
             "latefusion-tiny",

@@ -152,4 +152,4 @@ _TINY = replace(
     checkpoint=TINY,
     read_checkpoint=None,
 )
-definitions = {one.name: one for one in (_KITTI, _TINY)}
+definitions = {definition.name: definition for definition in (_KITTI, _TINY)}

@@ -210,8 +210,8 @@ def tiny(name: str, scenes: str, size: Fixed) -> ModelDefinition:
 
 
 definitions = {
-    one.name: one
-    for one in (
+    definition.name: definition
+    for definition in (
         _NYU,
         _KITTI,
         tiny("sparse2dense-tiny", "rooms", NYU),

@@ -95,4 +95,4 @@ _TINY = replace(
     defaults=Settings(layer="sparse_convs.1[0]", lr="3%", update="adam"),
     checkpoint=Path(__file__).parent / "weights" / "sparseconv-tiny.safetensors",
 )
-definitions = {one.name: one for one in (_PORT, _TINY)}
+definitions = {definition.name: definition for definition in (_PORT, _TINY)}

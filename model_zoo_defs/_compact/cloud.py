@@ -68,16 +68,19 @@ class Cloud(NamedTuple):
     @classmethod
     def of_image(cls, mask: Tensor, value: Tensor, rgb: Tensor) -> Cloud:
         """The cloud of the points of one image: mask and value (H, W), rgb (3, H, W)."""
+        # The points that stand for all, in units of their spacing, and their neighbours.
         rows, columns = torch.nonzero(mask, as_tuple=True)
         chosen, stand_in, sends = thinned(rows, columns, value[mask], mask.numel())
         rows, columns = rows[chosen], columns[chosen]
         spacing = max(1.0, math.sqrt(mask.numel() / max(1, int(sends.sum()))))
         position = torch.stack([rows, columns], 1).float() / spacing
         near, found = neighbours(position, sends)
+        # The colour around each.
         down, right = torch.meshgrid(AROUND, AROUND, indexing="ij")
         y = (rows.unsqueeze(1) + down.flatten().to(rows.device)).clamp(0, rgb.shape[1] - 1)
         x = (columns.unsqueeze(1) + right.flatten().to(rows.device)).clamp(0, rgb.shape[2] - 1)
         colour = rgb.float().flatten(1)[:, y * rgb.shape[2] + x].mean(2).t()
+        # A small image has the spacing that it would have at the size in training.
         enlarged = max(1.0, LEARNT_SIZE / max(mask.shape))
         log_spacing = torch.full_like(position[:, 0], math.log(enlarged * spacing))
         return cls(
@@ -115,10 +118,16 @@ class Cloud(NamedTuple):
         )
 
 
-def thinned(
-    rows: Tensor, columns: Tensor, value: Tensor, pixels: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers (n,) of the points that stand for all N, which one does for each, and who sends.
+class Thinned(NamedTuple):
+    """Points that stand for all N."""
+
+    chosen: Tensor  # (n,) their numbers
+    stand_in: Tensor  # (N,) which of them stands for each
+    sends: Tensor  # (n,) whether it sends messages
+
+
+def thinned(rows: Tensor, columns: Tensor, value: Tensor, pixels: int) -> Thinned:
+    """The points that stand for all N.
 
     Of each cell of a dense pattern the middle point is chosen, wherever its depth lies, so that as
     many of the chosen as of all points are outliers. These send messages. Where points of the cell
@@ -133,7 +142,7 @@ def thinned(
     """
     if len(rows) <= DENSE:
         all_of_them = torch.arange(len(rows), device=rows.device)
-        return all_of_them, all_of_them, torch.ones_like(all_of_them, dtype=torch.bool)
+        return Thinned(all_of_them, all_of_them, torch.ones_like(all_of_them, dtype=torch.bool))
     side = math.ceil(math.sqrt(pixels / CELLS))
     cell = rows // side * (int(columns.max()) // side + 1) + columns // side
     # The points cell by cell, in the order of their depths.
@@ -158,7 +167,7 @@ def thinned(
     chosen, rank = of_group.sort()
     number = torch.empty_like(rank)
     number[rank] = torch.arange(len(rank), device=rank.device)
-    return chosen, number[group], torch.isin(chosen, sender)
+    return Thinned(chosen, number[group], torch.isin(chosen, sender))
 
 
 def neighbours(position: Tensor, sends: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -171,20 +171,26 @@ def prior_hints(prior: Prior, fit: PriorFit, before: Tensor, level: str) -> Tens
     return torch.cat([*fits, (value - before) * valid, valid], 1)
 
 
-def prior_candidates(
-    prior: Prior, fit: PriorFit, depth: Tensor, level: str
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Depths that follow the prior, where they are known (B, n, h, w), and its reliability.
+class PriorCandidates(NamedTuple):
+    """Depths (B, n, h, w) that follow a prior."""
+
+    depth: Tensor
+    known: Tensor
+    reliability: Tensor
+
+
+def prior_candidates(prior: Prior, fit: PriorFit, depth: Tensor, level: str) -> PriorCandidates:
+    """The depths that follow the prior at a level, where they are known, and its reliability.
 
     At 1/16 the fits; elsewhere the depths of the coarser neighbours plus the change of the prior
     from there to here.
     """
     if level == "s16":
-        return fit.estimates, fit.valid, fit.reliability
+        return PriorCandidates(fit.estimates, fit.valid, fit.reliability)
     stride = STRIDES[level]
     value, valid = prior.at(stride)
     coarse, known = prior.at(2 * stride)
     both = torch.cat([neighbours(depth - coarse), neighbours(known)], 1)
     offset, known = F.interpolate(both, scale_factor=2.0, mode="nearest").chunk(2, 1)
     reliability = resize(fit.reliability.mean(1, keepdim=True), value.shape[-2:])
-    return value + offset, valid * known, reliability
+    return PriorCandidates(value + offset, valid * known, reliability)

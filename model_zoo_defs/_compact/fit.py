@@ -93,7 +93,7 @@ class PointFit(nn.Module):
                           *cells)
                 for i in range(0, height * width, FIT_CHUNK)
             ]  # fmt: skip
-        rows = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+        rows = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
         estimates, distance, *of_prior = (x.reshape(*x.shape[:-1], height, width) for x in rows)
         if prior is None:
             return Fit(estimates, distance.unsqueeze(1))
@@ -151,6 +151,7 @@ class PointFit(nn.Module):
         reliability and the fraction of the weights on cells where the prior is known, each
         (B, heads, cells).
         """
+        # How much each cell with points counts for each query: near, reliable and alike.
         *of_prior, known = more
         square = torch.cdist(centres.t().expand(at.shape[0], -1, -1), at.transpose(1, 2)).square()
         absent = ~known.unsqueeze(1)
@@ -158,12 +159,14 @@ class PointFit(nn.Module):
         alike = queries @ keys.transpose(2, 3) / FIT_KEY**0.5
         alike = alike + reliability.view(len(at), 1, 1, -1)
         weight = (alike - self.power.exp().view(1, -1, 1, 1) * far.unsqueeze(1)).softmax(-1)
+        # The plane through the weighted points, and the distance of the nearest.
         y, x = at.unbind(1)
         products = torch.stack([y, x, value, y * y, x * x, x * y, y * value, x * value], -1)
         nearest = square.masked_fill(absent, 1e6).amin(-1)
         distance = 0.5 * torch.log(nearest + 0.1)
         if not of_prior:
             return self._plane(centres, weight @ products.unsqueeze(1)), distance
+        # With a prior also the plane through the residuals against it.
         residual, support_at = of_prior
         products = torch.cat([products, value.square().unsqueeze(-1)], -1)
         more_products = torch.stack(
@@ -175,6 +178,7 @@ class PointFit(nn.Module):
         support = moments[..., 9]
         rest = moments[..., 10:] / support.unsqueeze(-1).clamp(min=1e-4)
         shifted = self._plane(centres, rest[..., :8])
+        # How much smaller the residuals are than the depths themselves.
         std = torch.sqrt((rest[..., 8] - rest[..., 2].square()).clamp(min=0.0) + 1e-4)
         plain = torch.sqrt((moments[..., 8] - moments[..., 2].square()).clamp(min=0.0) + 1e-4)
         reliability = torch.log(plain / std).clamp(-3.0, 3.0)

@@ -102,8 +102,9 @@ class Messages(nn.Module):
 
     def forward(self, state: Tensor, cloud: Cloud, pairs: list[Tensor]) -> Tensor:
         sent = self.neighbour(state) + self.bias
+        # A part of the points at a time.
         parts = zip(chunks(cloud), pairs, strict=True)
-        messages = [self._received(sent, cloud, some, part) for some, part in parts]
+        messages = [self._received(sent, cloud, some, of_some) for some, of_some in parts]
         received = torch.cat(messages) if messages else state.new_zeros((0, 2 * WIDTH))
         images = [
             states[sends].mean(0, keepdim=True).expand_as(states)

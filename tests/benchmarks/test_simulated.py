@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.simulated import error_aligned, simulated_network, stored_network, weakened
+from benchmarks.simulated import (
+    as_outputs,
+    error_aligned,
+    simulated_network,
+    stored_network,
+    weakened,
+)
 from benchmarks.strong_maps import rendered
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.models.network import Network
@@ -84,3 +90,29 @@ def test_the_predicted_depth_of_the_sample_is_off_by_4_per_cent_after_alignment(
     slope, shift = np.polyfit(stored[known], 1 / gt[known], 1, w=gt[known])
     depth = 1 / (slope * stored + shift)
     assert error_aligned(depth, gt) == pytest.approx(0.04, rel=0.05)
+
+
+def test_all_outputs_of_a_network_are_of_one_depth() -> None:
+    rows, _ = np.mgrid[:60, :80]
+    depth = np.minimum(4.0, 60 / np.maximum(rows - 20, 1)).astype(np.float32)
+    depth[25:45, 30:50] = 2.0
+    outputs = as_outputs(depth, np.random.default_rng(2))
+    quantities = {
+        "disparity": 1 / depth,
+        "metric": depth,
+        "relative": depth,
+        "log": np.log(depth),
+        "sqrt": np.sqrt(depth),
+    }
+    for name, quantity in quantities.items():
+        line = np.polyfit(outputs[name].ravel(), quantity.ravel(), 1)
+        assert np.polyval(line, outputs[name]) == pytest.approx(quantity, rel=1e-5)
+
+
+def test_unknown_truth_does_not_change_the_error_of_a_simulated_network() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    gt = np.minimum(4.0, 60 / np.maximum(rows - 20, 1)).astype(np.float32)
+    gt[25:45, 30:50] = 2.0
+    gt[(rows + columns) % 7 == 0] = 0
+    depth = weakened(gt, 0.09, np.random.default_rng(1))
+    assert error_aligned(depth, gt) == pytest.approx(0.09, rel=0.05)

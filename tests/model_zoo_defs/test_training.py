@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file, save_file
 from torch import nn
 
-from model_zoo_defs.training.learning import recipes
+from model_zoo_defs.training.learning import mean_weights, recipes
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 
 tiny = pytest.importorskip("model_zoo_defs.training.learning.tiny")
@@ -88,3 +90,21 @@ def test_an_edition_learns_and_goes_on_as_it_was(lanes: int, shards: Path, tmp_p
     run.save()
     assert tiny.train(TOY, RECIPE, replace(broken, resume=True)).read_bytes() == weights
     assert learned(whole.out)
+
+
+def test_weights_are_averaged_by_their_parts_and_stored_in_half_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = load_file(Path(mean_weights.__file__).parents[2] / "weights" / "compact.safetensors")
+    save_file({name: tensor.float() + 1 for name, tensor in shipped.items()}, tmp_path / "a")
+    save_file({name: tensor.float() - 2 for name, tensor in shipped.items()}, tmp_path / "b")
+    arguments = ["--weights", "a", "b", "--parts", "2", "1", "--out", "mean"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["mean_weights", *arguments])
+    mean_weights.main()
+    # Twice one more and once two less leave the weights as they are.
+    mean = load_file(tmp_path / "mean")
+    assert mean.keys() == shipped.keys()
+    for name, tensor in shipped.items():
+        assert mean[name].dtype == tensor.dtype
+        torch.testing.assert_close(mean[name], tensor, rtol=1e-3, atol=1e-6)

@@ -23,8 +23,8 @@ def mean_of(weights: Sequence[Mapping[str, Tensor]], parts: Sequence[float]) -> 
     return {
         name: torch.stack(
             [
-                part / total * tensors[name].float()
-                for tensors, part in zip(weights, parts, strict=True)
+                fraction / total * tensors[name].float()
+                for tensors, fraction in zip(weights, parts, strict=True)
             ]
         ).sum(0)
         for name in weights[0]

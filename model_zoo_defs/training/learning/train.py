@@ -208,9 +208,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
+    # Files.
     parser.add_argument("--data", type=Path, required=True, nargs="+", help="folders of shards")
     parser.add_argument("--val", type=Path, help="folder of shards kept for validation")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
+    # The schedule.
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR/state.pt")
@@ -225,6 +227,7 @@ def main() -> None:
     parser.add_argument("--averaging", type=float, default=Settings.averaging)
     parser.add_argument("--encoder-rate", type=float, default=0.0, help="times the rate; 0: frozen")
     parser.add_argument("--save-every", type=int, default=Settings.save_every)
+    # What does not change the weights, but for the lanes.
     parser.add_argument("--val-frames", type=int, default=Settings.val_frames)
     parser.add_argument("--lanes", type=int, default=Settings.lanes)
     parser.add_argument("--workers", type=int, default=Settings.workers)

@@ -95,6 +95,7 @@ def reconstruct(folder: Path, focal_px: float) -> None:
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory() as work:
         database = Path(work) / "database.db"
+        # Features, with known intrinsics, and their matches.
         pycolmap.extract_features(
             database,
             folder / "images",
@@ -106,6 +107,7 @@ def reconstruct(folder: Path, focal_px: float) -> None:
             device=pycolmap.Device.cpu,
         )
         pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        # The largest model of incremental mapping.
         options = pycolmap.IncrementalPipelineOptions(
             ba_refine_focal_length=False, ba_refine_extra_params=False, random_seed=0
         )

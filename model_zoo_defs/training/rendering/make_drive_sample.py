@@ -44,11 +44,13 @@ _POSE = "1 0 0 0 0 1 0 0 0 0 1 {ahead:g}\n"  # the camera moves along its own ax
 def make_drive(folder: Path) -> None:
     """Writes rgb/, sparse/, gt/ and calib/ of the frames, and poses.txt."""
     rng = generator(SAMPLE_SEED, STREET_SCENE, 0)
+    # The scene of samples/street, and a camera in its lane.
     world, plan = build("street", rng)
     start = looking(
         (float(plan.high[0]) * 0.55, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=_SIZE
     )
     start = replace(start, fx=_FOCAL_PX, fy=_FOCAL_PX, cx=_CX, cy=_CY)
+    # A frame every step, along the camera's own axis.
     for kind in ("rgb", "sparse", "gt", "calib"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     turn = laser_axes()
@@ -67,6 +69,7 @@ def make_drive(folder: Path) -> None:
         (folder / "calib" / f"{name}.txt").write_text(
             f"K: [{_FOCAL_PX}, 0, {_CX}, 0, {_FOCAL_PX}, {_CY}, 0, 0, 1]\n"
         )
+    # The poses.
     poses = [_POSE.format(ahead=STEP_M * number) for number in range(FRAMES)]
     (folder / "poses.txt").write_text("".join(poses))
 

@@ -89,16 +89,19 @@ def _radiance(
     reflect: bool,
 ) -> FloatArray:
     """Returns the linear colour (n, 3) that comes back along every ray."""
+    # How large a pixel is on the surface chooses the level of the texture.
     length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
     back = -directions / length[:, None]
     facing = np.clip(np.einsum("ij,ij->i", hits.normals, back), 0.08, 1)
     footprint = hits.t / view.fx / np.sqrt(facing)
     albedo = world.table.albedo(hits.material, hits.uv, footprint.astype(np.float32))
+    # Light that falls on it, light that it gives, highlights and reflections.
     colour = albedo * _lit(world, hits, back, visible)
     colour += albedo * world.table.glow[hits.material][:, None]
     colour += _highlights(world, hits, back, visible)
     if reflect:
         _reflect(world, view, hits, back, facing.astype(np.float32), colour)
+    # Haze, and the sky where nothing was met.
     if world.sky.haze_m > 0:
         clear = np.exp(-hits.t / world.sky.haze_m)[:, None]
         haze = np.asarray(world.sky.horizon, np.float32)

@@ -227,6 +227,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     """Returns printed matter: flat shapes, blurred blobs, lines of text."""
     paper = Image.new("RGB", (SIDE, SIDE), _ink(base))
     draw = ImageDraw.Draw(paper)
+    # A photo.
     if rng.random() < 0.5:
         photo = mixed(colour(rng, vivid=0.6), colour(rng, vivid=0.6), _contrasted(rng))
         photo = mixed_over(photo, colour(rng), _contrasted(rng))
@@ -235,6 +236,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
         paper.paste(
             Image.fromarray((np.clip(photo, 0, 1) * 255).astype(np.uint8)).resize((w, h)), (x, y)
         )
+    # Flat shapes.
     for _ in range(int(rng.integers(0, 9))):
         x, y = (int(v) for v in rng.integers(-40, SIDE, 2))
         w, h = (int(v) for v in rng.integers(8, 150, 2))
@@ -249,6 +251,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
             draw.polygon(points, fill=ink)
         else:
             draw.line((x, y, x + w, y + h), fill=ink, width=int(rng.integers(1, 12)))
+    # Large words.
     for _ in range(int(rng.integers(0, 5))):
         letters = rng.integers(65, 91, int(rng.integers(3, 12)))
         text = "".join(chr(int(c)) for c in letters)
@@ -256,6 +259,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
         draw.text(
             (x, y), text, fill=_ink(colour(rng, vivid=0.5)), font_size=int(rng.integers(10, 60))
         )
+    # Lines that look like text.
     if rng.random() < 0.5:
         x, y = (int(v) for v in rng.integers(10, 120, 2))
         for line in range(int(rng.integers(4, 18))):
@@ -268,8 +272,12 @@ def _contrasted(rng: np.random.Generator) -> FloatArray:
     return np.asarray(np.clip(0.5 + 3 * (noise(rng, smooth=0.95) - 0.5), 0, 1), np.float32)
 
 
-def _ink(value: FloatArray) -> tuple[int, int, int]:
-    red, green, blue = (int(255 * v) for v in np.clip(value, 0, 1))
+Ink = tuple[int, int, int]
+"""Red, green and blue, 0 to 255, as Pillow draws."""
+
+
+def _ink(value: FloatArray) -> Ink:
+    red, green, blue = (int(255 * channel) for channel in np.clip(value, 0, 1))
     return red, green, blue
 
 

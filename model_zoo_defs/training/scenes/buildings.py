@@ -12,6 +12,7 @@ from model_zoo_defs.training.scenes.walls import Hole, wall
 def building(kit: Kit, width: float) -> Group:
     """Returns a house whose front lies along x at y = 0 and looks toward -y."""
     group = Group()
+    # Size and materials.
     floors = int(kit.rng.integers(1, 6))
     storey = kit.size(2.6, 3.4)
     height = floors * storey + kit.size(0.2, 1)
@@ -33,11 +34,13 @@ def building(kit: Kit, width: float) -> Group:
         if kit.chance(0.6)
         else kit.surface("plain", vivid=0.3)
     )
+    # Front and sides.
     holes = _windows(kit, width, floors, storey)
     group.add(wall(width, height, holes), skin, (-width / 2, 0, 0))
     side = [(0, 0, 0), (0, deep, 0), (0, deep, height), (0, 0, height)]
     for x in (-width / 2, width / 2):
         group.add(quads([side]), skin, (x, 0, 0))
+    # Windows and doors: pane or curtain, reveals, sills and bars, balconies.
     recess = kit.size(0.06, 0.3)
     balcony = kit.chance(0.3)
     for u0, v0, u1, v1 in holes:
@@ -56,6 +59,7 @@ def building(kit: Kit, width: float) -> Group:
             group.add(box(*size), trim, at)
         if balcony and v0 > 2 and kit.chance(0.6):
             _balcony(kit, group, x, v0 - 0.4, w)
+    # Roof, awning and shop sign.
     _top(kit, group, width, height, deep, skin)
     if kit.chance(0.3):
         awning = [

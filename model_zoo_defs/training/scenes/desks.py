@@ -24,6 +24,7 @@ def _wild(kit: Kit) -> Group:
     choice = kit.rng.random()
     size = kit.size(0.04, 0.3)
     if choice < 0.35:
+        # A rounded body, dented by waves.
         body = superquadric(
             kit.rng.uniform(0.3, 1.0, 3) * size,
             vertical=kit.size(0.1, 2),
@@ -43,10 +44,12 @@ def _wild(kit: Kit) -> Group:
             roll=kit.size(-1, 1),
         )
     elif choice < 0.65:
+        # A turned body of random radii.
         z = np.linspace(0, size * 1.5, 20)
         r = size * 0.4 * np.clip(0.6 + np.cumsum(kit.rng.normal(0, 0.14, 20)), 0.1, 1.4)
         group.add(lathe(np.stack([r, z], axis=1), sides=24), kit.any_surface())
     else:
+        # A bent wire or tube.
         s = np.linspace(0, 1, 40)[:, None]
         waves = [np.sin(s * kit.rng.uniform(1, 7, 3) + kit.rng.uniform(0, 6, 3)) for _ in range(2)]
         path = size * (waves[0] + waves[1])
@@ -58,6 +61,7 @@ def _wild(kit: Kit) -> Group:
 def desk_scene(kit: Kit) -> Plan:
     """Returns a table top seen from near by, full of things."""
     group = Group()
+    # The table.
     w = kit.size(0.8, 2.2)
     d = kit.size(0.6, 1.4)
     top = kit.surface(
@@ -77,6 +81,7 @@ def desk_scene(kit: Kit) -> Plan:
     group.add(box(w, d, 0.04), top, (0, 0, z - 0.04))
     for x in (-w * 0.45, w * 0.45):
         group.add(box(0.05, 0.05, z - 0.04), kit.wood(), (x, 0, 0))
+    # Floor, walls near and far, ceiling.
     floor = kit.surface("planks", "carpet", "tiles", "plain", tile_m=1)
     group.add(quads([[(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)]]), floor)
     paper = kit.surface(
@@ -103,6 +108,7 @@ def desk_scene(kit: Kit) -> Plan:
         quads([[(-5, -5, 2.8), (5, -5, 2.8), (5, 5, 2.8), (-5, 5, 2.8)]]),
         kit.surface("plain", vivid=0),
     )
+    # Heaps of things, which the cameras look at.
     half = (w / 2 - 0.05, d / 2 - 0.05)
     heaps = int(kit.rng.integers(2, 7))
     targets = []
@@ -116,17 +122,20 @@ def desk_scene(kit: Kit) -> Plan:
         clutter.scatter(
             kit, group, area=clutter.Rectangle(low, high, z), count=int(kit.rng.integers(4, 14))
         )
+        # Odd bodies among them.
         for _ in range(int(kit.rng.integers(0, 4))):
             group.insert(
                 _wild(kit),
                 (kit.size(low[0], high[0]), kit.size(low[1], high[1]), z),
                 yaw=kit.size(0, 6.3),
             )
+    # Furniture behind the table.
     for _ in range(int(kit.rng.integers(0, 4))):
         maker = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))]
         group.insert(
             maker(kit), (kit.size(-2, 2), far - kit.size(0, 0.5), 0), yaw=kit.size(-0.5, 0.5)
         )
+    # Lights, and the light from all sides.
     lights = []
     for _ in range(int(kit.rng.integers(1, 5))):
         power = kit.size(0.3, 1.5)

@@ -11,11 +11,13 @@ from model_zoo_defs.training.scenes.kit import Kit
 def person(kit: Kit) -> Group:
     """Returns a standing or sitting figure of rounded bodies, about the origin."""
     group = Group()
+    # Clothes, skin and size.
     cloth = kit.any_surface()
     legs = kit.surface("plain", "fabric", vivid=0.2)
     skin = kit.palette.new("plain", np.array([0.85, 0.65, 0.52]) * kit.size(0.45, 1.1), gloss=0.1)
     h = kit.size(1.5, 1.9)
     stride = kit.size(0, 0.3)
+    # Legs, feet, arms and hands; the arms swing against the legs.
     for side in (-1, 1):
         x = side * 0.09
         foot = side * stride
@@ -42,8 +44,11 @@ def person(kit: Kit) -> Group:
             cloth,
         )
         group.add(superquadric((0.08, 0.08, 0.12)), skin, (side * 0.24, swing - 0.1, h * 0.47))
+    # Trunk, neck, head and hair.
     group.add(
-        superquadric((0.4, 0.25, h * 0.38), vertical=0.6, around=0.8), cloth, (0, 0, h * 0.66)
+        superquadric((0.4, 0.25, h * 0.38), vertical=0.6, around=0.8),
+        cloth,
+        (0, 0, h * 0.66),
     )
     group.add(cylinder(0.05, 0.1), skin, (0, 0, h * 0.83))
     group.add(superquadric((0.17, 0.2, 0.25)), skin, (0, -0.01, h * 0.93))

@@ -46,6 +46,7 @@ _TABLE_THINGS = (mug, books, papers, laptop, bowl, bottle, plant, lamp, gadget, 
 def table(kit: Kit, *, width: float = 0.0) -> Group:
     """Returns a table with legs and things on it."""
     group = Group()
+    # Size and materials.
     wood = kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
     w = width or kit.size(0.7, 2.0)
     d = kit.size(0.5, 0.95)
@@ -53,6 +54,7 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
     thick = kit.size(0.015, 0.05)
     legs = kit.metal() if kit.chance(0.3) else wood
     y = -d / 2
+    # A round table on one leg, or one on four.
     if kit.chance(0.15):
         group.add(cylinder(d * 0.6, thick, sides=30), wood, (0, y, h - thick))
         group.add(cylinder(0.04, h - thick), legs, (0, y, 0))
@@ -67,6 +69,7 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
                 group.add(leg, legs, at)
         if kit.chance(0.5):
             group.add(box(w * 0.9, d * 0.85, 0.08), wood, (0, y, h - thick - 0.08))
+    # Things on it.
     scatter(
         kit,
         group,
@@ -134,6 +137,7 @@ def _fill_shelf(
     x = -w / 2
     while x < w / 2 - 0.06:
         if kit.chance(0.8):
+            # A book, some of them leaning.
             wide = kit.size(0.012, 0.06)
             tall = gap * kit.size(0.5, 0.97)
             deep = d * kit.size(0.5, 0.9)
@@ -146,6 +150,7 @@ def _fill_shelf(
             )
             x += wide
         else:
+            # A thing, or a gap.
             wide = kit.size(0.08, 0.3)
             end = min(x + wide, w / 2)
             if kit.chance(0.7):
@@ -191,6 +196,7 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
     """Adds doors with handles to the front of a body of this width, depth and height at z."""
     w, d, h = size
     steel = kit.metal()
+    # Rows and columns of doors or drawers, with handles of one style.
     columns = max(1, round(w / kit.size(0.4, 0.6)))
     rows = int(kit.rng.integers(1, 5)) if h > 0.6 else 1
     style = int(kit.rng.integers(3))
@@ -201,7 +207,9 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
             tall = (h - 0.06) / rows
             x = -w / 2 + (column + 0.5) * wide
             low = z + 0.05 + row * tall
+            # The door.
             group.add(box(wide - 2 * gap, 0.018, tall - 2 * gap), front, (x, -d - 0.01, low + gap))
+            # Its handle: a bar across, a bar along, or a knob.
             if style == 0:
                 group.add(
                     box(min(0.25, wide * 0.5), 0.012, 0.012),
@@ -228,6 +236,7 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
 def kitchen(kit: Kit) -> Group:
     """Returns a kitchen counter with tap, tiled back wall, hung cupboards and clutter."""
     group = Group()
+    # The body with its doors, the top and the back wall.
     w = kit.size(1.6, 3.6)
     d = kit.size(0.58, 0.68)
     h = kit.size(0.84, 0.94)
@@ -240,6 +249,7 @@ def kitchen(kit: Kit) -> Group:
     group.add(
         box(w, 0.012, 0.55), kit.surface("tiles", "brick", "plain", tile_m=0.5), (0, -0.006, h)
     )
+    # Sink and tap.
     x = kit.size(-0.3, 0.3) * w
     steel = kit.metal()
     group.add(box(0.5, 0.4, 0.006), steel, (x, -d / 2, h))
@@ -249,6 +259,7 @@ def kitchen(kit: Kit) -> Group:
         [np.zeros(12), -0.18 - 0.09 * (1 - np.cos(a)), h + 0.22 + 0.08 * np.sin(a)], axis=1
     )
     group.add(tube(np.concatenate([[[0, -0.18, h]], arc]) + np.array([x, 0, 0]), 0.012), steel)
+    # Things on the counter.
     scatter(
         kit,
         group,
@@ -257,6 +268,7 @@ def kitchen(kit: Kit) -> Group:
         tallest=0.45,
         things=_KITCHEN_THINGS,
     )
+    # Hung cupboards.
     if kit.chance(0.6):
         for side in (-0.25, 0.25):
             group.insert(cupboard(kit, hang=h + kit.size(0.5, 0.65)), (side * w, 0, 0))

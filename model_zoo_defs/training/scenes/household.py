@@ -218,6 +218,7 @@ def lamp(kit: Kit) -> Group:
 def plant(kit: Kit) -> Group:
     """Returns a pot with many thin bent leaves."""
     group = Group()
+    # Pot and earth.
     r = kit.size(0.05, 0.15)
     h = kit.size(0.08, 0.25)
     group.add(cylinder(r * 0.8, h, top=r), kit.any_surface())
@@ -226,6 +227,7 @@ def plant(kit: Kit) -> Group:
         kit.palette.new("speckle", (0.2, 0.14, 0.1), tile_m=0.1),
         (0, 0, h * 0.95),
     )
+    # Leaves: strips that rise and bend down along s, 0 at the stem and 1 at the tip.
     green = kit.palette.new(
         "foliage",
         (kit.size(0.15, 0.4), kit.size(0.35, 0.6), kit.size(0.1, 0.3)),

@@ -32,7 +32,11 @@ def leaves(kit: Kit, centres: np.ndarray, size: float, material: int) -> Group:
     return group
 
 
-def leaf_green(kit: Kit) -> tuple[float, float, float]:
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
+
+
+def leaf_green(kit: Kit) -> Colour:
     """Returns a random colour of leaves."""
     if kit.chance(0.15):
         return kit.size(0.4, 0.7), kit.size(0.3, 0.45), kit.size(0.08, 0.2)
@@ -42,6 +46,7 @@ def leaf_green(kit: Kit) -> tuple[float, float, float]:
 def tree(kit: Kit, *, far: bool = False) -> Group:
     """Returns a tree of trunk, branches and clumps of leaves; far: with fewer leaves."""
     group = Group()
+    # Trunk.
     h = kit.size(4, 13)
     r = kit.size(0.1, 0.3)
     stem = h * kit.size(0.2, 0.45)
@@ -51,6 +56,7 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
         tube([(0, 0, 0), (lean[0] * 0.3, lean[1] * 0.2, stem), (lean[0], lean[1], h * 0.8)], r),
         bark,
     )
+    # Clumps around the trunk: leaves, a dark body within, and a branch.
     conifer = kit.chance(0.2)
     clumps = int(kit.rng.integers(9, 22))
     green = kit.palette.new("foliage", leaf_green(kit), tile_m=0.8, gloss=0.0)
@@ -83,6 +89,7 @@ def tree(kit: Kit, *, far: bool = False) -> Group:
             ),
             bark,
         )
+    # All leaves together.
     size = kit.size(0.1, 0.24) * (2.0 if far else 1.0)
     group.insert(leaves(kit, np.concatenate(centres), size, green))
     return group
@@ -127,6 +134,7 @@ def pole(kit: Kit) -> Group:
     choice = kit.rng.random()
     r = kit.size(0.03, 0.09)
     if choice < 0.4:
+        # A lamp post.
         h = kit.size(4.5, 9)
         reach = kit.size(0.5, 2.2)
         group.add(
@@ -138,6 +146,7 @@ def pole(kit: Kit) -> Group:
         )
         group.add(superquadric((0.7, 0.25, 0.15), vertical=0.5), grey, (reach, 0, h))
     elif choice < 0.8:
+        # A road sign, round or square.
         h = kit.size(2.0, 3.0)
         group.add(cylinder(0.032, h + 0.4), grey)
         sign = kit.palette.new("poster", tile_m=0.7, whole=True, gloss=0.2)
@@ -152,6 +161,7 @@ def pole(kit: Kit) -> Group:
         else:
             group.add(box(w, 0.02, kit.size(0.4, 0.9), fit=0.7), sign, (0, -0.04, h - 0.4))
     else:
+        # A traffic light.
         h = kit.size(2.6, 6)
         group.add(cylinder(r, h), grey)
         case = kit.dark()

@@ -16,11 +16,13 @@ from model_zoo_defs.training.scenes.world import Light, Plan, Sky
 def room(kit: Kit) -> Plan:
     """Returns a furnished room with its free box and camera targets."""
     rng = kit.rng
+    # Size: some rooms are corridors, some ceilings slope.
     corridor = kit.chance(0.12)
     w = kit.size(1.4, 2.2) if corridor else kit.size(2.2, 6.5)
     d = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
     h = kit.size(2.2, 3.1)
     rise = kit.size(-0.9, 1.5) if kit.chance(0.2) else 0.0
+    # Floor and ceiling; some floors reflect.
     group = Group()
     targets = []
     paint = kit.surface(
@@ -56,6 +58,7 @@ def room(kit: Kit) -> Plan:
     ceiling = kit.surface("plain", "plaster", "tiles", vivid=0.05, tile_m=2)
     group.add(quads([[(0, 0, 0), (w, 0, 0), (w, d, 0), (0, d, 0)]]), floor)
     group.add(quads([[(0, 0, h), (w, 0, h + rise), (w, d, h + rise), (0, d, h)]]), ceiling)
+    # Walls with windows, doors, and what stands along them.
     sides = (((0.0, d), 0.0, w, h, rise), ((w, d), -np.pi / 2, d, h + rise, 0.0),
              ((w, 0.0), np.pi, w, h + rise, -rise), ((0.0, 0.0), np.pi / 2, d, h, 0.0))  # fmt: skip
     for start, yaw, length, tall, lift in sides:
@@ -73,6 +76,7 @@ def room(kit: Kit) -> Plan:
         decorate(kit, side, length, min(tall, tall + lift), holes)
         _line_up(kit, side, length, min(w, d), holes, corridor)
         group.insert(side, (*start, 0), yaw=yaw)
+    # What stands in the middle: furniture, a pillar, things on the floor.
     if not corridor:
         _middle(kit, group, w, d)
     if kit.chance(0.3):
@@ -88,7 +92,9 @@ def room(kit: Kit) -> Plan:
         area=clutter.Rectangle((0.4, 0.4), (w - 0.4, d - 0.4), 0.0),
         count=int(rng.integers(0, 10)),
     )
+    # What the windows show.
     _outside(kit, group, w, d)
+    # Places that the cameras look at, and lights.
     for _ in range(16):
         targets.append((kit.size(0.1, 0.9) * w, kit.size(0.1, 0.9) * d, kit.size(0.1, 1.4)))
     lights = _lights(kit, w, d, h, group)
@@ -130,6 +136,7 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
     x = kit.size(0.35, 0.65) * w
     y = kit.size(0.35, 0.65) * d
     yaw = kit.size(0, 6.3)
+    # A rug.
     if kit.chance(0.5):
         rug = box(kit.size(1, 2.4), kit.size(0.8, 1.8), 0.008, fit=0.0)
         group.add(
@@ -138,6 +145,7 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
             (x, y, 0),
             yaw=yaw,
         )
+    # A table with chairs on both sides.
     if min(w, d) > 2.8 and kit.chance(0.75):
         ensemble = Group()
         item = furniture.table(kit) if kit.chance(0.7) else furniture.desk(kit)
@@ -156,6 +164,7 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
                         seat, at, yaw=(0.0 if side > 0 else np.pi) + kit.size(-0.5, 0.5)
                     )
         group.insert(ensemble, (x, y, 0), yaw=yaw)
+    # Single pieces of furniture.
     for _ in range(int(kit.rng.integers(0, 4))):
         makers = (
             seating.chair,
@@ -170,12 +179,14 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
         group.insert(
             item, (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0), yaw=kit.size(0, 6.3)
         )
+    # A person.
     if kit.chance(0.3):
         group.insert(
             figures.person(kit),
             (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0),
             yaw=kit.size(0, 6.3),
         )
+    # A hanging lamp.
     if kit.chance(0.4):
         shade = kit.palette.new("plain", glow=kit.size(0, 2), vivid=0.4)
         z = kit.size(1.5, 2.0)

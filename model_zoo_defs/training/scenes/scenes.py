@@ -188,6 +188,7 @@ def scene_frames(
     rig: Rig | None = None,
 ) -> list[Frame]:
     """Returns the VIEWS_PER_SCENE frames of a scene; the same bytes on every run."""
+    # One scene; each of its views has random numbers of its own.
     rng = generator(seed, scene, 0)
     kind = pick_kind(rng, kinds)
     world, plan = build(kind, rng)

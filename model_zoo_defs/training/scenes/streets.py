@@ -16,6 +16,7 @@ _FAR = 110.0
 
 def _ground(kit: Kit, group: Group, half: float) -> None:
     """Adds road, markings, kerbs, pavements and the land beside them."""
+    # Road and land.
     asphalt = kit.palette.new(
         "speckle", (kit.size(0.25, 0.5),) * 3, tile_m=kit.size(1, 3), gloss=0.0
     )
@@ -28,6 +29,7 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
     )
     group.add(box(2 * half, 260, 0.2), asphalt, (0, 60, -0.2))
     group.add(box(400, 400, 0.1), land, (0, 60, -0.14))
+    # Pavements and kerbs.
     walk = kit.surface("paving", "speckle", "tiles", tile_m=kit.size(1, 2), vivid=0.0)
     kerb = kit.palette.new("speckle", (0.6, 0.6, 0.58), tile_m=1)
     if kit.chance(0.85):
@@ -35,6 +37,7 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
             wide = kit.size(1.2, 3.5)
             group.add(box(wide, 260, 0.14), walk, (side * (half + wide / 2 + 0.15), 60, -0.02))
             group.add(box(0.15, 260, 0.14), kerb, (side * (half + 0.075), 60, -0.015))
+    # Lines between the lanes, at the sides, and a crossing.
     white = kit.palette.new("speckle", (0.85, 0.85, 0.82), tile_m=0.6)
     lines = [0.0] if half < 5 else [-half / 3, half / 3]
     for x in lines:
@@ -49,6 +52,7 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
         y = kit.size(5, 25)
         for x in np.arange(-half + 0.4, half - 0.3, 0.9):
             group.add(box(0.45, 3, 0.008), white, (float(x), y, 0))
+    # Mended patches.
     for _ in range(int(kit.rng.integers(0, 6))):
         patch = kit.palette.new("speckle", (kit.size(0.2, 0.5),) * 3, tile_m=1)
         group.add(
@@ -61,6 +65,7 @@ def _ground(kit: Kit, group: Group, half: float) -> None:
 def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, float]]:
     """Adds parked and moving vehicles; returns camera targets."""
     targets = []
+    # Parked vehicles on both sides, most of them of a few kinds.
     fleet = [vehicles.car(kit) for _ in range(4)] + [vehicles.lorry(kit)]
     for side in (-1, 1):
         y = kit.size(-8, 12)
@@ -80,11 +85,13 @@ def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, fl
                 )
                 targets.append((x, y, 0.8))
             y += kit.size(5.2, 8)
+    # Moving vehicles.
     for _ in range(int(kit.rng.integers(0, 4))):
         lane = kit.rng.choice([-1, 1]) * half * 0.4
         y = kit.size(7, 70)
         vehicle = fleet[int(kit.rng.integers(5))]
         group.insert(vehicle, (lane, y, 0), yaw=0 if lane > 0 else np.pi)
+    # Cyclists.
     for _ in range(int(kit.rng.integers(0, 3))):
         group.insert(
             vehicles.cyclist(kit),
@@ -96,6 +103,7 @@ def _traffic(kit: Kit, group: Group, half: float) -> list[tuple[float, float, fl
 
 def _verge(kit: Kit, group: Group, side: float, x: float) -> None:
     """Adds poles, trees, people, bins and hedges along one pavement."""
+    # Trees in a row.
     trees = [tree(kit) for _ in range(2)]
     spacing = kit.size(5, 14)
     density = kit.size(0, 1)
@@ -105,20 +113,23 @@ def _verge(kit: Kit, group: Group, side: float, x: float) -> None:
             group.insert(
                 trees[int(kit.rng.integers(2))], at, yaw=kit.size(0, 6.3), scale=kit.size(0.6, 1.1)
             )
+    # Poles in a row.
     post = pole(kit)
     for y in np.arange(kit.size(2, 12), 90, kit.size(12, 30)):
         item = post if kit.chance(0.6) else pole(kit)
         group.insert(
             item, (side * (x + 0.4), float(y), 0.1), yaw=0 if side < 0 else np.pi * kit.chance(0.5)
         )
+    # People, bins and bicycles.
     for _ in range(int(kit.rng.integers(0, 5))):
         at = (side * (x + kit.size(0.3, 2.5)), kit.size(3, 40), 0.12)
         group.insert(figures.person(kit), at, yaw=kit.size(0, 6.3))
     for _ in range(int(kit.rng.integers(0, 4))):
-        item = vehicles.pram(kit) if kit.chance(0.7) else figures.bicycle(kit)
+        item = vehicles.street_box(kit) if kit.chance(0.7) else figures.bicycle(kit)
         group.insert(
             item, (side * (x + kit.size(0.5, 2.5)), kit.size(3, 40), 0.12), yaw=kit.size(0, 6.3)
         )
+    # A hedge or a fence.
     if kit.chance(0.5):
         length = kit.size(5, 18)
         maker = hedge if kit.chance(0.55) else fence
@@ -164,6 +175,7 @@ def _background(kit: Kit, group: Group) -> None:
 def street(kit: Kit) -> Plan:
     """Returns a street along +y with cameras' free box over its lanes."""
     group = Group()
+    # Road, vehicles, and both sides of it.
     half = kit.size(2.8, 7.0)
     _ground(kit, group, half)
     targets = _traffic(kit, group, half)
@@ -173,6 +185,7 @@ def street(kit: Kit) -> Plan:
             buildings.row(kit, group, side, half + kit.size(2.5, 7))
         else:
             _grove(kit, group, side, half + kit.size(3, 7))
+    # What is far, and wires across the street.
     _background(kit, group)
     if kit.chance(0.4):
         for _ in range(int(kit.rng.integers(1, 5))):
@@ -187,6 +200,7 @@ def street(kit: Kit) -> Plan:
                 ),
                 kit.dark(),
             )
+    # Things on the road, places that the cameras look at, and light.
     clutter.scatter(
         kit,
         group,

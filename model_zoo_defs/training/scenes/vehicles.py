@@ -22,11 +22,13 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Mesh:
     """Returns a closed hull through stations of (y, half width, low z, high z)."""
+    # A rounded rectangle: power 1 is an ellipse, 0 a rectangle.
     angle = np.linspace(0, 2 * np.pi, 25)
     c = np.cos(angle)
     s = np.sin(angle)
     x = np.sign(c) * np.abs(c) ** power
     z = np.sign(s) * np.abs(s) ** power
+    # The ends are closed by stations of nearly no size.
     rows = [
         (
             stations[0][0],
@@ -44,6 +46,7 @@ def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Me
             (stations[-1][2] + stations[-1][3]) / 2 + 0.01,
         )
     )
+    # A ring of points for each station, the last point the first.
     points = np.empty((len(rows), 25, 3))
     for index, (y, half, low, high) in enumerate(rows):
         points[index, :, 0] = half * x
@@ -72,6 +75,7 @@ def _wheels(kit: Kit, group: Group, track: float, axles: tuple[float, ...], radi
 def car(kit: Kit) -> Group:
     """Returns a passenger car."""
     group = Group()
+    # Materials.
     paint_colours = (
         (0.85,) * 3,
         (0.6,) * 3,
@@ -86,6 +90,7 @@ def car(kit: Kit) -> Group:
         "plain", None if vivid else base, gloss=0.7, mirror=kit.size(0.04, 0.12), vivid=1.0
     )
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.size(0.1, 0.25))
+    # Measures: f and b are the front and the back end.
     long = kit.size(3.7, 4.8)
     half = kit.size(0.82, 0.93)
     low = kit.size(0.18, 0.24)
@@ -95,6 +100,7 @@ def car(kit: Kit) -> Group:
     f = long / 2
     b = -long / 2
     estate = kit.chance(0.55)
+    # Body, cabin and roof.
     body = [
         (b, half * 0.86, low + 0.12, belt * 0.85), (b + 0.12, half * 0.95, low + 0.03, belt * 0.97),
         (b + 0.8, half, low, belt), (0.2, half, low, belt), (f - 1.2, half * 0.99, low, hood),
@@ -113,6 +119,7 @@ def car(kit: Kit) -> Group:
     group.add(_loft(cabin, 0.4), glass)
     top = [(y, w * 0.93, z - 0.05, z + 0.012) for y, w, _, z in cabin[1:4]]
     group.add(_loft(top, 0.5), paint)
+    # On both sides: pillars, mirror, lights and trim.
     for side in (-1, 1):
         for start, end in ((cabin[0], cabin[1]), (cabin[4], cabin[3])):
             group.add(
@@ -147,10 +154,12 @@ def car(kit: Kit) -> Group:
             (side * half * 0.78, b + 0.06, belt * 0.85),
         )
         group.add(box(0.005, long * 0.5, 0.02), kit.dark(), (side * half, -0.1, belt * 0.6))
+    # Plates and bumper.
     plate = kit.palette.new("poster", (0.9, 0.9, 0.8), tile_m=0.5)
     group.add(box(0.5, 0.02, 0.11), plate, (0, f + 0.005, low + 0.22))
     group.add(box(0.5, 0.02, 0.11), plate, (0, b - 0.005, belt * 0.6))
     group.add(box(half * 1.5, 0.06, 0.14), kit.dark(), (0, f - 0.03, low + 0.05))
+    # Wheels.
     radius = kit.size(0.29, 0.36)
     # A dark box under the car and dark discs behind the wheels stand for the wheel arches.
     group.add(box(half * 1.8, long * 0.86, 0.3), kit.dark(), (0, 0, low - 0.02))
@@ -169,6 +178,7 @@ def car(kit: Kit) -> Group:
 def lorry(kit: Kit) -> Group:
     """Returns a van, bus or lorry."""
     group = Group()
+    # Materials and measures: f and b are the front and the back end.
     paint = kit.palette.new("plain", gloss=0.5, mirror=0.05, vivid=0.5)
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=0.2)
     long = kit.size(4.8, 11)
@@ -176,6 +186,7 @@ def lorry(kit: Kit) -> Group:
     tall = kit.size(1.9, 3.4)
     f = long / 2
     b = -long / 2
+    # A closed body, or a cab before a load.
     body = [(b, half, 0.4, tall), (f - 0.7, half, 0.4, tall), (f, half * 0.96, 0.4, tall * 0.55)]
     if kit.chance(0.4):
         load = kit.surface("plain", "poster", "stripes", tile_m=2.5, vivid=0.4)
@@ -187,6 +198,7 @@ def lorry(kit: Kit) -> Group:
         ]
         group.add(box(half, long * 0.9, 0.3), kit.dark(), (0, 0, 0.5))
     group.add(_loft(body, 0.25), paint)
+    # Windows at the sides, before and behind.
     for side in (-1, 1):
         y = f - 1.6
         while y > body[0][0] + 0.6:
@@ -194,6 +206,7 @@ def lorry(kit: Kit) -> Group:
             y -= 1.1
     group.add(box(half * 1.7, 0.05, tall * 0.3), glass, (0, f - 0.25, tall * 0.55), pitch=0.45)
     group.add(box(half * 1.5, 0.02, tall * 0.25), glass, (0, b - 0.005, tall * 0.55))
+    # Wheels.
     _wheels(kit, group, half - 0.1, (f - 0.9, b + 0.9), 0.42)
     return group
 
@@ -215,7 +228,7 @@ def cyclist(kit: Kit) -> Group:
     return group
 
 
-def pram(kit: Kit) -> Group:
+def street_box(kit: Kit) -> Group:
     """Returns a wheeled bin, a hydrant or a box on the pavement."""
     group = Group()
     choice = kit.rng.random()
@@ -224,9 +237,10 @@ def pram(kit: Kit) -> Group:
         body = np.array(
             [[(-0.25, -0.25, 0.1), (0.25, -0.25, 0.1), (0.3, -0.3, 1.0), (-0.3, -0.3, 1.0)]]
         )
-        group.add(joined([quads(body), quads(body * [1, -1, 1])]), shell)
+        # Two walls across and two along, each mirrored.
+        group.add(joined([quads(body), quads(body * np.array([1, -1, 1]))]), shell)
         side = body[:, :, [1, 0, 2]]
-        group.add(joined([quads(side), quads(side * [-1, 1, 1])]), shell)
+        group.add(joined([quads(side), quads(side * np.array([-1, 1, 1]))]), shell)
         group.add(box(0.64, 0.66, 0.06), shell, (0, 0, 1.0))
         for x in (-0.22, 0.22):
             group.add(torus(0.08, 0.03), kit.dark(), (x, 0.25, 0.1), roll=np.pi / 2)

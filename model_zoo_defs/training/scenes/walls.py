@@ -39,6 +39,7 @@ def wall(length: float, height: float, holes: Sequence[Hole], *, rise: float = 0
 def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     """Adds the reveal, the frame and what closes a window or door."""
     u0, v0, u1, v1 = hole
+    # Reveals around the hole.
     deep = kit.size(0.08, 0.3)
     x = (u0 + u1) / 2
     w = u1 - u0
@@ -48,6 +49,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
         ((x, deep / 2, v0), (w, deep, 0.004)), ((x, deep / 2, v1), (w, deep, 0.004)),
     ):  # fmt: skip
         side.add(box(*size), paint, at)
+    # The frame.
     trim = kit.wood() if kit.chance(0.4) else kit.palette.new("plain", (0.9, 0.9, 0.88), gloss=0.3)
     t = kit.size(0.04, 0.09)
     for at, size in (
@@ -55,6 +57,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
         ((x, deep, v1 - t), (w, 0.05, t)), ((x, deep, v0), (w, 0.05, t)),
     ):  # fmt: skip
         side.add(box(*size), trim, at)
+    # A door: what is behind it, and a leaf, open or closed.
     if v0 < 0.05:
         _hallway(kit, side, (u0 + u1) / 2, deep, paint)
         if kit.chance(0.75):
@@ -67,17 +70,20 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
             leaf.add(rod((w * 0.8, -0.06, 1.02), (w * 0.92, -0.06, 1.02), 0.01), kit.metal())
             side.insert(leaf, (u0 + t, deep * 0.6, 0), yaw=angle)
         return
+    # A window: bars and sill.
     for along in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
         side.add(box(0.05, 0.05, h), trim, (u0 + w * float(along), deep, v0))
     if kit.chance(0.4):
         side.add(box(w, 0.04, 0.04), trim, (x, deep, v0 + h * kit.size(0.4, 0.7)))
     side.add(box(w + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
+    # Curtains, or a blind.
     if kit.chance(0.5):
         _curtain(kit, side, u0, u1, v1)
     elif kit.chance(0.4):
         slat = kit.surface("plain", vivid=0.15)
         for z in np.arange(v0 + h * kit.size(0, 0.6), v1, 0.06):
             side.add(box(w - 0.02, 0.04, 0.002), slat, (x, deep * 0.5, float(z)), pitch=0.6)
+    # Things on the sill.
     scatter_z = v0
     if kit.chance(0.4):
         clutter.scatter(
@@ -132,6 +138,7 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
         z = kit.size(1.1, max(1.2, height - 0.7))
         w = kit.size(0.2, 1.0)
         h = kit.size(0.2, 0.8)
+        # A picture, some with a frame.
         if choice < 0.6:
             thick = kit.size(0.002, 0.04)
             if thick > 0.01:
@@ -140,6 +147,7 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
             poster = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
             side.add(box(w, 0.004, h, fit=h), poster, (u, -thick - 0.002, z))
         elif choice < 0.75:
+            # A shelf with things.
             side.add(box(w + 0.3, 0.2, 0.025), kit.wood(), (u, -0.1, z))
             clutter.scatter(
                 kit,
@@ -149,10 +157,12 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
                 tallest=0.3,
             )
         elif choice < 0.9:
+            # A radiator.
             white = kit.surface("plain", vivid=0.05)
             for x in np.arange(-0.4, 0.41, 0.05):
                 side.add(box(0.035, 0.08, 0.55), white, (u + float(x), -0.09, 0.12))
         else:
+            # A switch.
             side.add(box(0.08, 0.012, 0.08), kit.palette.new("plain", (0.9,) * 3), (u, -0.006, 1.1))
 
 
