@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,7 +38,7 @@ def check_tables(
     if named.count(_STDOUT) + as_json > 1:
         raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
     check_outputs(files, inputs, overwrite=overwrite)
-    if len({path.resolve() for path in files}) < len(files):
+    if len({os.path.realpath(path) for path in files}) < len(files):
         raise UsageError(f"--csv and --latex are the same file {files[0]}; name two files")
 
 

@@ -6,6 +6,7 @@ Imports neither numpy nor torch.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,10 @@ from pnpdepth_cli.settings import option
 
 def check_outputs(paths: Iterable[Path], inputs: Iterable[Path] = (), *, overwrite: bool) -> None:
     """Raises OutputError for a file that is an input, or that exists and may not be replaced."""
-    resolved = {path.resolve() for path in inputs}
+    # `Path.resolve` raises for a loop of symbolic links; whoever opens it says what is wrong.
+    real_inputs = {os.path.realpath(path) for path in inputs}
     for path in paths:
-        if path.resolve() in resolved:
+        if os.path.realpath(path) in real_inputs:
             raise OutputError(f"{path} is one of the inputs; name another output")
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, or name another output")

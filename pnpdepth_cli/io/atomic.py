@@ -49,7 +49,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
     The yielded folder is beside it. OSErrors become OutputErrors.
     """
-    target = folder.resolve()
+    target = Path(os.path.realpath(folder))
     make_folder(target.parent)
     temporary = target.with_name(f".{secrets.token_hex(6)}")
     try:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.util
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -185,7 +186,7 @@ def importing_beside(spec: str) -> Iterator[None]:
     if file.suffix != ".py":
         yield
         return
-    folder = str(file.resolve().parent)
+    folder = str(Path(os.path.realpath(file)).parent)
     sys.path.insert(0, folder)
     try:
         yield

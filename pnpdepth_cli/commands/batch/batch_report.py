@@ -45,8 +45,8 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
         request: Request of the batch.
         folder: Folder of the report.
     """
-    inside, output = folder.resolve(), request.output.resolve()
-    if output.is_relative_to(inside):
+    output = Path(os.path.realpath(request.output))
+    if output.is_relative_to(os.path.realpath(folder)):
         own = request.output / "report"
         raise OutputError(f"{folder} holds the results; name another folder, such as {own}")
     source, overwrite = _source(request, folder), request.refine.overwrite
@@ -97,7 +97,7 @@ def write_batch_report(
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
     """What the report is made of."""
-    output = os.path.relpath(request.output.resolve(), folder.resolve())
+    output = os.path.relpath(os.path.realpath(request.output), os.path.realpath(folder))
     return {"command": "batch", "output": output}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -266,7 +267,7 @@ def _read_run(text: str) -> Run:
     if text.endswith(f":{BEFORE}") and not path.exists():
         path, stage = Path(text.removesuffix(f":{BEFORE}")), BEFORE
     path = path / _SUMMARY if path.is_dir() else path
-    name = path.resolve().parent.name if path.name == _SUMMARY else path.stem
+    name = Path(os.path.realpath(path)).parent.name if path.name == _SUMMARY else path.stem
     content = read_json(path)
     # The frames with scores, and the measures that all of them have.
     try:

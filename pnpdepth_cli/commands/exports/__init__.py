@@ -7,6 +7,7 @@ holds an `Export` called `EXPORT`.
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -183,8 +184,10 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         hint = "refine the whole image (--protocol whole)"
         raise InputError(f"{result.depth} is not of the size of {image}; {hint}")
     path = output / "images" / name
-    if isinstance(image, Path) and image.resolve().is_relative_to(output.resolve()):
-        path = image
+    if isinstance(image, Path):
+        real_image = Path(os.path.realpath(image))
+        if real_image.is_relative_to(os.path.realpath(output)):
+            path = image
     return ExportFrame(
         result=result,
         image=image,

@@ -91,7 +91,7 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     if any(camera.distortion[len(names) :]):
         fact = f"{camera.lens} with {len(camera.distortion)} coefficients"
         raise InputError(f"{frame.image}: Nerfstudio knows no lens {fact}; undistort images first")
-    image = os.path.relpath(frame.image_path.resolve(), folder.resolve())
+    image = os.path.relpath(os.path.realpath(frame.image_path), os.path.realpath(folder))
     # The pose, with Nerfstudio's axes: y up, z backwards.
     matrix = np.eye(4)
     matrix[:3] = pose
