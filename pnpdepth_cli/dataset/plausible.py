@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.agreement import compare_depths
+from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.dataset.range_ends import far_end, far_values, near_end
 from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.depth import metres

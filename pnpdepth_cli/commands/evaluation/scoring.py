@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.eval_request import EvalRequest
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.results import ResultFrame
+from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.core.metrics import score
-from pnpdepth_cli.dataset.agreement import compare_depths
 from pnpdepth_cli.dataset.arrays import (
     apply_masks,
     camera_of_file,
