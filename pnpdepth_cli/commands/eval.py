@@ -20,7 +20,8 @@ from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order
 from pnpdepth_cli.commands.shared.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.shared.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.shared.tables import Table, count_of, some_names
-from pnpdepth_cli.dataset.agreement import Agreement, unit_warning
+from pnpdepth_cli.completion.two_depths import Agreement
+from pnpdepth_cli.dataset.agreement import unit_warning
 from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_of, one_of_each
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames

@@ -8,93 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.completion.two_depths import (
+    FEWEST_PAIRS,
+    OTHER_UNIT,
+    TIGHT,
+    Agreement,
+    compare_depths,
+)
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading
 
-_MOST = 20_000  # pairs that are compared; more tell no more
-_FEWEST = 10  # pairs; fewer decide nothing
-_CLEAR = 0.5  # rank correlation, of either sign, from which the order of two depths is clear
-_STANDARD_ERRORS = 4.0  # of the rank correlation, by which chance does not explain it
-_OTHER_UNIT = math.log(1.5)  # of the ratio, which noise does not explain
 _OTHER_FIT = math.log(3.0)  # of the ratio of a prediction, which a network's own scale explains
-_TIGHT = 0.25  # spread of the log ratio of depths that differ by a unit
 _SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0, 4000.0, 6553.5, 39.3701, 3.28084)
 """Numbers per metre in use. Millimetres, KITTI, TUM, cm, dm, m, 0.25 mm, Replica, inches, feet."""
 _ROUNDED = 0.05  # log ratio to the nearest of these, which is then meant
 _ROUNDED_FIT = 0.15  # the same of the depth of a network, which is biased
-
-
-class Agreement(NamedTuple):
-    """How two depths of the same pixels agree."""
-
-    pairs: int
-    """Number of pairs that both know."""
-    rank: float
-    """Spearman's rank correlation, −1…1; 0 of values without order."""
-    ratio: float
-    """Median of first / second; NaN without pairs."""
-    spread: float
-    """Half of the range that holds the middle 68 % of the log ratio."""
-
-    @property
-    def is_reversed(self) -> bool:
-        """Whether larger values of one are nearer in the other, as of depth and disparity."""
-        return self._is_certain and self.rank < -_CLEAR
-
-    @property
-    def is_ordered(self) -> bool:
-        """Whether larger values of one are farther in the other, as of two depths."""
-        return self._is_certain and self.rank > _CLEAR
-
-    @property
-    def _is_certain(self) -> bool:
-        """Whether chance does not explain the rank correlation."""
-        return abs(self.rank) * math.sqrt(max(self.pairs - 1, 0)) > _STANDARD_ERRORS
-
-    @property
-    def is_unit(self) -> bool:
-        """Whether a factor, far from 1, explains the difference of the two."""
-        off = self.pairs >= _FEWEST and abs(math.log(self.ratio)) > _OTHER_UNIT
-        # of a wall, the order is noise
-        ordered = self.rank >= _CLEAR or self.spread < _TIGHT / 5
-        return off and self.spread <= _TIGHT and ordered
-
-
-def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) -> Agreement:
-    """Returns the rank correlation of two depths, and the median and spread of their ratio.
-
-    Args:
-        first: Depths of any shape, not above 0 where unknown.
-        second: The others, of the same shape and pixels.
-    """
-    both = (first > 0) & (second > 0)
-    values = np.stack([first[both], second[both]]).astype(np.float64)
-    count = values.shape[1]
-    if not count:
-        return Agreement(0, 0.0, math.nan, math.nan)
-    values = values[:, :: max(1, count // _MOST)]
-    log_ratio = np.log(values[0]) - np.log(values[1])
-    low, middle, high = np.quantile(log_ratio, (0.16, 0.5, 0.84)).tolist()
-    ranks = np.stack([_ranks(each) for each in values])
-    ranks -= ranks.mean(axis=1, keepdims=True)
-    length = float(np.linalg.norm(ranks[0]) * np.linalg.norm(ranks[1]))
-    rank = float(ranks[0] @ ranks[1]) / length if length > 0 else 0.0
-    return Agreement(count, rank, math.exp(middle), (high - low) / 2)
-
-
-def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The ranks (N,) of values (N,) from 1, the mean rank for equal ones.
-
-    As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
-    """
-    _, number, count = np.unique(values, return_inverse=True, return_counts=True)
-    mean_rank = np.cumsum(count) - (count - 1) / 2
-    return np.asarray(mean_rank[number], np.float64)
 
 
 def check_order(what: str, first: NDArray[np.floating], second: NDArray[np.floating]) -> str | None:
@@ -114,7 +46,7 @@ def check_order(what: str, first: NDArray[np.floating], second: NDArray[np.float
         f"{what} have opposite orders (rank correlation {found.rank:.2f} of {found.pairs:,}"
         " pixels): larger values are nearer in one of them, as of disparity and 1/depth"
     )
-    if product.spread > _TIGHT:
+    if product.spread > TIGHT:
         return f"{fact}; their product is not constant, so that no baseline · focal length fits"
     kind = f"disparity:{product.ratio:.4g}"
     if abs(math.log(product.ratio)) < _ROUNDED:
@@ -143,13 +75,13 @@ def unit_warning(
     Raises:
         InputError: There is such a multiple, and one of the scales was assumed.
     """
-    if found.pairs < _FEWEST:
+    if found.pairs < FEWEST_PAIRS:
         return None
     times = (
         f"{what} are {found.ratio:.4g} times the ground truth (median of {found.pairs:,} pixels)"
     )
     if not found.is_unit:
-        if abs(math.log(found.ratio)) <= (_OTHER_FIT if fitted else _OTHER_UNIT):
+        if abs(math.log(found.ratio)) <= (_OTHER_FIT if fitted else OTHER_UNIT):
             return None
         way_out = "; --scale-by fits each image" if fitted else ""
         return (

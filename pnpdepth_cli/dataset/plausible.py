@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.dataset.agreement import compare_depths
+from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.dataset.range_ends import far_end, far_values, near_end
 from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.depth import metres
@@ -54,6 +54,14 @@ _SQUARE = 0.97  # of the other side, up to which the points of a square reach
 _CORNER, _MANY = 0.75, 50  # of the image's sides that so many points keep within: another size
 _DOWN, _PART_OF_ROWS = 0.6, 0.3  # rank correlation; of the image's height, that points cover
 _MANY_BESIDE, _RUN_DOWN = 100, 0.15  # pixels beside unknown ones, and how many of them run down
+_TWICE = 0.04
+"""Log ratio to 2 within which neighbours are one twice the other; as wide as either side of it."""
+_MANY_TWICE = 30
+"""Neighbours; as many as any map has by chance."""
+_PART_TWICE = 0.004
+"""Of all neighbours."""
+_MORE_TWICE = 5.0
+"""Times as many as have a ratio beside 2."""
 _UNIT, _WHOLE_UNIT, _NEAR_UNIT = 1.0001, 0.99, 0.9  # ends and a median of maps within 0…1
 _BELOW_ZERO = 0.1  # of the points; more left of or above the image are x y z of a scan
 
@@ -230,8 +238,9 @@ def interpolation_warning(depth: NDArray[np.float32]) -> str | None:
     """Returns a warning if a map (H, W) with unknown pixels, 0, was resized by interpolation.
 
     Values then run down to 0 beside unknown pixels. There, below half of a neighbour are 0.4 % of
-    the pixels at most in 36 maps of five sets, 10 % in the samples, and 22 to 80 % after a resize
-    (but 5 to 10 % of a sparse map at exactly half its size, whose pixels are means of four).
+    the pixels at most in 36 maps of five sets, 10 % in the samples, and 22 to 80 % after a resize.
+    At exactly half the size, a pixel is the mean of four, of which one to four are known, so that
+    neighbours have ratios such as 2.
     """
     known = depth > 0
     window = np.ones((3, 3), np.uint8)
@@ -240,13 +249,40 @@ def interpolation_warning(depth: NDArray[np.float32]) -> str | None:
     if count < _MANY_BESIDE:
         return None
     low = depth[beside] < cv2.dilate(depth, window)[beside] / 2
-    if low.mean() < _RUN_DOWN:
+    cause = "as of a map that was resized by interpolation, which mixes depth with unknown"
+    way_out = "resize it by the nearest neighbour"
+    if low.mean() >= _RUN_DOWN:
+        return (
+            f"warning: {low.mean():.0%} of {count:,} depths beside unknown pixels are below half of"
+            f" a neighbour's, {cause}; {way_out}"
+        )
+    twice = _share_of_twice(depth)
+    if twice is None:
         return None
     return (
-        f"warning: {low.mean():.0%} of {count:,} depths beside unknown pixels are below half of a"
-        " neighbour's, as of a map that was resized by interpolation, which mixes depth with"
-        " unknown; resize it by the nearest neighbour"
+        f"warning: {twice:.1%} of neighbouring depths are one exactly twice the other, {cause};"
+        f" {way_out}"
     )
+
+
+def _share_of_twice(depth: NDArray[np.float32]) -> float | None:
+    """The share of neighbours of a map (H, W) of which one is twice the other; None if by chance.
+
+    Where they are surfaces, no more have this ratio than have those beside it. After a resize to
+    half or a quarter, 0.5 to 38 % have it in 30 maps of seven sets, and 6 to 500 times as many as
+    beside it. Before it, of 130 maps that have 5 times as many, none has it at more than 0.14 %.
+    """
+    ratios = list[NDArray[np.float32]]()
+    for first, second in ((depth[:, 1:], depth[:, :-1]), (depth[1:], depth[:-1])):
+        both = (first > 0) & (second > 0)
+        ratios.append(np.abs(np.log(first[both] / second[both])))
+    off = np.abs(np.concatenate(ratios) - np.log(np.float32(2)))
+    twice = int(np.count_nonzero(off < _TWICE))
+    # The windows beside it are together twice as wide.
+    beside = np.count_nonzero((off > 2 * _TWICE) & (off < 4 * _TWICE)) / 2
+    if twice < max(_MANY_TWICE, _PART_TWICE * len(off), _MORE_TWICE * beside):
+        return None
+    return twice / len(off)
 
 
 def named(what: str, note: str) -> str:

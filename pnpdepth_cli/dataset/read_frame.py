@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.image_registration import better_orientation, evidence
+from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.dataset import arrays, sparse_depth
-from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
+from pnpdepth_cli.dataset.agreement import check_order, unit_warning
 from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import (
     SCAN_ONLY_SUFFIXES,

@@ -141,7 +141,7 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
         raise ModelError(f"{folder} has no {weights.name}; {way_out}")
     # The definition, whose network is built when it is needed.
     return definition.ModelDefinition(
-        name=folder.resolve().name,
+        name=Path(os.path.realpath(folder)).name,
         summary=f"Hugging Face {kind}",
         input_kind="rgb",
         size=size,

@@ -168,6 +168,22 @@ def test_a_map_within_0_and_1_is_no_metres_unless_said(
     np.testing.assert_allclose(read(path, depth_scale=1.0).points.depth.max(), stored.max())
 
 
+@pytest.mark.parametrize("factor", [0.5, 0.25])
+@pytest.mark.parametrize("interpolation", [cv2.INTER_LINEAR, cv2.INTER_AREA])
+@pytest.mark.parametrize("known", [0.2, 0.8])
+def test_a_map_of_half_the_size_whose_pixels_are_means_with_unknown_ones_is_told(
+    factor: float, interpolation: int, known: float, tmp_path: Path
+) -> None:
+    chance = np.random.default_rng(0).random(TRUTH.shape)
+    depth = np.where(chance < known, TRUTH, 0).astype(np.float32)
+    resized = cv2.resize(depth, None, fx=factor, fy=factor, interpolation=interpolation)
+    frame = read(save(tmp_path / "a.npy", resized), None)
+    assert any("interpolation" in note for note in warnings_of(frame))
+    nearest = cv2.resize(depth, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    frame = read(save(tmp_path / "b.npy", nearest), None)
+    assert not any("interpolation" in note for note in warnings_of(frame))
+
+
 def test_16_bits_that_were_stretched_are_no_depth_unless_a_scale_is_stated(tmp_path: Path) -> None:
     ramp = np.linspace(0, 1, TRUTH.size).reshape(TRUTH.shape)
     stretched = np.rint(65535 * ramp).astype(np.uint16)

@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from pnpdepth_cli.choices import OutputKind, OutputScale
 from pnpdepth_cli.errors import DeviceError, ModelError
 from pnpdepth_cli.models.definition import Multiple, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -94,6 +95,41 @@ def test_a_network_of_the_wrong_direction_is_one_depth_everywhere_and_named() ->
     aligned = reader(depth)
     assert float(aligned.max() - aligned.min()) == pytest.approx(0, abs=1e-5)
     assert any(note.startswith("warning: at the 50 points") for note in reader.notes)
+
+
+@pytest.mark.parametrize("stored", ["386 / depth", "1 / depth", "10 - depth"])
+@pytest.mark.parametrize("kind", ["depth", "log", "inverse"])
+@pytest.mark.parametrize("asked", ["auto", "none"])
+def test_points_of_disparity_are_told_by_a_network_that_sees_depth(
+    stored: str, kind: OutputKind, asked: str
+) -> None:
+    depth, points = frame_of_depth(200)
+    output = {"depth": depth, "log": depth.log(), "inverse": 1 / depth}[kind]
+    reversed_depth = {
+        "386 / depth": 386 / points.depth,
+        "1 / depth": 1 / points.depth,
+        "10 - depth": 10 - points.depth,
+    }[stored]
+    scale: OutputScale = "affine" if asked == "auto" else "metric"
+    of_image = network(output_kind=kind, output_scale=scale)
+    for given, is_told in ((points.depth, False), (reversed_depth, True)):
+        reader = AlignedDepth(of_image, replace(points, depth=given), asked)
+        reader(output)
+        told = [note for note in reader.notes if "--sparse-kind" in note]
+        assert bool(told) == is_told
+        assert all(note.startswith("warning") for note in told)
+
+
+def test_the_order_of_the_points_says_nothing_where_a_network_follows_them_or_sees_little() -> None:
+    depth, points = frame_of_depth(200)
+    for of_points, output in (
+        (network(input_kind="rgb+sparse", output_scale="affine"), 1 / depth),
+        (network(output_kind="unknown"), 1 / depth),
+        (network(output_scale="affine"), 1 / depth + 2 * torch.rand(depth.shape)),
+    ):
+        reader = AlignedDepth(of_points, points, "auto")
+        reader(output)
+        assert not any("--sparse-kind" in note for note in reader.notes)
 
 
 @pytest.mark.parametrize(("wrong", "said"), [(0.2, False), (0.4, True)])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_errors
 from pnpdepth_cli.commands.requests.eval_request import EvalRequest
 from pnpdepth_cli.commands.shared.results import ResultFrame
-from pnpdepth_cli.dataset.agreement import compare_depths
+from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.dataset.arrays import (
     apply_masks,
     camera_of_file,

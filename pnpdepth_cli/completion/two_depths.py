@@ -1,0 +1,95 @@
+"""Two depths of the same pixels: how their order and their ratio agree."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MOST = 20_000
+"""Pairs that are compared; more tell no more."""
+FEWEST_PAIRS = 10
+"""Fewer pairs decide nothing."""
+_CLEAR = 0.5
+"""Rank correlation, of either sign, from which the order of two depths is clear."""
+_STANDARD_ERRORS = 4.0
+"""Of the rank correlation, by which chance does not explain it."""
+OTHER_UNIT = math.log(1.5)
+"""Log ratio that noise does not explain."""
+TIGHT = 0.25
+"""Spread of the log ratio of depths that differ by a unit."""
+
+
+class Agreement(NamedTuple):
+    """How two depths of the same pixels agree."""
+
+    pairs: int
+    """Number of pairs that both know."""
+    rank: float
+    """Spearman's rank correlation, −1…1; 0 of values without order."""
+    ratio: float
+    """Median of first / second; NaN without pairs."""
+    spread: float
+    """Half of the range that holds the middle 68 % of the log ratio."""
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether larger values of one are nearer in the other, as of depth and disparity."""
+        return is_reversed(self.rank, self.pairs)
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether larger values of one are farther in the other, as of two depths."""
+        return is_reversed(-self.rank, self.pairs)
+
+    @property
+    def is_unit(self) -> bool:
+        """Whether a factor, far from 1, explains the difference of the two."""
+        off = self.pairs >= FEWEST_PAIRS and abs(math.log(self.ratio)) > OTHER_UNIT
+        # of a wall, the order is noise
+        ordered = self.rank >= _CLEAR or self.spread < TIGHT / 5
+        return off and self.spread <= TIGHT and ordered
+
+
+def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) -> Agreement:
+    """Returns the rank correlation of two depths, and the median and spread of their ratio.
+
+    Args:
+        first: Depths of any shape, not above 0 where unknown.
+        second: The others, of the same shape and pixels.
+    """
+    both = (first > 0) & (second > 0)
+    values = np.stack([first[both], second[both]]).astype(np.float64)
+    count = values.shape[1]
+    if not count:
+        return Agreement(0, 0.0, math.nan, math.nan)
+    values = values[:, :: max(1, count // _MOST)]
+    log_ratio = np.log(values[0]) - np.log(values[1])
+    low, middle, high = np.quantile(log_ratio, (0.16, 0.5, 0.84)).tolist()
+    rank = rank_correlation(*values)
+    return Agreement(count, rank, math.exp(middle), (high - low) / 2)
+
+
+def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
+    """Returns Spearman's rank correlation of finite numbers (N,), 0 of numbers without order."""
+    ranks = np.stack([_ranks(first), _ranks(second)])
+    ranks -= ranks.mean(axis=1, keepdims=True)
+    length = float(np.linalg.norm(ranks[0]) * np.linalg.norm(ranks[1]))
+    return float(ranks[0] @ ranks[1]) / length if length > 0 else 0.0
+
+
+def is_reversed(rank: float, pairs: int) -> bool:
+    """Returns whether a rank correlation of so many pairs is clearly below 0, not by chance."""
+    return rank < -_CLEAR and -rank * math.sqrt(max(pairs - 1, 0)) > _STANDARD_ERRORS
+
+
+def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The ranks (N,) of values (N,) from 1, the mean rank for equal ones.
+
+    As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
+    """
+    _, number, count = np.unique(values, return_inverse=True, return_counts=True)
+    mean_rank = np.cumsum(count) - (count - 1) / 2
+    return np.asarray(mean_rank[number], np.float64)
