@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 from pnpdepth_cli.core.metrics import score
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.measures import MEASURES, OF_SIGMA, TABLE, by_depth, frame_means
-from tests.core.test_metrics import brute
+from tests.core.plain_scores import brute
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 MAIN = ("rmse", "mae", "mre", "delta1")

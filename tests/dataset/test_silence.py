@@ -12,7 +12,7 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
-from tests.io.test_scans import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes
+from tests.io.scan_files import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 SCALES = {

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +18,7 @@ from pnpdepth_cli.io.atomic import (
     remove_leftovers,
 )
 from pnpdepth_cli.io.depth import write_depth
-
-
-@contextmanager
-def no_room_on_disk() -> Iterator[None]:
-    """Files cannot grow beyond 64 bytes inside."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (64, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from tests.io.full_disk import no_room_on_disk
 
 
 @pytest.mark.parametrize("error", [None, InputError("the frame was bad"), KeyboardInterrupt()])

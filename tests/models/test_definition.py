@@ -13,18 +13,11 @@ from torch import nn
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
     Fixed,
-    ModelDefinition,
     Multiple,
     Normalisation,
     graph_definition,
 )
-
-
-def definition(**more: object) -> ModelDefinition:
-    settings: dict[str, object] = {
-        "name": "n", "input_kind": "rgb", "size": Multiple(1), "build": nn.Identity, **more,
-    }  # fmt: skip
-    return ModelDefinition(**settings)  # type: ignore[arg-type]
+from tests.models.definitions import definition
 
 
 def test_arguments_come_in_the_order_of_the_input_kind() -> None:

@@ -24,7 +24,7 @@ from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
-from tests.core.test_metrics import brute
+from tests.core.plain_scores import brute
 from tests.data_sets import SELECTED, image, touch
 
 

@@ -20,8 +20,7 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
-from tests.models.weights.files import little, npy_of, pickled, refused
-from tests.models.weights.test_tensor_bundle import bundle, entry
+from tests.models.weights.files import bundle, entry, little, npy_of, pickled, refused
 
 
 class Net(nn.Module):
