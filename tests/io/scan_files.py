@@ -35,7 +35,7 @@ def compressed_pcd_bytes(points: NDArray[np.float32]) -> bytes:
     header = pcd_bytes(points).partition(b"DATA")[0] + b"DATA binary_compressed\n"
     literal = bytes(len(points)) + points.T.astype("<f4").tobytes()
     parts = [literal[at : at + 32] for at in range(0, len(literal), 32)]
-    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+    packed = b"".join(bytes([len(literals) - 1]) + literals for literals in parts)
     packed += b"\x00\x00"  # one byte of n; the others are copies from one byte back
     for at in range(0, 8 * len(points) - 1, 250):
         packed += bytes([7 << 5, min(8 * len(points) - 1 - at, 250) - 9, 0])

@@ -61,7 +61,8 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
 
 @pytest.mark.parametrize("suffix", [".png", ".exr", ".npy"])
 def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suffix: str) -> None:
-    target, depth = tmp_path / f"depth{suffix}", np.random.default_rng(0).random((40, 50)) + 1
+    target = tmp_path / f"depth{suffix}"
+    depth = np.random.default_rng(0).random((40, 50)) + 1
     with no_room_on_disk(), pytest.raises(OutputError, match=str(target)):
         write_depth(target, depth.astype(np.float32))
     assert list(tmp_path.iterdir()) == []

@@ -65,7 +65,9 @@ KITTIS: dict[str, dict[str, dict[str, Any]]] = {
 @pytest.mark.parametrize("kind", KITTIS)
 def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Path) -> None:
     for file, values in KITTIS[kind].items():
-        lines = ["calib_time: 03-Apr-2018 18:47:03"] * (values is SIZED)
+        lines = []
+        if values is SIZED:
+            lines.append("calib_time: 03-Apr-2018 18:47:03")
         lines += [" ".join([name, *map(str, np.ravel(v).tolist())]) for name, v in values.items()]
         (tmp_path / file).write_text("\n".join(lines) + "\n")
     path = tmp_path / file if len(KITTIS[kind]) == 1 else tmp_path
@@ -114,7 +116,7 @@ def test_a_camera_is_the_same_in_every_kind_of_file(kind: str, tmp_path: Path) -
     camera = got.camera
     assert (camera.intrinsics.tolist(), camera.size, camera.lens) == (K, (480, 640), lens)
     assert camera.distortion == tuple(coefficients)
-    assert [each.tolist() for each in got.scanner or ()] == ([TURN, SHIFT] if has_pose else [])
+    assert [array.tolist() for array in got.scanner or ()] == ([TURN, SHIFT] if has_pose else [])
     with pytest.raises(UsageError):  # there is no such camera
         read_calibration(tmp_path / "calib.txt", 7)
 
@@ -144,10 +146,17 @@ def test_the_cameras_of_rectified_images_follow_p_and_r(
 
 
 NO_CALIBRATIONS = [
-    *(KITTI.replace("Tr_velo_to_cam", "Tr_v"), KITTI.replace("P2: 700", "P2: nan")),
-    *(KITTI.replace("R0_rect: 1", "R0_rect: 1.2"), KITTI.replace("to_cam: 0 -1", "to_cam: 0 1")),
-    *(KITTI + KITTI, "1 2 3", KALIBR.replace("pinhole", "omni"), PLAIN.replace("500.5", "1e308")),
-    *(PLAIN.replace("t:", "#t:"), PLAIN.replace("-0.02, ", ""), PLAIN.replace("640", "0")),
+    KITTI.replace("Tr_velo_to_cam", "Tr_v"),
+    KITTI.replace("P2: 700", "P2: nan"),
+    KITTI.replace("R0_rect: 1", "R0_rect: 1.2"),
+    KITTI.replace("to_cam: 0 -1", "to_cam: 0 1"),
+    KITTI + KITTI,
+    "1 2 3",
+    KALIBR.replace("pinhole", "omni"),
+    PLAIN.replace("500.5", "1e308"),
+    PLAIN.replace("t:", "#t:"),
+    PLAIN.replace("-0.02, ", ""),
+    PLAIN.replace("640", "0"),
     # YAML that is more than plain texts
     "a: &a [1, 1]\ncamera_matrix: *a\n",
     "camera_matrix: [" * 2000,
@@ -155,10 +164,16 @@ NO_CALIBRATIONS = [
     "camera_matrix: !!python/object/apply:os.system ['true']",
     *(f"camera_matrix: {odd}\n" for odd in ("!!int ''", "!!binary é", "1e999", "9" * 5000)),
     # where the time grows with the square of the length, each of these takes a minute
-    *("a" * 60_000, "a: b\nb\n" + "1\n" * 400_000, "1 " * 2_000_000),
+    "a" * 60_000,
+    "a: b\nb\n" + "1\n" * 400_000,
+    "1 " * 2_000_000,
 ]
 NO_POSES = [
-    *("1 2 3", "1 0 0 0 0 2 0 0 0 0 1 0", "0 0 0 1 1 1 1", "1e9 0 0 0 0 0 1", "hello: 3"),
+    "1 2 3",
+    "1 0 0 0 0 2 0 0 0 0 1 0",
+    "0 0 0 1 1 1 1",
+    "1e9 0 0 0 0 0 1",
+    "hello: 3",
     "translation: {x: 1, y: 2, z: 3}\nrotation: {x: 0, y: 0, z: 0, w: one}",
 ]
 

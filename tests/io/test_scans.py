@@ -62,7 +62,8 @@ def test_what_is_no_scan_is_an_error_of_one_line(tmp_path: Path, name: str, cont
 
 @pytest.mark.parametrize("channels", [0, 3])
 def test_the_parts_of_a_cloud_are_the_rows_of_a_ply(tmp_path: Path, channels: int) -> None:
-    path, halves = tmp_path / "a.ply", (slice(20), slice(20, None))
+    path = tmp_path / "a.ply"
+    halves = (slice(20), slice(20, None))
     colours = np.arange(POINTS.size, dtype=np.uint8).reshape(POINTS.shape)
     parts = [(POINTS[n], -POINTS[n], colours[n] if channels else None) for n in halves]
     assert write_cloud(path, parts) == len(POINTS)
