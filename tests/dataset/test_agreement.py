@@ -22,8 +22,14 @@ def test_the_ratio_and_its_spread_are_those_of_what_was_multiplied() -> None:
     assert found.pairs == DEPTH.size
     assert found.ratio == pytest.approx(3, rel=0.01)
     assert found.spread == pytest.approx(0.05, rel=0.1)
-    assert found.rank > 0.98
+
+
+def test_the_rank_tells_depth_from_its_inverse() -> None:
+    assert compare_depths(3 * NOISY, DEPTH).rank > 0.98
     assert compare_depths(1 / NOISY, DEPTH).rank < -0.98
+
+
+def test_unknown_depths_make_no_pair() -> None:
     assert compare_depths(np.zeros(5), np.ones(5)).pairs == 0
 
 

@@ -74,10 +74,12 @@ def read_again(record: FrameRecord) -> FrameRecord:
 def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: FrameRecord) -> None:
     entry = record.to_json()
     assert read_again(record) == record
-    parts = [part for part in entry.values() if isinstance(part, dict)]
+    parts = [section for section in entry.values() if isinstance(section, dict)]
     parts += [*entry.get("inputs", {}).values(), *entry.get("figures", {}).values(), entry]
-    own = [part for part in parts if part is not entry.get("alignment")]
-    assert not [name for part in own for name, value in part.items() if value in (None, {}, [])]
+    own = [section for section in parts if section is not entry.get("alignment")]
+    assert not [
+        name for section in own for name, value in section.items() if value in (None, {}, [])
+    ]
     assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
 
 
@@ -117,7 +119,8 @@ def test_what_is_no_record_is_refused_with_the_name_of_its_file(entry: object) -
 def test_half_a_record_of_a_batch_is_refused(lost: str) -> None:
     entry = RECORD.to_json()
     assert FrameRecord.from_json(entry, Path("a.json")) == RECORD
-    part, (*outer, name) = entry, lost.split()
+    part = entry
+    (*outer, name) = lost.split()
     for key in outer:
         part = part[key]
     del part[name]

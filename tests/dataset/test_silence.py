@@ -73,7 +73,8 @@ def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
 
 
 def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:
-    street, kitti = SAMPLES / "street", shared_data / "kitti_object"
+    street = SAMPLES / "street"
+    kitti = shared_data / "kitti_object"
     frames = [(street / "rgb.png", street / "000000.bin", street / "calib.txt")]
     for scan in sorted((kitti / "velodyne").glob("*.bin")):
         name = scan.stem

@@ -36,7 +36,8 @@ def refused(path: Path) -> str:
 @contextmanager
 def little(*, megabytes: int = 60, seconds: float = 5) -> Iterator[None]:
     """Inside, no more memory and processor time than this are taken."""
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.process_time()
     yield
     assert time.process_time() - start < seconds
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1000 * megabytes
@@ -130,12 +131,13 @@ def block(entries: list[tuple[bytes, bytes]]) -> bytes:
 
 def index_of(*blocks: bytes, copies: int = 1) -> bytes:
     """An index that names each of these blocks of data so often."""
-    data, handles = b"", []
-    for part in blocks:
-        handles += [(b"\xff", varint(len(data)) + varint(len(part) - 5))] * copies
-        data += part
+    data = b""
+    handles = []
+    for content in blocks:
+        handles += [(b"\xff", varint(len(data)) + varint(len(content) - 5))] * copies
+        data += content
     tables = b""
-    for part in (block([]), block(handles)):
-        tables += varint(len(data)) + varint(len(part) - 5)
-        data += part
+    for content in (block([]), block(handles)):
+        tables += varint(len(data)) + varint(len(content) - 5)
+        data += content
     return data + tables.ljust(40, b"\0") + struct.pack("<Q", 0xDB4775248B80FB57)

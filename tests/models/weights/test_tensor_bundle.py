@@ -38,7 +38,8 @@ def test_what_tensorflow_wrote_is_read_to_the_bit_or_refused_if_it_is_cut(tmp_pa
 
 
 def test_variables_of_two_files_are_read(tmp_path: Path) -> None:
-    first, second = np.arange(6, dtype=np.float32), np.full((2, 1), 7, np.float32)
+    first = np.arange(6, dtype=np.float32)
+    second = np.full((2, 1), 7, np.float32)
     entries = {"b/w": entry(1, (3,), 12, 12), "a/w": entry(1, (2, 1), 0, 8, 1)}
     entries["empty"] = entry(1, (0, 2), 0, 0, 1)
     index = bundle(tmp_path, entries, first.tobytes(), second.tobytes())
