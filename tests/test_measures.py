@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 from pnpdepth_cli import choices
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.measures import MEASURES, OF_SIGMA, by_depth, frame_means, score
-from tests.test_scores import brute
+from tests.plain_scores import brute
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 MAIN = ("rmse", "mae", "mre", "delta1")

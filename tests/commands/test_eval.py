@@ -26,7 +26,7 @@ from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from tests.builders import result_record
 from tests.data_sets import SELECTED, image, touch
-from tests.test_scores import brute
+from tests.plain_scores import brute
 
 
 def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:

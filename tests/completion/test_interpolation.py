@@ -27,7 +27,7 @@ from pnpdepth_cli.completion.interpolation import (
 )
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
-from tests.completion.test_triangles import POINTS, all_delaunay, holds
+from tests.completion.exact_triangles import POINTS, all_delaunay, holds
 
 FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
     "nearest": nearest,

@@ -9,8 +9,8 @@ from pnpdepth_cli.completion.gaussian_process import Residuals, leave_one_out
 from pnpdepth_cli.completion.outliers import FAR, far_points, inlier_mask, inlier_weights
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.points import SparsePoints
+from tests.completion.residuals import field
 from tests.completion.scenes import random_points, scene
-from tests.completion.test_gaussian_process import field
 
 
 def test_outliers_are_left_out_and_inliers_kept() -> None:

@@ -382,3 +382,23 @@ def build(name: str) -> nn.Module:
 
 def image(height: int = 16, width: int = 16) -> Tensor:
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(1))
+
+
+def state_of(network: nn.Module) -> dict[str, Any]:
+    """Everything of a network that a split could leave changed."""
+    state: dict[str, Any] = {}
+    for name, module in network.named_modules():
+        state[name] = (
+            module.training,
+            module.__dict__.get("forward"),
+            sorted(module.__dict__),
+            *(list(getattr(module, hooks)) for hooks in vars(nn.Module()) if "hooks" in hooks),
+        )
+    for name, tensor in (*network.named_parameters(), *network.named_buffers()):
+        grad = None if tensor.grad is None else bits(tensor.grad)
+        state[f"tensor {name}"] = (id(tensor), bits(tensor), tensor.requires_grad, grad)
+    return state
+
+
+def bits(tensor: Tensor) -> bytes:
+    return tensor.detach().numpy().tobytes()

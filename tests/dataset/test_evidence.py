@@ -27,7 +27,8 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 
 SAMPLES = Path(__file__).parents[2] / "samples"
-INDOOR, STREET = SAMPLES / "indoor", SAMPLES / "street"
+INDOOR = SAMPLES / "indoor"
+STREET = SAMPLES / "street"
 TRUTH = np.asarray(Image.open(INDOOR / "gt.png")) / 1000
 """(480, 640) metres, everywhere known."""
 Depth = NDArray[Any]
@@ -92,7 +93,8 @@ def test_a_stated_scale_is_obeyed_in_every_file_of_floats(
 @pytest.mark.parametrize("scale", [3.28084, 100.0])
 def test_a_stated_scale_is_obeyed_in_every_scan(suffix: str, scale: float, tmp_path: Path) -> None:
     xyz = read_scan(STREET / "000000.bin")[0][::9]
-    path, rows = tmp_path / f"scan{suffix}", (scale * xyz).astype("<f4")
+    path = tmp_path / f"scan{suffix}"
+    rows = (scale * xyz).astype("<f4")
     if suffix == ".bin":
         np.column_stack([rows, np.random.default_rng(0).uniform(size=len(rows))]).astype(
             "<f4"

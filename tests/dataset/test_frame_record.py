@@ -79,10 +79,12 @@ def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: Fra
     entry = record.to_json()
     assert read_again(record) == record
     result = entry.get("result", {})
-    parts = [part for part in (*entry.values(), *result.values()) if isinstance(part, dict)]
-    parts += [*entry.get("inputs", {}).values(), *result.get("figures", {}).values(), entry]
-    own = [part for part in parts if part is not result.get("alignment")]
-    assert not [name for part in own for name, value in part.items() if value in (None, {}, [])]
+    sections = [entry, *entry.get("inputs", {}).values(), *result.get("figures", {}).values()]
+    for value in (*entry.values(), *result.values()):
+        if isinstance(value, dict) and value is not result.get("alignment"):
+            sections.append(value)
+    for section in sections:
+        assert not [name for name, value in section.items() if value in (None, {}, [])]
     assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
 
 
@@ -144,7 +146,8 @@ def test_a_frame_that_failed_has_no_result() -> None:
 def test_half_a_record_of_a_batch_is_refused(lost: str) -> None:
     entry = RECORD.to_json()
     assert FrameRecord.from_json(entry, Path("a.json")) == RECORD
-    part, (*outer, name) = entry, lost.split()
+    part = entry
+    (*outer, name) = lost.split()
     for key in outer:
         part = part[key]
     del part[name]

@@ -155,8 +155,16 @@ OTHERS = {
 @pytest.mark.parametrize(
     "name",
     [
-        *("depth", "disparity", "pred", "metric_depth", "arr_0", "z"),
-        *("normalized_depth", "masked_depth", "affine_invariant_depth", "Depth"),
+        "depth",
+        "disparity",
+        "pred",
+        "metric_depth",
+        "arr_0",
+        "z",
+        "normalized_depth",
+        "masked_depth",
+        "affine_invariant_depth",
+        "Depth",
     ],
 )
 @pytest.mark.parametrize("stack", [False, True])
@@ -351,7 +359,8 @@ def test_a_surface_at_the_end_of_the_range_is_known(values: Array, tmp_path: Pat
 def test_the_ends_of_integers_are_unknown(tmp_path: Path) -> None:
     codes = CODES.astype(np.int16) // 2
     codes[FAR] = 0
-    codes[40, 0], codes[41, 0] = -32768, 32767
+    codes[40, 0] = -32768
+    codes[41, 0] = 32767
     depth = read(save(tmp_path / "a.npy", codes))
     unknown = FAR.copy()
     unknown[40:42, 0] = True

@@ -107,7 +107,8 @@ def test_intrinsics_of_an_image_of_another_size_are_found(factor: float, street:
 
 def variants(rgb: Image, scan: Scan, right: Calibration) -> Iterator[tuple[str, Frame]]:
     """Inputs that are right: resized, cropped, thinned, darkened, noisy."""
-    rng, (height, width) = np.random.default_rng(0), rgb.shape[:2]
+    rng = np.random.default_rng(0)
+    (height, width) = rgb.shape[:2]
     camera = replace(right.camera, size=(height, width))
     for factor in (0.5, 0.7, 1.3):
         size = round(width * factor), round(height * factor)
@@ -159,7 +160,7 @@ def test_nothing_is_told_of_what_is_right(street: Frame) -> None:
 def test_nothing_is_told_of_real_frames_that_are_right(shared_data: Path) -> None:
     folder = shared_data / "kitti_object"
     for calib in sorted((folder / "calib").glob("*.txt")):
-        image, scan = (folder / part for part in (f"image_2/{calib.stem}.png", "velodyne"))
+        image, scan = (folder / file for file in (f"image_2/{calib.stem}.png", "velodyne"))
         real = frame_of(image, scan / f"{calib.stem}.bin", calib)
         for name, frame in (("as it is", real), *variants(*real)):
             assert told(*frame) == [], f"{calib.stem} {name}"

@@ -24,14 +24,17 @@ from tests.commands.frames import CALIBRATION, HEIGHT, WIDTH, scan_on_disk
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 SIZE = (375, 1242)
-K, D = np.array([[800.0, 0, 600], [0, 800, 180], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, 0])
+K = np.array([[800.0, 0, 600], [0, 800, 180], [0, 0, 1]])
+D = np.array([-0.2, 0.05, 0, 0, 0])
 TURN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from a LiDAR's axes to a camera's
 
 
 @pytest.mark.parametrize("rectified", [True, False])
 def test_edges_say_whether_an_image_is_rectified(rectified: bool, tmp_path: Path) -> None:
     right = read_calibration(STREET / "calib.txt")
-    image, scan, calib = STREET / "rgb.png", STREET / "000000.bin", tmp_path / "camera_info.yaml"
+    image = STREET / "rgb.png"
+    scan = STREET / "000000.bin"
+    calib = tmp_path / "camera_info.yaml"
     if not rectified:  # as the raw camera would have seen it
         xy = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), -1).astype(np.float32)
         at = cv2.undistortPoints(xy.reshape(-1, 1, 2), K, D, P=right.camera.intrinsics)
@@ -93,7 +96,8 @@ def test_the_direction_is_judged_by_the_points_in_the_image_and_what_is_upright(
     beside = np.repeat([up, -up], 500, axis=0)
     along = np.repeat([ahead, ahead_inverted], [inside, inverted], axis=0)
     scan = 5 * np.concatenate([along, beside])
-    camera, pose = Camera(intrinsics=K), Extrinsics(turn, np.zeros(3))
+    camera = Camera(intrinsics=K)
+    pose = Extrinsics(turn, np.zeros(3))
     if notes is None:
         with pytest.raises(UsageError):
             check_direction(scan, camera, pose, SIZE)
@@ -102,7 +106,8 @@ def test_the_direction_is_judged_by_the_points_in_the_image_and_what_is_upright(
 
 
 def test_extrinsics_complete_a_calibration_in_one_direction(tmp_path: Path) -> None:
-    scene, shift = scan_on_disk(tmp_path), np.array([0.1, -0.05, -0.2])
+    scene = scan_on_disk(tmp_path)
+    shift = np.array([0.1, -0.05, -0.2])
     scene.calib.write_text(CALIBRATION.splitlines()[0])
     np.savetxt(tmp_path / "pose.txt", np.column_stack([TURN, shift]))
     np.savetxt(tmp_path / "inverse.txt", np.column_stack([TURN.T, -TURN.T @ shift]))

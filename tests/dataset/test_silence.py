@@ -12,7 +12,7 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.scans import read_scan
-from tests.io.test_scans import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes
+from tests.io.scan_files import compressed_pcd_bytes, npy_bytes, pcd_bytes, ply_bytes
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 SCALES = {
@@ -73,7 +73,8 @@ def test_nothing_is_said_of_real_frames(shared_data: Path) -> None:
 
 
 def test_nothing_is_said_of_scans_in_any_format(shared_data: Path, tmp_path: Path) -> None:
-    street, kitti = SAMPLES / "street", shared_data / "kitti_object"
+    street = SAMPLES / "street"
+    kitti = shared_data / "kitti_object"
     frames = [(street / "rgb.png", street / "000000.bin", street / "calib.txt")]
     for scan in sorted((kitti / "velodyne").glob("*.bin")):
         name = scan.stem

@@ -54,14 +54,16 @@ def refine(project: Path, output: str = "out", **changes: Any) -> FrameRecord:
     return run(frame, output=project / output, **(files | changes))
 
 
-@pytest.mark.parametrize(("unit_scale", "unit"), [(None, "model units"), (0.5, "m")])
-def test_depth_is_in_units_or_in_metres(unit_scale: float | None, unit: str, project: Path) -> None:
+UNIT_SCALES = pytest.mark.parametrize("unit_scale", [None, 0.5])
+
+
+@UNIT_SCALES
+def test_depth_is_in_units_of_the_model_unless_metres_per_unit_are_stated(
+    unit_scale: float | None, project: Path
+) -> None:
     record = refine(project, unit_scale=unit_scale, method="alone", iterations=0)
-    metric = unit_scale is not None
-    assert (record.unit, record.refined().settings["align"]) == (
-        unit,
-        "auto" if metric else "scale",
-    )
+    unit, align = ("model units", "scale") if unit_scale is None else ("m", "auto")
+    assert (record.unit, record.refined().settings["align"]) == (unit, align)
     factor = unit_scale or 1.0
     assert (
         3.4
@@ -69,17 +71,33 @@ def test_depth_is_in_units_or_in_metres(unit_scale: float | None, unit: str, pro
         < record.refined().points.farthest / factor
         < 4.6
     )
+
+
+def test_a_depth_map_in_metres_has_256_codes_a_metre(project: Path) -> None:
+    refine(project, unit_scale=0.5, method="alone", iterations=0)
+    assert read_depth(project / "out/a_depth.png").reading.scale == 256
+
+
+def test_a_depth_map_in_units_has_another_power_of_two_of_codes_a_unit(project: Path) -> None:
+    refine(project, method="alone", iterations=0)
     scale = read_depth(project / "out/a_depth.png").reading.scale
-    assert (scale == 256) == metric
+    assert scale != 256
     assert np.log2(scale) % 1 == 0
-    photo = project / "images/a.png"  # turned by EXIF, it is read as COLMAP reads it
+
+
+@UNIT_SCALES
+def test_a_photo_that_exif_turns_is_read_as_colmap_reads_it(
+    unit_scale: float | None, project: Path
+) -> None:
+    upright = refine(project, unit_scale=unit_scale)
+    photo = project / "images/a.png"
     with Image.open(photo) as opened:
         exif = opened.getexif()
         exif[0x0112] = 6
         opened.save(photo, exif=exif)
     turned = refine(project, "turned", unit_scale=unit_scale)
-    assert turned.refined().size == record.refined().size == (WIDTH, HEIGHT)
-    assert turned.refined().points == record.refined().points
+    assert turned.refined().size == upright.refined().size == (WIDTH, HEIGHT)
+    assert turned.refined().points == upright.refined().points
 
 
 @pytest.mark.parametrize("name", ["03", "04"])
@@ -174,7 +192,7 @@ def test_each_registered_photo_of_the_largest_model_is_a_frame(project: Path) ->
     (project / "images/c.png").unlink()
     write_text_model(project / "sparse/1", names=("d.png",))
     layout, frames, unmatched = list_frames(project)
-    assert (layout, [each.name for each in frames]) == ("colmap", ["a", "b"])
+    assert (layout, [frame.name for frame in frames]) == ("colmap", ["a", "b"])
     assert frames[1].pose == ((1, 0, 0, -0.1), (0, 1, 0, 0), (0, 0, 1, 0))
     lost = [path.relative_to(project).as_posix() for path, _ in unmatched]
     assert lost == ["images/new.png", "sparse/1", "images/c.png"]
@@ -195,7 +213,8 @@ def test_a_calibration_beside_a_depth_map_is_that_of_the_camera(frame: FrameOnDi
 
 
 def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: FrameOnDisk) -> None:
-    opened, photo = Image.open(frame.image), frame.folder / "img.jpg"
+    opened = Image.open(frame.image)
+    photo = frame.folder / "img.jpg"
     exif = opened.getexif()
     exif[0x8769] = {0xA405: 26}
     opened.save(photo, exif=exif)
@@ -206,7 +225,8 @@ def test_exif_is_used_where_nothing_else_gives_the_camera_of_a_view(frame: Frame
 
 def test_the_camera_of_a_part_sees_the_same_directions(tmp_path: Path) -> None:
     part = FramePart(halved=True, crop=(20, 30), anchor="bottom")
-    frame, calib = frame_on_disk(tmp_path, 60, 80), tmp_path / "k.txt"
+    frame = frame_on_disk(tmp_path, 60, 80)
+    calib = tmp_path / "k.txt"
     calib.write_text(CALIB)
     record = run(frame, part=part, scan=ScanOptions(calib=calib))
     camera, _ = record.refined().camera.read()

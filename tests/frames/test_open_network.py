@@ -11,7 +11,7 @@ import torch
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import ClosedSettings
-from tests.core.split.test_split import state_of
+from tests.core.networks import state_of
 from tests.frames.scenes import SIZE, Brightness, Nearest, depth_of_scene, frame_in_memory, member
 
 

@@ -33,11 +33,10 @@ from pnpdepth_cli.io.depth import write_depth
 from tests.bags import write_bag
 from tests.colmap_models import write_binary_model, write_text_model
 from tests.data_sets import HEIGHT, WIDTH, image
-from tests.io.test_calibration import FOUR, KALIBR, KITTI, POSES, ROS, opencv_file
-from tests.io.test_scans import FILES
+from tests.io.calibration_files import FOUR, KALIBR, KITTI, POSES, ROS, opencv_file
+from tests.io.scan_files import FILES
 from tests.models.onnx.onnx_files import write_network
-from tests.models.weights.files import little
-from tests.models.weights.test_tensor_bundle import written
+from tests.models.weights.files import little, written
 
 INPUTS = int(os.environ.get("PNPDEPTH_FUZZ_INPUTS", "400"))
 SEED = int(os.environ.get("PNPDEPTH_FUZZ_SEED", "0"))

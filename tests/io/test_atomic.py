@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +18,7 @@ from pnpdepth_cli.io.atomic import (
     remove_leftovers,
 )
 from pnpdepth_cli.io.depth import write_depth
-
-
-@contextmanager
-def no_room_on_disk() -> Iterator[None]:
-    """Files cannot grow beyond 64 bytes inside."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (64, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from tests.io.full_disk import no_room_on_disk
 
 
 @pytest.mark.parametrize("error", [None, InputError("the frame was bad"), KeyboardInterrupt()])
@@ -73,7 +61,8 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
 
 @pytest.mark.parametrize("suffix", [".png", ".exr", ".npy"])
 def test_a_full_disk_is_an_output_error_that_names_the_file(tmp_path: Path, suffix: str) -> None:
-    target, depth = tmp_path / f"depth{suffix}", np.random.default_rng(0).random((40, 50)) + 1
+    target = tmp_path / f"depth{suffix}"
+    depth = np.random.default_rng(0).random((40, 50)) + 1
     with no_room_on_disk(), pytest.raises(OutputError, match=str(target)):
         write_depth(target, depth.astype(np.float32))
     assert list(tmp_path.iterdir()) == []

@@ -73,7 +73,7 @@ def test_an_organised_cloud_gives_its_points_row_by_row(order: str) -> None:
 def read_all(path: Path) -> int:
     """The number of messages in the bag."""
     with open_bag(path) as bag:
-        topics = [each.topic for each in bag.reader.connections]
+        topics = [connection.topic for connection in bag.reader.connections]
         return sum(1 for _ in bag.messages(topics))
 
 

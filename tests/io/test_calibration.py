@@ -15,79 +15,29 @@ from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.sensors.lens import pixels_of
+from tests.io.calibration_files import (
+    FIVE,
+    FOUR,
+    KALIBR,
+    KITTI,
+    PLAIN,
+    POSES,
+    ROS,
+    TOPIC,
+    K,
+    opencv_file,
+)
 
 pytest.importorskip("yaml")
 
-KITTI = """P0: 700 0 600 0 0 700 170 0 0 0 1 0
-P2: 700 0 600 42 0 700 170 -0.35 0 0 1 0.005
-R0_rect: 1 0 0 0 1 0 0 0 1
-Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
-Tr_imu_to_velo: 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8
-"""
-PLAIN = """# a comment
-K: [[500.5, 0, 320], [0, 501, 240],
-    [0, 0, 1]]
-R: [0, -1, 0, 0, 0, -1, 1, 0, 0]
-t: [0.1, -0.2, -0.3]   # metres
-distortion: [-0.02, 0.01, -0.003, 0.001]
-size: [640, 480]
-lens: fisheye
-"""
-K = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
 TURN, SHIFT = [[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0.1, -0.2, -0.3]
-ROS = """image_width: 640
-image_height: 480
-camera_matrix: {{rows: 3, cols: 3, data: [500.5, 0, 320, 0, 501, 240, 0, 0, 1]}}
-distortion_model: {model}
-distortion_coefficients: {{rows: 1, cols: 5, data: {data}}}
-rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
-"""
-TOPIC = """height: 480
-width: 640
-distortion_model: plumb_bob
-d: [-0.1, 0.02, 0.001, -0.002, 0.01]
-k: [500.5, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]
----
-height: 480
-"""
-KALIBR = """cam0:
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.02, 0.01, -0.003, 0.001]
-  distortion_model: equidistant
-  intrinsics: [500.5, 501, 320, 240]
-  resolution: [640, 480]
-cam1:
-  T_cam_lidar: [[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]]
-  camera_model: pinhole
-  distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
-  distortion_model: radtan
-  intrinsics: [500.5, 501, 320, 240]
-  resolution: [640, 480]
-"""
 RADIAL = "radial-tangential"
-POSES = {
-    "matrix of 16": "0 -1 0 0.1\n0 0 -1 -0.2\n1 0 0 -0.3\n0 0 0 1\n",
-    "matrix of 12": "[[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3]]  # by rows",
-    "quaternion": "0.1 -0.2 -0.3 0.5 -0.5 0.5 0.5",
-    "tf": "transforms:\n- transform:\n    translation: {x: 0.1, y: -0.2, z: -0.3}\n"
-    "    rotation: {x: 0.5, y: -0.5, z: 0.5, w: 0.5}\n",
-}
 
 
 def write(folder: Path, text: str) -> Path:
     path = folder / "calib.txt"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def opencv_file(coefficients: list[float], **others: int) -> str:
-    file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for name, value in {"image_width": 640, "image_height": 480, **others}.items():
-        file.write(name, value)
-    file.write("camera_matrix", np.array(K))
-    file.write("distortion_coefficients", np.array(coefficients)[:, None])
-    return file.releaseAndGetString()
 
 
 RECTIFY = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
@@ -115,7 +65,9 @@ KITTIS: dict[str, dict[str, dict[str, Any]]] = {
 @pytest.mark.parametrize("kind", KITTIS)
 def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Path) -> None:
     for file, values in KITTIS[kind].items():
-        lines = ["calib_time: 03-Apr-2018 18:47:03"] * (values is SIZED)
+        lines = []
+        if values is SIZED:
+            lines.append("calib_time: 03-Apr-2018 18:47:03")
         lines += [" ".join([name, *map(str, np.ravel(v).tolist())]) for name, v in values.items()]
         (tmp_path / file).write_text("\n".join(lines) + "\n")
     path = tmp_path / file if len(KITTIS[kind]) == 1 else tmp_path
@@ -139,7 +91,6 @@ def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Pat
             read_calibration(path)
 
 
-FIVE, FOUR = [-0.1, 0.02, 0.001, -0.002, 0.01], [-0.02, 0.01, -0.003, 0.001]
 EIGHT = [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01]
 VALUES = {"K": K, "R": TURN, "t": SHIFT, "distortion": FIVE, "size": [640, 480]}
 NAMED: dict[str, tuple[str, int | None, list[float], str, bool]] = {
@@ -165,7 +116,7 @@ def test_a_camera_is_the_same_in_every_kind_of_file(kind: str, tmp_path: Path) -
     camera = got.camera
     assert (camera.intrinsics.tolist(), camera.size, camera.lens) == (K, (480, 640), lens)
     assert camera.distortion == tuple(coefficients)
-    assert [each.tolist() for each in got.scanner or ()] == ([TURN, SHIFT] if has_pose else [])
+    assert [array.tolist() for array in got.scanner or ()] == ([TURN, SHIFT] if has_pose else [])
     with pytest.raises(UsageError):  # there is no such camera
         read_calibration(tmp_path / "calib.txt", 7)
 
@@ -195,10 +146,17 @@ def test_the_cameras_of_rectified_images_follow_p_and_r(
 
 
 NO_CALIBRATIONS = [
-    *(KITTI.replace("Tr_velo_to_cam", "Tr_v"), KITTI.replace("P2: 700", "P2: nan")),
-    *(KITTI.replace("R0_rect: 1", "R0_rect: 1.2"), KITTI.replace("to_cam: 0 -1", "to_cam: 0 1")),
-    *(KITTI + KITTI, "1 2 3", KALIBR.replace("pinhole", "omni"), PLAIN.replace("500.5", "1e308")),
-    *(PLAIN.replace("t:", "#t:"), PLAIN.replace("-0.02, ", ""), PLAIN.replace("640", "0")),
+    KITTI.replace("Tr_velo_to_cam", "Tr_v"),
+    KITTI.replace("P2: 700", "P2: nan"),
+    KITTI.replace("R0_rect: 1", "R0_rect: 1.2"),
+    KITTI.replace("to_cam: 0 -1", "to_cam: 0 1"),
+    KITTI + KITTI,
+    "1 2 3",
+    KALIBR.replace("pinhole", "omni"),
+    PLAIN.replace("500.5", "1e308"),
+    PLAIN.replace("t:", "#t:"),
+    PLAIN.replace("-0.02, ", ""),
+    PLAIN.replace("640", "0"),
     # YAML that is more than plain texts
     "a: &a [1, 1]\ncamera_matrix: *a\n",
     "camera_matrix: [" * 2000,
@@ -206,10 +164,16 @@ NO_CALIBRATIONS = [
     "camera_matrix: !!python/object/apply:os.system ['true']",
     *(f"camera_matrix: {odd}\n" for odd in ("!!int ''", "!!binary é", "1e999", "9" * 5000)),
     # where the time grows with the square of the length, each of these takes a minute
-    *("a" * 60_000, "a: b\nb\n" + "1\n" * 400_000, "1 " * 2_000_000),
+    "a" * 60_000,
+    "a: b\nb\n" + "1\n" * 400_000,
+    "1 " * 2_000_000,
 ]
 NO_POSES = [
-    *("1 2 3", "1 0 0 0 0 2 0 0 0 0 1 0", "0 0 0 1 1 1 1", "1e9 0 0 0 0 0 1", "hello: 3"),
+    "1 2 3",
+    "1 0 0 0 0 2 0 0 0 0 1 0",
+    "0 0 0 1 1 1 1",
+    "1e9 0 0 0 0 0 1",
+    "hello: 3",
     "translation: {x: 1, y: 2, z: 3}\nrotation: {x: 0, y: 0, z: 0, w: one}",
 ]
 

@@ -16,20 +16,42 @@ from tests.colmap_models import CAMERAS, write_binary_model, write_text_model
 COLUMNS = ["number", "xyz", "error", "track"]
 
 
-def test_a_binary_model_is_read_as_written_and_found_in_folders_above_it(tmp_path: Path) -> None:
+@pytest.fixture
+def binary_model(tmp_path: Path) -> Path:
+    """The folder of a binary model, two folders below `tmp_path`."""
     folder = tmp_path / "sparse" / "0"
     write_binary_model(folder)
-    for above in (tmp_path, folder.parent, folder):
-        assert read_model(above).folder == folder
-    model = read_model(tmp_path)
-    camera, image = model.images["dir/1.png"].camera, model.images["dir/2.png"]
+    return folder
+
+
+def test_a_model_is_found_in_its_folder_and_in_folders_above_it(binary_model: Path) -> None:
+    for above in (binary_model.parents[1], binary_model.parent, binary_model):
+        assert read_model(above).folder == binary_model
+
+
+def test_a_folder_beside_the_model_is_refused(binary_model: Path) -> None:
+    with pytest.raises(InputError):
+        read_model(binary_model.parent / "1")
+
+
+def test_the_camera_of_a_binary_model_is_read_as_written(binary_model: Path) -> None:
+    camera = read_model(binary_model).images["dir/1.png"].camera
     assert (camera.source, camera.size) == ("SIMPLE_RADIAL camera", (48, 64))
     assert camera.intrinsics.tolist() == [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]
     assert (camera.lens, camera.distortion) == ("radial-tangential", (0.1, 0, 0, 0))
+
+
+def test_the_pose_and_points_of_an_image_of_a_binary_model_are_read_as_written(
+    binary_model: Path,
+) -> None:
+    image = read_model(binary_model).images["dir/2.png"]
     assert (image.pose.translation.tolist(), image.points.tolist()) == ([0.2, 0, 0], [7])
-    assert [model.points[n].tolist() for n in COLUMNS] == [[7], [[0.5, -0.25, 4]], [0.75], [2]]
-    with pytest.raises(InputError):
-        read_model(folder.parent / "1")
+
+
+def test_the_points_of_a_binary_model_are_read_as_written(binary_model: Path) -> None:
+    points = read_model(binary_model).points
+    values = [points[name].tolist() for name in COLUMNS]
+    assert values == [[7], [[0.5, -0.25, 4]], [0.75], [2]]
 
 
 def test_a_text_model_is_read_as_written(tmp_path: Path) -> None:

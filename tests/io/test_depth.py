@@ -193,7 +193,8 @@ def as_others_read(path: Path) -> np.ndarray:
 def test_float_formats_give_back_every_known_depth_exactly_also_to_other_programs(
     suffix: str, layout: Callable[[np.ndarray], np.ndarray], tmp_path: Path
 ) -> None:
-    path, depth = tmp_path / f"d{suffix.upper()}", layout(np.array(SPECIAL, np.float32))
+    path = tmp_path / f"d{suffix.upper()}"
+    depth = layout(np.array(SPECIAL, np.float32))
     write_depth(path, depth)
     known = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     assert (again := read_depth(path).values).dtype == np.float32
@@ -203,7 +204,8 @@ def test_float_formats_give_back_every_known_depth_exactly_also_to_other_program
 
 @pytest.mark.parametrize("scale", [256.0, 1000.0, 5000.0, 1.0, 0.1, 1000 / 3])
 def test_png_gives_back_every_code_and_its_scale(scale: float, tmp_path: Path) -> None:
-    path, codes = tmp_path / "d.png", np.arange(65535, dtype=np.uint16).reshape(257, 255)
+    path = tmp_path / "d.png"
+    codes = np.arange(65535, dtype=np.uint16).reshape(257, 255)
     depth = (codes / scale).astype(np.float32)
     write_depth(path, depth, scale=scale)
     assert np.array_equal(as_others_read(path), codes)
@@ -245,7 +247,8 @@ def test_the_range_has_count_and_ends_and_says_how_to_change_an_assumed_scale() 
     assert "--depth-scale 1000" in describe_range(np.array([3.125, 13.28]), assumed)
 
 
-SIZE, ROWS = (10, 20), [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]
+SIZE = (10, 20)
+ROWS = [[10.5, 3.25, 4.0], [0.0, 0.0, 0.5], [7.0, 2.0, 80.0]]
 WRONG = [[np.nan, 2, 3], [1, np.inf, 3], [1, 1, np.nan], [1, 1, -2], [1, 1, 0]]
 MAP = np.array([[0, 2, 0, 0], [3, 0, 0, 4]], np.float32)
 

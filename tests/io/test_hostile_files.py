@@ -27,7 +27,8 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from tests.models.weights.files import little
 
-TAGS, HIGH = 3000, 2**31 - 1
+TAGS = 3000
+HIGH = 2**31 - 1
 
 
 def png(side: int, bits: int, body: bytes) -> bytes:
@@ -58,7 +59,7 @@ def shared_tags(where: str) -> bytes:
 def overlapping_pages() -> bytes:
     """A TIFF of so many pages, each of whose values ends with the tags of a page begun there."""
     start = [8 + 2 + 12 * TAGS + 4 + 10 + 12 * k for k in range(TAGS)]
-    pointers = b"".join(struct.pack("<HHII", 34665, 4, 0, each) for each in start)
+    pointers = b"".join(struct.pack("<HHII", 34665, 4, 0, offset) for offset in start)
     shared = struct.pack("<HHIHH", 1, 1, 0, 0, 60_000) * (60_000 + TAGS + 1)
     return b"II*\0" + struct.pack("<IH", 8, TAGS) + pointers + bytes(4) + shared
 
@@ -105,7 +106,8 @@ def npz(
     return bytes(content)
 
 
-PLAIN, MANY = exr("Z"), exr(*(f"c{n}" for n in range(5000)))
+PLAIN = exr("Z")
+MANY = exr(*(f"c{n}" for n in range(5000)))
 TILED = exr("Z", type=OpenEXR.tiledimage, tiles=OpenEXR.TileDescription())
 LONG = exr("Z", a="x").replace(b"a\0string\0\1\0\0\0", b"a\0string\0\xff\xff\xff\x7f")
 SHAPES = ["(6, 8", "(True, 5)", "(2, 10**9)", "(-1, 8)", "(6, 8.0)", "(1" * 900]
@@ -151,7 +153,8 @@ READERS = [read_depth, read_sparse, read_rgb, read_calibration, read_json, sha25
 
 @pytest.mark.parametrize("read", READERS)
 def test_no_device_pipe_or_terabyte_is_read(read: Callable[[Path], object], tmp_path: Path) -> None:
-    pipe, huge = tmp_path / "pipe.bin", tmp_path / "huge.bin"
+    pipe = tmp_path / "pipe.bin"
+    huge = tmp_path / "huge.bin"
     os.mkfifo(pipe)
     huge.touch()
     os.truncate(huge, 1 << 42)

@@ -51,7 +51,8 @@ def test_poses_are_joined_by_time_else_by_order_or_number(
 def test_poses_of_nerfstudio_have_axes_up_and_back(tmp_path: Path) -> None:
     # a camera at (1, 2, 3) that looks along x of the world, whose z is up
     matrix = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
-    path, still = tmp_path / "transforms.json", np.eye(4).tolist()
+    path = tmp_path / "transforms.json"
+    still = np.eye(4).tolist()
 
     def poses_of(listed: dict[str, object], *names: str) -> tuple[np.ndarray, str]:
         frames = [{"file_path": n, "transform_matrix": pose} for n, pose in listed.items()]
@@ -95,8 +96,13 @@ def test_poses_of_each_kind_are_one_camera(tmp_path: Path, kind: str, row: str, 
 @pytest.mark.parametrize(
     "text",
     [
-        *("# nothing\n", "1 2 3\n", "2 0 0 0 0 1 0 0 0 0 1 0\n", "-1 0 0 0 0 1 0 0 0 0 1 0\n"),
-        *("1 0 0 nan 0 1 0 0 0 0 1 0\n", "0 0 0 0 0 0 0 0\n", kitti_row(0) + tum_row(0, 0)),
+        "# nothing\n",
+        "1 2 3\n",
+        "2 0 0 0 0 1 0 0 0 0 1 0\n",
+        "-1 0 0 0 0 1 0 0 0 0 1 0\n",
+        "1 0 0 nan 0 1 0 0 0 0 1 0\n",
+        "0 0 0 0 0 0 0 0\n",
+        kitti_row(0) + tum_row(0, 0),
     ],
 )
 def test_a_broken_row_is_refused(tmp_path: Path, text: str) -> None:

@@ -16,8 +16,12 @@ from pnpdepth_cli.io.report import check_report_folder, visible, write_report
 from tests.commands.report_pages import page_data
 
 NAMES = [
-    *("</script><script>alert(1)</script>", "<!-- \"'&amp; -->", "two\nlines", "@DATA@ @SCRIPT@"),
-    *("ü \u2028 \U0001f600", "not utf-8: \udcff"),
+    "</script><script>alert(1)</script>",
+    "<!-- \"'&amp; -->",
+    "two\nlines",
+    "@DATA@ @SCRIPT@",
+    "ü \u2028 \U0001f600",
+    "not utf-8: \udcff",
 ]
 
 
@@ -26,29 +30,57 @@ def written(folder: Path, frames: Iterable[dict[str, Any]], **head: Any) -> list
     page = {"title": "", "facts": [], "notes": [], "tables": [], "without": [], **head}
     data = {"columns": [], "sort_by": 0, "signed": [], "unit": "m"}
     write_report(folder, {"command": "eval"}, page, data, lambda images: frames)
-    return [each["name"] for each in page_data(folder)["frames"]]
+    return [row["name"] for row in page_data(folder)["frames"]]
 
 
 def frame(name: str) -> dict[str, Any]:
     return {"name": name, "key": None, "values": []}
 
 
-def test_names_are_data_and_the_page_lets_nothing_run_but_itself(tmp_path: Path) -> None:
+@pytest.fixture
+def page_of_odd_names(tmp_path: Path) -> Path:
+    """The folder of a report whose title, frames and frames left out have odd names."""
     without = [(name, name) for name in NAMES]
-    assert written(tmp_path, map(frame, NAMES), title=NAMES[0], without=without) == NAMES
-    data, text = page_data(tmp_path), (tmp_path / "index.html").read_text()
+    written(tmp_path, map(frame, NAMES), title=NAMES[0], without=without)
+    return tmp_path
+
+
+def test_names_of_frames_and_the_title_are_data_of_the_page(page_of_odd_names: Path) -> None:
+    data = page_data(page_of_odd_names)
+    assert [row["name"] for row in data["frames"]] == NAMES
     assert data["title"] == NAMES[0]
     assert [name for name, _ in data["without"]] == [visible(name) for name in NAMES]
+
+
+def test_no_name_opens_or_closes_a_script(page_of_odd_names: Path) -> None:
+    text = (page_of_odd_names / "index.html").read_text()
     assert text.count("<script") == text.count("</script>") == 2
-    addresses = set(re.findall(r"\w+://[^\s\"']*", text))
-    assert addresses == {"http://www.w3.org/2000/svg"}  # the name of SVG's elements
+
+
+def test_the_page_has_no_address_but_the_name_of_svgs_elements(page_of_odd_names: Path) -> None:
+    text = (page_of_odd_names / "index.html").read_text()
+    assert set(re.findall(r"\w+://[^\s\"']*", text)) == {"http://www.w3.org/2000/svg"}
+
+
+def policy_of(text: str) -> str:
+    """What the page says that a browser may load and run."""
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert isinstance(policy, str)
+    return policy
+
+
+def test_the_page_lets_nothing_be_loaded(page_of_odd_names: Path) -> None:
+    policy = policy_of((page_of_odd_names / "index.html").read_text())
     assert "default-src 'none'" in policy
     assert "unsafe" not in policy
-    for element in ("style", "script"):
-        (body,) = re.findall(rf"<{element}>(.*?)</{element}>", text, re.DOTALL)
-        digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
-        assert f"{element}-src 'sha256-{digest}'" in policy
+
+
+@pytest.mark.parametrize("element", ["style", "script"])
+def test_the_page_lets_nothing_run_but_itself(page_of_odd_names: Path, element: str) -> None:
+    text = (page_of_odd_names / "index.html").read_text()
+    (body,) = re.findall(rf"<{element}>(.*?)</{element}>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+    assert f"{element}-src 'sha256-{digest}'" in policy_of(text)
 
 
 def test_a_report_replaces_the_one_before_with_its_images_or_leaves_it(tmp_path: Path) -> None:
@@ -63,7 +95,7 @@ def test_a_report_replaces_the_one_before_with_its_images_or_leaves_it(tmp_path:
 
     with pytest.raises(OutputError):
         written(tmp_path / "r", broken())
-    assert [each["name"] for each in page_data(tmp_path / "r")["frames"]] == ["new"]
+    assert [row["name"] for row in page_data(tmp_path / "r")["frames"]] == ["new"]
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 

@@ -33,7 +33,8 @@ STRANGE = "<img src=x onerror=document.title='run'>\n\"ü'"
 @pytest.fixture(scope="module")
 def chrome() -> Iterator[webdriver.Chrome]:
     programs = [shutil.which(name) for name in ("chromium", "google-chrome")]
-    program, driver = next(filter(None, programs), None), shutil.which("chromedriver")
+    program = next(filter(None, programs), None)
+    driver = shutil.which("chromedriver")
     if program is None or driver is None:
         pytest.skip("needs chromium and chromedriver (Debian: apt install chromium-driver)")
     options = webdriver.ChromeOptions()
@@ -86,8 +87,8 @@ def open_view(page: webdriver.Chrome) -> None:
 
 def requested(page: webdriver.Chrome) -> list[str]:
     messages = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
-    sent = [each for each in messages if each["method"] == "Network.requestWillBeSent"]
-    return [each["params"]["request"]["url"] for each in sent]
+    sent = [message for message in messages if message["method"] == "Network.requestWillBeSent"]
+    return [message["params"]["request"]["url"] for message in sent]
 
 
 def test_it_opens_without_a_network_and_loads_views_when_asked(page: webdriver.Chrome) -> None:
@@ -109,7 +110,8 @@ def test_it_opens_without_a_network_and_loads_views_when_asked(page: webdriver.C
 
 def test_before_after_and_ground_truth_are_drawn_and_differ(page: webdriver.Chrome) -> None:
     open_view(page)
-    canvas, drawn = one(page, ".space canvas"), {}
+    canvas = one(page, ".space canvas")
+    drawn = {}
     for name in ("before", "after", "gt"):
         page.execute_async_script(
             "const [css, canvas, done] = arguments; document.querySelector(css).click();"

@@ -21,8 +21,10 @@ COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.u
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("colours", [COLOURS, COLOURS_16])
 def test_bits_are_kept_and_alpha_dropped(tmp_path: Path, suffix: str, colours: np.ndarray) -> None:
-    path, expected = tmp_path / f"a{suffix}", colours / np.float32(np.iinfo(colours.dtype).max)
-    alpha, red = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA), expected[:, :, :1].repeat(3, axis=2)
+    path = tmp_path / f"a{suffix}"
+    expected = colours / np.float32(np.iinfo(colours.dtype).max)
+    alpha = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)
+    red = expected[:, :, :1].repeat(3, axis=2)
     stored = {"colours": (alpha[:, :, :3], expected), "grey": (colours[:, :, :1], red)}
     if suffix == ".png":
         stored["alpha"] = alpha, expected
@@ -42,7 +44,8 @@ STORED += [stored.T for stored in STORED]
 def test_exif_rotation_is_honoured(tmp_path: Path, kind: str, orientation: int) -> None:
     # 16 x 16 blocks, so that JPEG keeps each one's grey
     pixels = np.kron(STORED[orientation - 1].astype(np.uint8) * 50, np.ones((16, 16), np.uint8))
-    path, exif = tmp_path / "a.img", Image.Exif()
+    path = tmp_path / "a.img"
+    exif = Image.Exif()
     exif[0x0112] = orientation
     image = Image.fromarray(pixels.astype(np.uint16) * 257 if "16" in kind else pixels)
     image.save(path, kind.removesuffix("16"), exif=exif)
@@ -64,7 +67,8 @@ def test_what_is_no_image_is_refused(tmp_path: Path, kind: bytes) -> None:
 
 def test_a_heic_photo_is_read_upright(tmp_path: Path) -> None:
     heif = pytest.importorskip("pillow_heif", reason="needs the extra [heic]")
-    path, exif = tmp_path / "a.heic", Image.Exif()
+    path = tmp_path / "a.heic"
+    exif = Image.Exif()
     exif[0x0112] = 6
     red_above_blue = np.uint8([[[200, 0, 0]], [[0, 0, 200]]]).repeat(32, 0).repeat(32, 1)
     heif.from_pillow(Image.fromarray(red_above_blue)).save(path, exif=exif.tobytes(), quality=100)
@@ -85,7 +89,8 @@ def test_every_truncation_of_an_image_is_refused(tmp_path: Path, kind: str) -> N
 
 
 def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(tmp_path: Path) -> None:
-    image, path = Image.new("RGB", (400, 300)), tmp_path / "a.jpg"
+    image = Image.new("RGB", (400, 300))
+    path = tmp_path / "a.jpg"
     for tags in ({0xA405: 50}, {}, {0xA405: 5}, {0xA405: 5000}, {0x920A: 5.0}):
         exif = image.getexif()
         exif[0x8769] = tags
@@ -98,7 +103,8 @@ def test_the_focal_length_is_that_of_film_if_a_camera_can_have_it(tmp_path: Path
 
 
 def test_linear_exr_gets_the_srgb_curve_and_what_is_clipped_a_note(tmp_path: Path) -> None:
-    path, linear = tmp_path / "a.exr", np.array([[0, 0.002, 0.2140411], [0.5, 1, 0]], np.float32)
+    path = tmp_path / "a.exr"
+    linear = np.array([[0, 0.002, 0.2140411], [0.5, 1, 0]], np.float32)
     layer = {f"V.Combined.{c}": linear * shown for c, shown in zip("RGB", (1, 1, 0), strict=True)}
     OpenEXR.File({}, {**layer, "V.Depth.Z": linear}).write(str(path))
     encoded = np.array([[0, 12.92 * 0.002, 0.5], [0.7353569, 1, 0]])[:, :, None] * [1, 1, 0]

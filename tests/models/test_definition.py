@@ -13,22 +13,16 @@ from torch import nn
 from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import (
     Fixed,
-    ModelDefinition,
     Multiple,
     Normalisation,
     graph_definition,
 )
-
-
-def definition(**more: object) -> ModelDefinition:
-    settings: dict[str, object] = {
-        "name": "n", "input_kind": "rgb", "size": Multiple(1), "build": nn.Identity, **more,
-    }  # fmt: skip
-    return ModelDefinition(**settings)  # type: ignore[arg-type]
+from tests.models.definitions import definition
 
 
 def test_arguments_come_in_the_order_of_the_input_kind() -> None:
-    rgb, sparse = torch.ones(1), torch.zeros(1)
+    rgb = torch.ones(1)
+    sparse = torch.zeros(1)
     assert definition().call_arguments(rgb, sparse) == (rgb,)
     assert definition(input_kind="sparse").call_arguments(None, sparse) == (sparse,)
     assert definition(input_kind="rgb+sparse").call_arguments(rgb, sparse) == (rgb, sparse)
@@ -55,7 +49,7 @@ def test_channels_are_first_or_last(shape: tuple[object, ...], size: Fixed | Mul
     stated = {"input_kind": "sparse", "takes_intrinsics": True}
     sparse = graph_definition([[1, 8, 8, 1], [3, 3]], Path("x.pt2"), stated, build=nn.Identity)
     inputs = sparse.call_arguments(None, torch.zeros(1, 1, 8, 8), torch.eye(3)[None])
-    assert [tuple(each.shape) for each in inputs] == [(1, 8, 8, 1), (3, 3)]
+    assert [tuple(tensor.shape) for tensor in inputs] == [(1, 8, 8, 1), (3, 3)]
 
 
 @pytest.mark.parametrize(

@@ -68,19 +68,33 @@ def test_points_stay_at_their_pixel(policy: Fixed | Multiple | Near, size: tuple
     assert len(points) > 50
 
 
-def test_sizes_are_cropped_in_the_middle_shrunk_to_the_longest_or_near_as_transformers() -> None:
-    assert FrameMap.fit(Fixed(30, 40, "crop"), 60, 100).crop == (0, 10, 60, 80)
-    assert FrameMap.fit(Fixed(10, 1000, "crop"), 1, 50).crop == (0, 0, 1, 50)  # of one pixel
+@pytest.mark.parametrize(
+    ("size", "height", "width", "crop"),
+    [
+        (Fixed(30, 40, "crop"), 60, 100, (0, 10, 60, 80)),
+        (Fixed(10, 1000, "crop"), 1, 50, (0, 0, 1, 50)),  # of one pixel
+    ],
+)
+def test_a_fixed_shape_is_cropped_in_the_middle(
+    size: Fixed, height: int, width: int, crop: tuple[int, ...]
+) -> None:
+    assert FrameMap.fit(size, height, width).crop == crop
+
+
+def test_an_image_is_shrunk_to_the_longest_side_but_never_enlarged() -> None:
     assert FrameMap.fit(Multiple(32, longest=640), 1000, 2000).resized == (320, 640)
     assert FrameMap.fit(Multiple(32, longest=640), 100, 200).resized == (100, 200)
 
+
+def test_near_sizes_are_the_multiples_that_transformers_chooses() -> None:
     assert FrameMap.fit(Near(of=14, height=518, width=518), 480, 640).network == (518, 686)
     assert FrameMap.fit(Near(of=32), 375, 1242).network == (384, 1248)
 
 
 @pytest.mark.parametrize("size", [Multiple(32), Fixed(20, 30), Fixed(20, 30, "crop"), Near(of=16)])
 def test_a_prior_stays_but_beside_the_unknown_and_padding(size: Fixed | Multiple | Near) -> None:
-    frame, prior = FrameMap.fit(size, 50, 70), torch.full((1, 1, 50, 70), 3.0)
+    frame = FrameMap.fit(size, 50, 70)
+    prior = torch.full((1, 1, 50, 70), 3.0)
     whole = frame.prior_to_network(prior)
     expected = torch.zeros(1, 1, *frame.network)
     expected[..., : frame.resized[0], : frame.resized[1]] = 3.0

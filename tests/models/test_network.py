@@ -24,7 +24,7 @@ from pnpdepth_cli.models.network import (
     load_network,
 )
 from pnpdepth_cli.points import SparsePoints
-from tests.models.test_definition import definition
+from tests.models.definitions import definition
 
 
 def network(**more: Any) -> Network:

@@ -36,11 +36,11 @@ def test_the_parts_are_behind_the_colon(spec: str, base: str, parts: tuple[str, 
     "output", [MAPS, MAPS[0], MAPS.permute(0, 2, 3, 1), MAPS[None].permute(0, 1, 3, 4, 2)]
 )
 def test_a_channel_is_found_first_or_last(output: torch.Tensor) -> None:
-    for part, number in (("0", 0), ("2", 2), ("z", 2), ("x", 0)):
-        assert torch.equal(part_of(output, part), MAPS[:, number : number + 1])
-    for part in ("3", "w", "-1"):
+    for key, number in (("0", 0), ("2", 2), ("z", 2), ("x", 0)):
+        assert torch.equal(part_of(output, key), MAPS[:, number : number + 1])
+    for key in ("3", "w", "-1"):
         with pytest.raises(ModelError, match="x, y, z"):
-            part_of(output, part)
+            part_of(output, key)
 
 
 @pytest.mark.parametrize(
@@ -113,9 +113,9 @@ def test_a_part_of_an_output_of_an_onnx_file_is_refined(
     name = "last" if channels_last else "points"
     path = write_network(tmp_path / "net.onnx", nodes=nodes, outputs=(name, "g"))
     image = torch.rand(1, 3, 32, 48)
-    whole, part = (load_network(f"{path}:{each}", None) for each in ("g", f"{name}[z]"))
+    whole, part = (load_network(f"{path}:{output}", None) for output in ("g", f"{name}[z]"))
     with torch.no_grad():
-        expected, found = (each.raw_of(each.module(image)) for each in (whole, part))
+        expected, found = (loaded.raw_of(loaded.module(image)) for loaded in (whole, part))
     assert torch.equal(found, expected)
     assert "agrees with onnxruntime" in part.verify((image,))[0]
 

@@ -54,7 +54,8 @@ others = os.path:sep
 
 
 def test_entry_points_add_networks_or_are_reported_when_they_are_named(open_list: Path) -> None:
-    one, several = ONE.replace("NAME", "theirs-object"), SEVERAL.replace("NAME", "theirs-in-a-dict")
+    one = ONE.replace("NAME", "theirs-object")
+    several = SEVERAL.replace("NAME", "theirs-in-a-dict")
     (open_list / "other_nets.py").write_text(one + several)
     info = open_list / "other-1.0.dist-info"
     info.mkdir()

@@ -39,7 +39,8 @@ class Net(nn.Module):
         super().__init__()
         torch.manual_seed(0)
         layers = nn.Conv2d(3, 8, 3, 2, 1), nn.BatchNorm2d(8), nn.ReLU(inplace=True)
-        self.encode, self.out = nn.Sequential(*layers), nn.Conv2d(8, 1, 1)
+        self.encode = nn.Sequential(*layers)
+        self.out = nn.Conv2d(8, 1, 1)
         self.levels = torch.arange(1, 9)
 
     def forward(self, rgb: Tensor) -> Tensor:
@@ -60,12 +61,14 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_exported_program_is_cut_at_its_graphs_nodes_bit_for_bit(archive: Path) -> None:
-    network, net = load_network(str(archive), None), Net().eval()
+    network = load_network(str(archive), None)
+    net = Net().eval()
     rgb = torch.rand(1, 3, 32, 48, requires_grad=True)
     assert network.definition.size == Fixed(32, 48)
-    depth, expected = network.raw_of(network.module(rgb)), net(rgb)
+    depth = network.raw_of(network.module(rgb))
+    expected = net(rgb)
     assert torch.equal(depth, expected)
-    ours, theirs = (torch.autograd.grad(one.sum(), rgb)[0] for one in (depth, expected))
+    ours, theirs = (torch.autograd.grad(output.sum(), rgb)[0] for output in (depth, expected))
     torch.testing.assert_close(ours, theirs)
     names = [name for name, _ in network.module.named_children()]
     assert {"conv2d", "batch_norm", "relu", "relu_", "sigmoid"} <= set(names)
@@ -100,7 +103,9 @@ def test_a_definition_names_a_graph_of_image_sparse_depth_and_intrinsics(
 ) -> None:
     if define is onnx_definition and pytestconfig.getoption("--rounding"):
         pytest.skip("torch's exporter would trace the other roundings")
-    net, rgb, path = WithPointsAndCamera().eval(), torch.rand(3, 20, 30), tmp_path / "net.pt2"
+    net = WithPointsAndCamera().eval()
+    rgb = torch.rand(3, 20, 30)
+    path = tmp_path / "net.pt2"
     given = (rgb[None], torch.zeros(1, 1, 20, 30), torch.eye(3)[None])
     if define is onnx_definition:
         pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")

@@ -33,7 +33,8 @@ def room(position: Shift = (0, 0, 0), box_x: float | None = None, *, seed: int) 
     """What a camera at a position sees: two walls, a floor, and a box 4 m away, if any."""
     pixels = np.random.default_rng(seed).permutation(SIZE[0] * SIZE[1])[:3000]
     xy = np.column_stack([pixels % SIZE[1], pixels // SIZE[1]]).astype(np.float32)
-    depth, shift = depth_of_walls(xy, position), np.array(position)
+    depth = depth_of_walls(xy, position)
+    shift = np.array(position)
     if box_x is not None:
         at = unproject(CAMERA, xy, np.full(3000, 4 - shift[2]))[:, :2] + shift[:2]
         on_box = (np.abs(at - (box_x, 0)) < 0.5).all(axis=1)
@@ -56,7 +57,8 @@ def from_ahead(metres: float) -> NDArray[np.float64]:
 
 
 def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
-    own, ahead = room(seed=0), room((0, 0, 0.5), seed=1)
+    own = room(seed=0)
+    ahead = room((0, 0, 0.5), seed=1)
     both = accumulate(own, {1: [(ahead, from_ahead(0.5))]}, CAMERA)
     assert both.xy[: len(own)].tobytes() == own.xy.tobytes()
     assert both.depth[: len(own)].tobytes() == own.depth.tobytes()
@@ -66,7 +68,8 @@ def test_moved_points_lie_on_the_surfaces_of_the_frame() -> None:
 
 
 def test_points_of_a_moved_object_are_dropped() -> None:
-    own, later = room(box_x=-1.0, seed=0), room(box_x=1.0, seed=1)
+    own = room(box_x=-1.0, seed=0)
+    later = room(box_x=1.0, seed=1)
     both = accumulate(own, {1: [(later, from_ahead(0))]}, CAMERA)
     moved, depth = both.xy[len(own) :], both.depth[len(own) :]
     at = (moved - (79.5, 59.5)) / 150 * 4
@@ -79,7 +82,7 @@ def test_points_of_a_moved_object_are_dropped() -> None:
 def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
     own, one, two = (room(seed=seed) for seed in range(3))
     near, far = {1: [(one, from_ahead(0))]}, {2: [(two, from_ahead(0))]}
-    with_near, with_both = (accumulate(own, each, CAMERA) for each in (near, far | near))
+    with_near, with_both = (accumulate(own, points, CAMERA) for points in (near, far | near))
     kept = with_both.xy[: len(with_near)]
     assert kept.tobytes() == with_near.xy.tobytes()
     more = with_both.xy[len(with_near) :]
@@ -92,7 +95,8 @@ def test_a_scan_farther_in_time_is_replaced_by_a_nearer_one() -> None:
 def test_a_scan_that_sees_little_of_the_view_adds_what_agrees(seen: int, count: int) -> None:
     own = room(seed=0).select(slice(count))
     turned_away = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
-    behind, ahead = own.select(slice(0)), own.select(slice(seen))
+    behind = own.select(slice(0))
+    ahead = own.select(slice(seen))
     scans = [(room(seed=1), turned_away), (behind, from_ahead(0)), (ahead, from_ahead(0))]
     both = accumulate(own, {1: scans}, CAMERA)
     assert both.xy.tobytes() == own.xy.tobytes()  # the one that agrees lies on a measured pixel
@@ -100,7 +104,8 @@ def test_a_scan_that_sees_little_of_the_view_adds_what_agrees(seen: int, count: 
 
 
 def test_an_inaccurate_motion_is_corrected_by_the_surfaces() -> None:
-    own, ahead = room(box_x=-1.0, seed=0), room((0, 0, 0.5), -1.0, seed=1)
+    own = room(box_x=-1.0, seed=0)
+    ahead = room((0, 0, 0.5), -1.0, seed=1)
     xyz = unproject(CAMERA, ahead.xy, ahead.depth)
     motion = refine_motion(own, xyz, from_ahead(0.6), CAMERA)
     np.testing.assert_allclose(motion[:, :3], np.eye(3), atol=2e-3)
@@ -130,9 +135,10 @@ def test_the_motion_between_two_images_is_that_of_the_poses() -> None:
 def test_a_motion_beyond_the_median_depth_is_refused() -> None:
     points = room(seed=0).select(slice(400))
     descriptors = np.random.default_rng(0).random((400, 128)).astype(np.float32)
-    xyz, own = unproject(CAMERA, points.xy, points.depth), points.xy.astype(np.float64)
-    for part, refused in ((0.1, False), (1.5, True)):
-        shift = [part * float(np.median(points.depth)), 0, 0]
+    xyz = unproject(CAMERA, points.xy, points.depth)
+    own = points.xy.astype(np.float64)
+    for share, refused in ((0.1, False), (1.5, True)):
+        shift = [share * float(np.median(points.depth)), 0, 0]
         shown = pixels_of(CAMERA, xyz + shift)
         motion, _ = motion_of_images((shown, descriptors), (own, descriptors), points, CAMERA)
         assert (motion is None) == refused

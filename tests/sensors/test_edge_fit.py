@@ -17,18 +17,20 @@ def boxes(seed: int = 0) -> tuple[np.ndarray, Points]:
     rgb = np.full((*SIZE, 3), 0.5, np.float32)
     depth = np.full(SIZE, 10.0, np.float32)
     for near in (7, 5, 3):
-        top, left = rng.integers(10, 150), rng.integers(10, 230)
+        top = rng.integers(10, 150)
+        left = rng.integers(10, 230)
         rgb[top : top + 60, left : left + 60] = rng.uniform(size=3)
         depth[top : top + 60, left : left + 60] = near
     rgb += rng.normal(0, 0.02, rgb.shape).astype(np.float32)
-    y, x = (each.ravel() for each in np.mgrid[4:240:5, 2:320:2])
+    y, x = (coordinates.ravel() for coordinates in np.mgrid[4:240:5, 2:320:2])
     xy = np.column_stack([x, y]).astype(np.float32)
     return rgb.clip(0, 1), Points(xy=xy, depth=depth[y, x], size=SIZE)
 
 
 def test_points_that_belong_to_an_image_stand_out_and_a_shift_is_found() -> None:
     rgb, points = boxes()
-    weight, edges = jump_weights(points), edge_map(rgb)
+    weight = jump_weights(points)
+    edges = edge_map(rgb)
     assert weight is not None
     assert weight.mean() == pytest.approx(0, abs=1e-9)
     assert np.linalg.norm(weight) == pytest.approx(1)

@@ -28,7 +28,8 @@ EXAMPLES: dict[str, tuple[float, ...]] = {
 def test_lenses_are_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
     xy = np.random.default_rng(seed).uniform(-0.6, 0.6, (60, 2))
     points = 3 * np.column_stack([xy, np.ones(60)])
-    camera, still = Camera(intrinsics=K, distortion=coefficients), np.zeros(3)
+    camera = Camera(intrinsics=K, distortion=coefficients)
+    still = np.zeros(3)
     theirs, _ = cv2.projectPoints(points, still, still, K, np.array(coefficients))
     np.testing.assert_allclose(pixels_of(camera, points), theirs[:, 0], atol=1e-6)
     four = coefficients[:4]
@@ -39,7 +40,8 @@ def test_lenses_are_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_undoing_a_lens_gives_the_directions_back_and_the_rays_of_an_image(lens: str) -> None:
-    turn, out = np.linspace(0, 40, 99), np.linspace(0, 5, 99)  # from the axis to 79 degrees
+    turn = np.linspace(0, 40, 99)
+    out = np.linspace(0, 5, 99)  # from the axis to 79 degrees
     plane = np.column_stack([out * np.cos(turn), out * np.sin(turn)])
     shown = distort(plane, lens, EXAMPLES[lens])
     assert np.abs(shown - plane).max() > 0.1

@@ -55,7 +55,8 @@ def test_both_sides_of_a_jump_are_left_out_and_nothing_else() -> None:
 
 def test_unknown_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
     depth = np.full((HEIGHT, WIDTH), 3, np.float32)
-    depth[8, 4], depth[5, 6] = 0, np.inf
+    depth[8, 4] = 0
+    depth[5, 6] = np.inf
     cloud = joined(cloud_from_depth(depth, CAMERA))
     assert len(cloud.xyz) == HEIGHT * WIDTH - 2
     assert (cloud.xyz[:, 2] == 3).all()
@@ -66,13 +67,15 @@ def test_unknown_pixels_have_no_point_and_a_pose_moves_the_others() -> None:
 
 
 def test_merged_clouds_have_one_mean_point_per_voxel() -> None:
-    rng, normals = np.random.default_rng(2), np.tile(np.float32([0, 0, -1]), (500, 1))
+    rng = np.random.default_rng(2)
+    normals = np.tile(np.float32([0, 0, -1]), (500, 1))
     clouds = []
     for _ in range(3):
         xyz = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
         rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
         clouds.append(PointCloud(xyz=xyz, rgb=rgb, normals=normals))
-    merged, every = merge_in_voxels(clouds, 0.5), joined(clouds)
+    merged = merge_in_voxels(clouds, 0.5)
+    every = joined(clouds)
     cells = np.floor(every.xyz / 0.5)
     assert len(merged.xyz) == len(np.unique(cells, axis=0))
     first = (cells == np.floor(merged.xyz[0] / 0.5)).all(axis=1)
@@ -97,7 +100,8 @@ def view_at(x: float, depth: np.ndarray) -> View:
 
 def test_a_wrong_view_is_outvoted_and_does_not_move_the_mean() -> None:
     depth = depth_of_a_wall(0.0)
-    here, right = view_at(0.0, depth), view_at(0.4, depth_of_a_wall(0.4))
+    here = view_at(0.0, depth)
+    right = view_at(0.4, depth_of_a_wall(0.4))
     wrong = view_at(0.2, np.float32(1.2) * depth_of_a_wall(0.2))
     kept = consistent_depth(here, [right, wrong], 2)
     known = kept > 0
@@ -109,8 +113,11 @@ def test_a_wrong_view_is_outvoted_and_does_not_move_the_mean() -> None:
 
 def test_a_pixel_that_is_unknown_occluded_or_outside_elsewhere_is_left_out() -> None:
     depth = depth_of_a_wall(0.0)
-    here, other = view_at(0.0, depth), depth.copy()
-    other[:10], other[10:20], other[20:25] = 0, 1.0, np.inf
+    here = view_at(0.0, depth)
+    other = depth.copy()
+    other[:10] = 0
+    other[10:20] = 1.0
+    other[20:25] = np.inf
     kept = consistent_depth(here, [view_at(0.0, other)], 2)
     assert not kept[:25].any()
     np.testing.assert_allclose(kept[25:], depth[25:], rtol=1e-6)

@@ -74,7 +74,8 @@ def test_nearer_points_hide_others(origin: tuple[float, float, float], focal_px:
     depth = rng.choice([2.0, 2.1, 3.0, 5.0, 20.0], 200)
     scanner = np.array([[focal_px, 0, 15.5], [0, focal_px, 11.5], [0, 0, 1]]) @ origin
     expected = np.zeros(200, bool)
-    reach, margin = max(1, round(np.radians(0.8) * focal_px)), np.radians(0.24) * focal_px
+    reach = max(1, round(np.radians(0.8) * focal_px))
+    margin = np.radians(0.24) * focal_px
     for (i, far), (j, near) in itertools.product(enumerate(depth), repeat=2):
         apart = np.floor(xy[j] + 0.5) - np.floor(xy[i] + 0.5)
         if near < 0.92 * far and np.abs(apart).max() <= reach:
@@ -101,7 +102,8 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
     elevation, azimuth = np.meshgrid(
         np.radians(np.arange(-9, 9, 0.4)), np.radians(np.arange(-24, 24, 0.2)), indexing="ij"
     )
-    y, z = np.tan(azimuth).ravel(), (np.tan(elevation) / np.cos(azimuth)).ravel()
+    y = np.tan(azimuth).ravel()
+    z = (np.tan(elevation) / np.cos(azimuth)).ravel()
     on_board = (np.floor(5 * y / 0.25) % 2 == 0) & (np.abs(5 * z) < 0.4)
     x = np.where(on_board, 5.0, 20.0)
     scan = project_velodyne(
@@ -114,23 +116,48 @@ def boards_before_a_wall(*, keep_occluded: bool = True) -> Points:
     return points_of(as_depth_image(scan))
 
 
-def test_points_of_the_wall_within_the_boards_are_occluded(tmp_path: Path) -> None:
+def test_points_of_the_wall_within_the_boards_are_occluded() -> None:
     points = boards_before_a_wall()
     hidden = occluded_in_map(points)
-    assert points.depth[hidden].min() > 19  # the foreground itself stays
     between = interleaved(as_depth_image(points))
     column, row = points.xy.astype(int).T
     assert hidden[between[row, column]].mean() > 0.8
     assert hidden.mean() < 2.5 * between.sum() / len(points)
+
+
+def test_points_of_the_foreground_are_never_occluded() -> None:
+    points = boards_before_a_wall()
+    assert points.depth[occluded_in_map(points)].min() > 19  # the boards are at 5 m
+
+
+def test_a_map_whose_occluded_points_are_gone_is_no_raw_projection() -> None:
     assert occluded_in_map(boards_before_a_wall(keep_occluded=False)) is None
-    write_depth(tmp_path / "sparse.png", as_depth_image(points), scale=256)
-    files = FrameFiles(sparse=tmp_path / "sparse.png")
-    read = read_requested(RefineRequest(files=files))
+
+
+@pytest.fixture
+def map_of_boards(tmp_path: Path) -> FrameFiles:
+    """A file with the map of the boards and the wall."""
+    write_depth(tmp_path / "sparse.png", as_depth_image(boards_before_a_wall()), scale=256)
+    return FrameFiles(sparse=tmp_path / "sparse.png")
+
+
+def test_occluded_points_of_a_file_are_dropped_and_counted(map_of_boards: FrameFiles) -> None:
+    hidden = occluded_in_map(boards_before_a_wall())
+    read = read_requested(RefineRequest(files=map_of_boards))
     assert read.sources["sparse"].dropped["hidden by foreground"] == hidden.sum()
     assert len(read.points) == np.count_nonzero(~hidden)
+
+
+def test_one_note_says_that_the_papers_method_keeps_occluded_points(
+    map_of_boards: FrameFiles,
+) -> None:
+    read = read_requested(RefineRequest(files=map_of_boards))
     assert sum("--method paper" in note for note in read.notes) == 1
-    paper = RefineRequest(files=files, method=Settings(method="paper"))
-    assert len(read_requested(paper).points) == len(points)
+
+
+def test_the_papers_method_keeps_occluded_points(map_of_boards: FrameFiles) -> None:
+    paper = RefineRequest(files=map_of_boards, method=Settings(method="paper"))
+    assert len(read_requested(paper).points) == len(boards_before_a_wall())
 
 
 @pytest.mark.parametrize("kind", ["uniform", "grid"])

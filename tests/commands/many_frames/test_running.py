@@ -23,7 +23,7 @@ from pnpdepth_cli.errors import DeviceError, ModelError, OutputError, StorageErr
 from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.atomic import remove_leftovers
 from tests.commands.batches import Recorder, add_frame, batch, done, pairs_on_disk, results
-from tests.io.test_atomic import no_room_on_disk
+from tests.io.full_disk import no_room_on_disk
 
 NAMES = tuple(f"f{number:02}" for number in range(12))
 FRAMES = ("a", "b", "c", "sub/d", "sub/e")

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
 from tests.completion.naive import plain
-from tests.core.networks import NETWORKS, Counting, Net, UNet, build, conv, image
+from tests.core.networks import NETWORKS, Counting, Net, UNet, build, conv, image, state_of
 
 NO_CUT = {
     "unet": {"encoder.stages", "ups"},
@@ -179,26 +179,6 @@ def test_the_rear_needs_a_front_that_succeeded_and_may_be_tried_again() -> None:
         with pytest.raises(ModelError):
             split.rear(z[:, :3])
         assert torch.equal(split.rear(z), plain(network, x))
-
-
-def state_of(network: nn.Module) -> dict[str, Any]:
-    """Everything of a network that a split could leave changed."""
-    state: dict[str, Any] = {}
-    for name, module in network.named_modules():
-        state[name] = (
-            module.training,
-            module.__dict__.get("forward"),
-            sorted(module.__dict__),
-            *(list(getattr(module, hooks)) for hooks in vars(nn.Module()) if "hooks" in hooks),
-        )
-    for name, tensor in (*network.named_parameters(), *network.named_buffers()):
-        grad = None if tensor.grad is None else bits(tensor.grad)
-        state[f"tensor {name}"] = (id(tensor), bits(tensor), tensor.requires_grad, grad)
-    return state
-
-
-def bits(tensor: Tensor) -> bytes:
-    return tensor.detach().numpy().tobytes()
 
 
 def prepared(name: str) -> nn.Module:

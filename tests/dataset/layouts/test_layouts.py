@@ -67,7 +67,9 @@ def test_a_layout_is_guessed_and_no_other_takes_it(name: str, tmp_path: Path) ->
     stated = (own.sparse_scale, own.gt_scale, own.one_view, own.gt_other_size)
     assert stated == STATED.get(name, (None, None, False, False))
     assert repr(frames) == repr(read_frames(root, name))
-    assert [other for other, layout in LAYOUTS.items() if layout.matches(root)] == [name]
+    assert [layout_name for layout_name, layout in LAYOUTS.items() if layout.matches(root)] == [
+        name
+    ]
 
 
 def test_pairs_may_lack_parts_and_files_of_no_frame_are_listed(tmp_path: Path) -> None:
@@ -85,7 +87,7 @@ def test_pairs_may_lack_parts_and_files_of_no_frame_are_listed(tmp_path: Path) -
     assert (layout, b.name, b.calib) == ("pairs", "b", tmp_path / "calib.txt")
     alone = ("sparse/a.png", "sparse/d.png", "gt/a.exr", "calib/a.json", "calib/f.txt")
     said = (f"{path.relative_to(tmp_path)} {why}" for path, why in unmatched)
-    lost = [each.split(" has ")[0] for each in said]
+    lost = [note.split(" has ")[0] for note in said]
     assert lost == ["rgb/a.png and a.jpg are one frame; keep one", "rgb/c.png", *alone]
 
 
@@ -140,7 +142,7 @@ def test_the_files_of_a_frame_are_found_from_wherever_the_data_set_starts(
     tree(tmp_path, files)
     for frames in (read_frames(tmp_path / start) for start in starts):
         for name, values in parts.items():
-            expected = [tmp_path / each if isinstance(each, str) else each for each in values]
+            expected = [tmp_path / value if isinstance(value, str) else value for value in values]
             assert [getattr(frame, name) for frame in frames] == expected
 
 
@@ -386,8 +388,10 @@ def test_poses_of_a_raw_drive_are_those_of_the_inertial_system(
     heading_deg: float, tmp_path: Path
 ) -> None:
     # 10 m ahead, then a turn by 3 degrees to the left on the spot, at a latitude of 49 degrees.
-    heading, metre_deg = np.radians(heading_deg), 1 / 111_319.49
-    north, east = 10 * np.sin(heading) * metre_deg, 10 * np.cos(heading) * metre_deg
+    heading = np.radians(heading_deg)
+    metre_deg = 1 / 111_319.49
+    north = 10 * np.sin(heading) * metre_deg
+    east = 10 * np.cos(heading) * metre_deg
     places = [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 1.0, 3.0)]
     scale = np.cos(np.radians(49))
     packets = [

@@ -245,5 +245,5 @@ def test_weights_beside_it_stay_and_are_read_once(field: str, value: Any, tmp_pa
 def test_weights_beside_the_model_are_those_of_one_file(tmp_path: Path) -> None:
     two = beside(tmp_path / "x.onnx", copies=1)
     (tmp_path / "one.onnx").write_bytes(onnx.load(str(two)).SerializeToString())
-    one, other = (load_network(str(each), None) for each in (tmp_path / "one.onnx", two))
+    one, other = (load_network(str(path), None) for path in (tmp_path / "one.onnx", two))
     assert torch.equal(one.module(IMAGE), other.module(IMAGE))

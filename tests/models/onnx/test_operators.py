@@ -31,7 +31,8 @@ PARTLY_COVERED = {"AveragePool", "Dropout", "GatherND", "IsInf", "MaxPool"}
 PARTLY_COVERED |= {"Pad", "ReduceSum", "Resize", "ScatterND"}
 """Operators some of whose attributes are refused."""
 OTHERWISE = {
-    *("test_convtranspose_output_shape", "test_maxpool_2d_uint8"),
+    "test_convtranspose_output_shape",
+    "test_maxpool_2d_uint8",
     "test_resize_downsample_scales_linear_align_corners",
     "test_resize_downsample_scales_cubic_align_corners",
     *(f"test_reduce_{kind}" for kind in ("max_empty_set", "max_empty_set_bool", "min_empty_set")),
@@ -65,9 +66,10 @@ def outputs_of(model: onnx.ModelProto, x: Any) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("op", sorted(OPERATORS.keys() - WITHOUT_CASES))
 def test_an_operator_computes_what_the_standard_says(op: str) -> None:
-    agreed, refused = 0, list[str]()
+    agreed = 0
+    refused = list[str]()
     for case in standard_cases()[op]:
-        inputs, outputs = ([np.asarray(value) for value in part] for part in case.data_sets[0])
+        inputs, outputs = ([np.asarray(value) for value in values] for values in case.data_sets[0])
         kinds = {value.dtype for value in (*inputs, *outputs)}
         if case.name in OTHERWISE or "training" in case.name or not inputs or not kinds <= KINDS:
             continue
@@ -111,7 +113,9 @@ def model_of(
 
 X = normal(1, 4, 7, 6)
 STATISTICS = [normal(4), normal(4), np.abs(normal(4)) + 0.1]
-W, V, TWICE = normal(6, 4, 3, 3), normal(4, 5, 3, 3), {"strides": [2, 2]}
+W = normal(6, 4, 3, 3)
+V = normal(4, 5, 3, 3)
+TWICE = {"strides": [2, 2]}
 CASES: list[tuple[str, int, list[np.ndarray | None], dict[str, Any]]] = [
     ("Clip", 6, [X], {"min": 0.0, "max": 6.0}),
     ("Softmax", 11, [X], {"axis": 2}),

@@ -20,14 +20,14 @@ from pnpdepth_cli.errors import ModelError
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple
 from pnpdepth_cli.models.registry import find_definition
 from pnpdepth_cli.models.weights import load_checkpoint
-from tests.models.weights.files import little, npy_of, pickled, refused
-from tests.models.weights.test_tensor_bundle import bundle, entry
+from tests.models.weights.files import bundle, entry, little, npy_of, pickled, refused
 
 
 class Net(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.conv, self.norm = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
+        self.conv = nn.Conv2d(3, 4, 3)
+        self.norm = nn.BatchNorm2d(4)
 
 
 DEFINITION = ModelDefinition(name="net", input_kind="rgb", size=Multiple(1), build=Net)
@@ -88,7 +88,7 @@ def test_prefixes_of_parallel_or_compiled_modules_are_stripped(prefix: str, tmp_
     state = {f"{prefix}{name}": tensor for name, tensor in weights().items()}
     torch.save({"state_dict": state}, tmp_path / "w.ckpt")
     (note,) = loads(tmp_path / "w.ckpt", weights())
-    assert all(repr(f"{part}.") in note for part in prefix.split(".")[:-1])
+    assert all(repr(f"{name}.") in note for name in prefix.split(".")[:-1])
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -110,7 +110,8 @@ def test_of_several_states_the_one_that_is_read_is_named(order: int, tmp_path: P
 def test_every_kind_of_misfit_is_listed(tmp_path: Path) -> None:
     state = weights()
     del state["norm.running_mean"], state["norm.running_var"]
-    state["norm.weight"][0], state["norm.bias"][0] = float("nan"), float("inf")
+    state["norm.weight"][0] = float("nan")
+    state["norm.bias"][0] = float("inf")
     state |= {f"extra{n}": torch.ones(1) for n in range(5)}
     state["conv.bias"] = torch.ones(7)
     state["conv.weight"] = state["conv.weight"] * 1j

@@ -42,7 +42,8 @@ def save(content: Any, path: Path, new: bool = True) -> Path:
 
 @both_layouts
 def test_of_a_whole_module_the_state_is_read_the_rest_named(tmp_path: Path, new: bool) -> None:
-    net, notes = Net(), list[str]()
+    net = Net()
+    notes = list[str]()
     optimiser = torch.optim.SGD(net.parameters(), lr=0.1, momentum=0.9)
     whole = {"args": argparse.Namespace(lr=0.1), "model": net, "optimizer": optimiser}
     state = read_checkpoint(save(whole, tmp_path / "net.pth.tar", new), notes)
@@ -64,7 +65,8 @@ def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, ne
 @pytest.mark.parametrize("how", ["zip", "row of pickles", "pickle alone", "numpy"])
 @pytest.mark.parametrize("kind", hostile(Path("x")))
 def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path, kind: str, how: str) -> None:
-    marker, path = tmp_path / "ran", tmp_path / ("bad.npy" if how == "numpy" else "bad.pt")
+    marker = tmp_path / "ran"
+    path = tmp_path / ("bad.npy" if how == "numpy" else "bad.pt")
     content = {"w": torch.ones(2), "x": hostile(marker)[kind]}
     if how == "numpy":
         npy_of(path, pickled({**content, "w": np.ones(2)}))
@@ -89,7 +91,8 @@ def archive_of(path: Path, pickled: bytes, storage: bytes, **how: Any) -> Path:
 
 def tensor_pickle(elements: int, shape: tuple[int, ...], stride: tuple[int, ...]) -> bytes:
     """A pickle of one float32 tensor on storage 0, of whatever shape."""
-    content, storage = io.BytesIO(), torch.UntypedStorage(4)
+    content = io.BytesIO()
+    storage = torch.UntypedStorage(4)
     pickler = pickle.Pickler(content, protocol=2)
     pid = ("storage", torch.FloatStorage, "0", "cpu", elements)
     pickler.persistent_id = lambda each: pid if each is storage else None  # type: ignore[method-assign]
