@@ -61,7 +61,8 @@ def suggest_layers(
         if output.shape[1] > 1 and _has_aspect_of(output, sides) and output.grad_fn in behind
     }
     # The last map before each finer one, from the first of the coarsest maps on.
-    coarsest, last_of = min(areas.values(), default=0), dict[int, str]()
+    coarsest = min(areas.values(), default=0)
+    last_of = dict[int, str]()
     for name, area in dropwhile(lambda named: named[1] > coarsest, areas.items()):
         if area >= max(last_of, default=0):
             last_of[area] = name
@@ -71,7 +72,8 @@ def suggest_layers(
 
 def _nodes_of(prediction: Tensor) -> set[Node]:
     """The operations of torch's graph that a gradient of the prediction comes back through."""
-    seen, nodes = set[Node](), [prediction.grad_fn]
+    seen = set[Node]()
+    nodes = [prediction.grad_fn]
     while nodes:
         node = nodes.pop()
         if node is None or node in seen:

@@ -40,7 +40,8 @@ def _check(owner: object, field: str, good: bool, wanted: str) -> None:
     """ModelError with the field and its value, unless that is good or the default."""
     value = getattr(owner, field)
     if not good and value is not getattr(type(owner), field, _check):
-        name, shown = getattr(owner, "name", ""), " ".join(repr(value).split())
+        name = getattr(owner, "name", "")
+        shown = " ".join(repr(value).split())
         named = f"{type(owner).__name__} {name!r}" if name else type(owner).__name__
         raise ModelError(f"{named[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
 

@@ -21,7 +21,8 @@ from torch.utils.flop_counter import flop_registry
 
 from pnpdepth_cli.errors import ModelError
 
-_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH = 1 << 28, 64
+_ACTIVATION_ELEMENTS = 1 << 28
+_ACTIVATION_GROWTH = 64
 """One activation may have so many elements (1 GB), or so many times those of input and weights."""
 
 _NUMBERS = ("item", "_local_scalar_dense", "equal")
@@ -30,8 +31,24 @@ _NUMBERS = ("item", "_local_scalar_dense", "equal")
 _BATCH_NORMS = ("native_batch_norm", "_native_batch_norm_legit_no_training")
 
 _TRUTH_VALUES = (
-    *("eq", "ne", "lt", "le", "gt", "ge", "isnan", "isinf", "isfinite", "isposinf", "isneginf"),
-    *("signbit", "logical_and", "logical_or", "logical_xor", "logical_not", "isclose", "isreal"),
+    "eq",
+    "ne",
+    "lt",
+    "le",
+    "gt",
+    "ge",
+    "isnan",
+    "isinf",
+    "isfinite",
+    "isposinf",
+    "isneginf",
+    "signbit",
+    "logical_and",
+    "logical_or",
+    "logical_xor",
+    "logical_not",
+    "isclose",
+    "isreal",
 )
 """Functions of single elements whose result is true or false."""
 
@@ -149,7 +166,8 @@ class _Runner(fx.Interpreter):
 
     def __init__(self, module: FileGraph, most: float) -> None:
         super().__init__(module, graph=module._graph)
-        self.extra_traceback, self._most = False, most
+        self.extra_traceback = False
+        self._most = most
 
     def call_module(
         self, target: Target, args: tuple[Argument, ...], kwargs: dict[str, object]

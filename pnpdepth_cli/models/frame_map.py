@@ -114,7 +114,8 @@ def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints, Camera
     coarse = torch.rand(1, 3, max(2, height // 8), max(2, width // 8), generator=generator)
     rgb = F.interpolate(coarse, size, mode="bilinear")
     pixels = torch.randperm(height * width, generator=generator)[:_SYNTHETIC_POINTS]
-    y, x = pixels // width, pixels % width
+    y = pixels // width
+    x = pixels % width
     points = SparsePoints(
         xy=torch.stack([x, y], dim=1).float(),
         depth=2 + 3 * y.float() / height + torch.rand(len(pixels), generator=generator),

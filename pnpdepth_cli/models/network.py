@@ -128,7 +128,8 @@ class Network:
             ModelError: The definition's `arguments` raises or does not return a tuple.
             UsageError: The network takes intrinsics, and they are unknown.
         """
-        definition, name = self.definition, f"network {self.definition.name!r}"
+        definition = self.definition
+        name = f"network {self.definition.name!r}"
         sparse = points.scatter().to(self.device) if "sparse" in definition.input_kind else None
         camera = None
         if definition.takes_intrinsics:
@@ -225,7 +226,8 @@ class Network:
 
 def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
     """Makes 0 of NaN in the gradients behind a tensor, which are 0 times an infinite slope."""
-    seen, nodes = set(), [tensor.grad_fn]
+    seen = set()
+    nodes = [tensor.grad_fn]
     while nodes:
         node = nodes.pop()
         if node is None or node in seen:
@@ -267,7 +269,8 @@ class AlignedDepth:
         seen = at_points.isfinite()
         self.notes = self._unknown_notes(raw, seen)
         if bool(seen.any()):
-            self._points, at_points = self._points.select(seen), at_points[seen]
+            self._points = self._points.select(seen)
+            at_points = at_points[seen]
         definition = self._network.definition
         self.notes += self._order_notes(at_points)
         if self._kind == "none":
@@ -278,7 +281,8 @@ class AlignedDepth:
 
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
         """Where the network says nothing, such as of the sky, and how many points lie there."""
-        unknown, lost = float(raw.isnan().cpu().double().mean()), int((~seen).sum())
+        unknown = float(raw.isnan().cpu().double().mean())
+        lost = int((~seen).sum())
         if not lost and unknown < _FEW_UNKNOWN:
             return ()
         note = f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there"

@@ -56,7 +56,8 @@ def part_of(output: Any, part: str) -> Any:
 
 def _channel_of(output: Tensor, part: str, number: int | None) -> Tensor:
     """The channel as a map (1, 1, h, w)."""
-    shape, maps = "×".join(map(str, output.shape)), output
+    shape = "×".join(map(str, output.shape))
+    maps = output
     while maps.ndim > 3 and maps.shape[0] == 1:
         maps = maps[0]
     if maps.ndim == 2:

@@ -112,7 +112,8 @@ def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDef
 
 def _from_file(spec: str) -> ModelDefinition | None:
     """The definition of a file or folder; None if `spec` looks like neither."""
-    file, part = spec, None
+    file = spec
+    part = None
     if (found := re.fullmatch(r"(.*\.(?:py|onnx)):([^:]*)", spec, re.DOTALL)) is not None:
         file, part = found.groups()
     if file.endswith(".py"):

@@ -85,7 +85,8 @@ def _read(file: Path) -> tuple[_Json, dict[str, Tensor]]:
 
 def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
     """The program of models/model.json as a module, whose submodules are its nodes."""
-    graph, module = FileGraph(), program["graph_module"]
+    graph = FileGraph()
+    module = program["graph_module"]
     for spec in module["signature"]["input_specs"]:
         ((kind, value),) = dict(spec).items()
         if kind == "user_input":

@@ -44,7 +44,9 @@ _SHARED = 2  # tensors that may have the same bytes of a file beside the model
 
 _STANDARD = ("", "ai.onnx")
 _TO_SHAPES = ("Shape", "Size")
-_CONSTANT_ELEMENTS, _CONSTANT_GROWTH, _CONSTANTS = 1 << 24, 4, 4
+_CONSTANT_ELEMENTS = 1 << 24
+_CONSTANT_GROWTH = 4
+_CONSTANTS = 4
 """One computed constant may have so many elements, or so many times those stored in the file; all
 of them together so many times as many as one."""
 
@@ -166,7 +168,9 @@ def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
 
 def _prune(model: ModelProto, output: str) -> bool:
     """Leaves in the model one output and the nodes that it needs. True if others were there."""
-    graph, needed, nodes = model.graph, {output}, []
+    graph = model.graph
+    needed = {output}
+    nodes = []
     for node in reversed(graph.node):
         if not needed.isdisjoint(node.output):
             nodes.append(node)
@@ -253,8 +257,10 @@ def _deviation(actual: Tensor, expected: Tensor) -> float:
     both = known & actual.isfinite()  # a network may be inf or NaN in the sky
     if int((known != actual.isfinite()).sum()) > MISMATCH * expected.numel() or not both.any():
         return math.inf
-    actual, expected = actual[both].float(), expected[both]
-    largest, difference = float(expected.abs().amax()), float((actual - expected).abs().amax())
+    actual = actual[both].float()
+    expected = expected[both]
+    largest = float(expected.abs().amax())
+    difference = float((actual - expected).abs().amax())
     return difference / largest if largest else difference
 
 
@@ -269,7 +275,8 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
         ModelError: An operator is not covered; the message names every one.
     """
     _check_operators(model.graph.node, path)
-    graph, opset = FileGraph(), _opset(model)
+    graph = FileGraph()
+    opset = _opset(model)
     constants = {tensor.name: _tensor(tensor, path) for tensor in model.graph.initializer}
     stored = sum(constant.numel() for constant in constants.values())
     largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * stored)
@@ -324,7 +331,8 @@ def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
         if node.get(name, only) != only:
             raise ModelError(f"{name} {node.get(name)!r}")
     devices = [value.device for value in inputs if value is not None and not value.is_cpu]
-    device, host = devices[0] if devices else "cpu", HOST_INPUTS[node.op]
+    device = devices[0] if devices else "cpu"
+    host = HOST_INPUTS[node.op]
     moved: list[Any] = [
         None if value is None else value.to("cpu" if index in host else device)
         for index, value in enumerate(inputs)

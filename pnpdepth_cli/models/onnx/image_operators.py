@@ -35,7 +35,8 @@ def _sides(pads: Pads) -> list[int]:
 
 def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> tuple[list[int], list[int], Pads]:
     """Stride, dilation and pads (begin, end) of each spatial axis."""
-    rank, auto = x.ndim - 2, node.get("auto_pad", "NOTSET")
+    rank = x.ndim - 2
+    auto = node.get("auto_pad", "NOTSET")
     stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
     if auto in ("NOTSET", "VALID"):
         flat = node.get("pads", [0] * (2 * rank)) if auto == "NOTSET" else [0] * (2 * rank)
@@ -53,26 +54,34 @@ def _halves(node: Node, totals: Sequence[int]) -> Pads:
 
 @operator("Conv")
 def conv(node: Node, inputs: Inputs) -> Tensor:
-    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
+    x = inputs[0]
+    weight = inputs[1]
+    bias = optional(inputs, 2)
     if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
         raise ModelError("double precision")
     stride, dilation, pads = _window(node, x, weight.shape[2:])
-    padding, none = [begin for begin, _ in pads], [0] * len(pads)
+    padding = [begin for begin, _ in pads]
+    none = [0] * len(pads)
     if any(begin != end for begin, end in pads):
-        x, padding = F.pad(x, _sides(pads)), none
+        x = F.pad(x, _sides(pads))
+        padding = none
     group = node.get("group", 1)
     return torch.convolution(x, weight, bias, stride, padding, dilation, False, none, group)
 
 
 @operator("ConvTranspose")
 def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
-    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
+    x = inputs[0]
+    weight = inputs[1]
+    bias = optional(inputs, 2)
     stride, dilation, pads = _window(node, x, weight.shape[2:])
-    none, group = [0] * len(pads), node.get("group", 1)
+    none = [0] * len(pads)
+    group = node.get("group", 1)
     extra = node.get("output_padding", none)
     y = torch.convolution(x, weight, bias, stride, none, dilation, True, extra, group)
     # The result without its pads, which may be stated by its shape.
-    sizes, wanted = y.shape[2:], node.get("output_shape")
+    sizes = y.shape[2:]
+    wanted = node.get("output_shape")
     if wanted is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
         wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
     if wanted is not None:
@@ -84,7 +93,8 @@ def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
 
 def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
     """Arguments of torch's pooling, and the pads that it cannot have, in the order of F.pad."""
-    kernel, ceil = node.get("kernel_shape"), bool(node.get("ceil_mode", 0))
+    kernel = node.get("kernel_shape")
+    ceil = bool(node.get("ceil_mode", 0))
     stride, _, pads = _window(node, x, kernel)
     called = {"kernel_size": kernel, "stride": stride, "ceil_mode": ceil}
     if all(begin == end <= k // 2 for (begin, end), k in zip(pads, kernel, strict=True)):
@@ -105,7 +115,8 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
-    x, with_pads = inputs[0], bool(node.get("count_include_pad", 0))
+    x = inputs[0]
+    with_pads = bool(node.get("count_include_pad", 0))
     if x.ndim != 4 or any(d != 1 for d in node.get("dilations", [])):
         raise ModelError("other than two spatial axes, or dilations")
     called, sides = _pooling(node, x)
@@ -134,7 +145,9 @@ def batch_norm(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("LayerNormalization")
 def layer_norm(node: Node, inputs: Inputs) -> Tensor:
-    x, weight, bias = inputs[0], inputs[1], optional(inputs, 2)
+    x = inputs[0]
+    weight = inputs[1]
+    bias = optional(inputs, 2)
     shape = list(x.shape[node.get("axis", -1) % x.ndim :])
     bias = None if bias is None else bias.expand(shape)
     return F.layer_norm(x, shape, weight.expand(shape), bias, node.get("epsilon", 1e-5))
@@ -148,7 +161,9 @@ def group_norm(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Upsample", "Resize", host=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
-    x, scales, sizes = inputs[0], optional(inputs, 2), optional(inputs, 3)
+    x = inputs[0]
+    scales = optional(inputs, 2)
+    sizes = optional(inputs, 3)
     if "axes" in node.attributes:
         raise ModelError("axes")
     wanted = [] if sizes is None else whole_numbers(sizes)
@@ -179,7 +194,8 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
     exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
     if x.ndim != 4 or list(x.shape[:2]) != sizes[:2] or not exact or not x.is_floating_point():
         return None
-    size, mode = (sizes[2], sizes[3]), node.get("mode", "nearest")
+    size = (sizes[2], sizes[3])
+    mode = node.get("mode", "nearest")
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
     whole = all(f >= 1 and f == int(f) for f in factors)
     if mode == "nearest" and whole and node.get("nearest_mode") == "floor":
@@ -212,9 +228,11 @@ def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
         raise ModelError("a region of interest")
     torch.empty(out, size, device="meta")  # which a `SizeLimit` refuses if it is too large
     attributes = {name: node.get(name) for name in _RESIZE if name in node.attributes}
-    stated, by = ["none", "by"], np.array([out, size])
+    stated = ["none", "by"]
+    by = np.array([out, size])
     if factor != out / size:
-        stated, by = ["by"], np.array([factor, 1], np.float32)
+        stated = ["by"]
+        by = np.array([factor, 1], np.float32)
     none = np.zeros(0, np.float32)
     graph = helper.make_graph(
         [helper.make_node("Resize", ["x", "none", *stated], ["y"], **attributes)],

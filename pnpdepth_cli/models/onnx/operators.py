@@ -87,9 +87,34 @@ def stated(node: Node, name: str, inputs: Inputs, index: int) -> list[int]:
 
 
 _SAME_NAME = (
-    *("Relu", "Sigmoid", "Tanh", "Erf", "Exp", "Log", "Sqrt", "Reciprocal", "Abs", "Neg", "Floor"),
-    *("Ceil", "Round", "Sign", "Sin", "Cos", "IsNaN", "IsInf", "Softplus", "HardSwish", "Mish"),
-    *("Add", "Sub", "Mul", "Greater", "Less", "MatMul", "Where"),
+    "Relu",
+    "Sigmoid",
+    "Tanh",
+    "Erf",
+    "Exp",
+    "Log",
+    "Sqrt",
+    "Reciprocal",
+    "Abs",
+    "Neg",
+    "Floor",
+    "Ceil",
+    "Round",
+    "Sign",
+    "Sin",
+    "Cos",
+    "IsNaN",
+    "IsInf",
+    "Softplus",
+    "HardSwish",
+    "Mish",
+    "Add",
+    "Sub",
+    "Mul",
+    "Greater",
+    "Less",
+    "MatMul",
+    "Where",
 )
 """Named as in torch, but for capitals."""
 
@@ -150,7 +175,9 @@ def softmax(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Gemm")
 def gemm(node: Node, inputs: Inputs) -> Tensor:
-    a, b, c = inputs[0], inputs[1], optional(inputs, 2)
+    a = inputs[0]
+    b = inputs[1]
+    c = optional(inputs, 2)
     a = a.T if node.get("transA", 0) else a
     b = b.T if node.get("transB", 0) else b
     product: Tensor = node.get("alpha", 1.0) * (a @ b)
@@ -213,7 +240,8 @@ register(
 
 @operator("Reshape", host=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
-    x, wanted = inputs[0], stated(node, "shape", inputs, 1)
+    x = inputs[0]
+    wanted = stated(node, "shape", inputs, 1)
     if not node.get("allowzero", 0):
         wanted = [x.shape[i] if n == 0 else n for i, n in enumerate(wanted)]
     return x.reshape(wanted)
@@ -221,7 +249,8 @@ def reshape(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Unsqueeze", host=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
-    x, axes = inputs[0], stated(node, "axes", inputs, 1)
+    x = inputs[0]
+    axes = stated(node, "axes", inputs, 1)
     rank = x.ndim + len(axes)
     for axis in sorted(a % rank for a in axes):
         x = x.unsqueeze(axis)
@@ -230,7 +259,8 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Split", host=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
-    x, axis = inputs[0], node.get("axis", 0)
+    x = inputs[0]
+    axis = node.get("axis", 0)
     equal = math.ceil(x.shape[axis] / node.get("num_outputs", node.outputs))
     return torch.split(x, stated(node, "split", inputs, 1) or equal, axis)
 
@@ -240,7 +270,8 @@ _PAD_MODES = {"edge": "replicate", "reflect": "reflect"}
 
 @operator("Pad", host=(1, 2))
 def pad(node: Node, inputs: Inputs) -> Tensor:
-    x, mode = inputs[0], node.get("mode", "constant")
+    x = inputs[0]
+    mode = node.get("mode", "constant")
     if optional(inputs, 3) is not None:
         raise ModelError("axes")
     flat = stated(node, "pads", inputs, 1)
@@ -256,7 +287,8 @@ def pad(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("DepthToSpace")
 def depth_to_space(node: Node, inputs: Inputs) -> Tensor:
-    x, side = inputs[0], node.get("blocksize")
+    x = inputs[0]
+    side = node.get("blocksize")
     if node.get("mode", "DCR") == "DCR":  # torch has the channels of a block the other way round
         blocks = x.reshape(x.shape[0], side**2, -1, *x.shape[2:])
         x = blocks.transpose(1, 2).reshape(x.shape)
@@ -310,7 +342,8 @@ def slice_(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Gather")
 def gather(node: Node, inputs: Inputs) -> Tensor:
-    x, axis = inputs[0], node.get("axis", 0) % inputs[0].ndim
+    x = inputs[0]
+    axis = node.get("axis", 0) % inputs[0].ndim
     index = _from_start(inputs[1], x.shape[axis])
     picked = x.index_select(axis, index.reshape(-1).to(x.device))
     return picked.reshape((*x.shape[:axis], *index.shape, *x.shape[axis + 1 :]))

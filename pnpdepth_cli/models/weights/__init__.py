@@ -134,7 +134,8 @@ def _without_prefixes(
     state: dict[str, Tensor], path: Path, notes: list[str], own: Mapping[str, object] | None = None
 ) -> dict[str, Tensor]:
     """The tensors without prefixes of wrappers that a network's own names lack."""
-    own, stripped = own or {}, list[str]()
+    own = own or {}
+    stripped = list[str]()
     while (prefix := _prefix(state)) is not None and prefix != _prefix(own):
         if prefix == "model." and own.keys().isdisjoint(_WRAPPED.sub("", name) for name in state):
             break  # part of the names of a published file

@@ -38,12 +38,50 @@ MAX_NAME = 1_000
 
 _MAX_EXPANDED = 1 << 28  # elements of a tensor with strides of 0; nothing is allocated for them
 _OPCODES = (
-    *("PROTO", "FRAME", "STOP", "MARK", "BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET"),
-    *("LONG_BINGET", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "APPEND"),
-    *("APPENDS", "EMPTY_SET", "ADDITEMS", "EMPTY_DICT", "SETITEM", "SETITEMS", "NONE", "NEWTRUE"),
-    *("NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINSTRING"),
-    *("SHORT_BINSTRING", "BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES"),
-    *("BINBYTES8", "GLOBAL", "STACK_GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID"),
+    "PROTO",
+    "FRAME",
+    "STOP",
+    "MARK",
+    "BINPUT",
+    "LONG_BINPUT",
+    "MEMOIZE",
+    "BINGET",
+    "LONG_BINGET",
+    "EMPTY_TUPLE",
+    "TUPLE",
+    "TUPLE1",
+    "TUPLE2",
+    "TUPLE3",
+    "EMPTY_LIST",
+    "APPEND",
+    "APPENDS",
+    "EMPTY_SET",
+    "ADDITEMS",
+    "EMPTY_DICT",
+    "SETITEM",
+    "SETITEMS",
+    "NONE",
+    "NEWTRUE",
+    "NEWFALSE",
+    "BININT",
+    "BININT1",
+    "BININT2",
+    "LONG1",
+    "LONG4",
+    "BINFLOAT",
+    "BINSTRING",
+    "SHORT_BINSTRING",
+    "BINUNICODE",
+    "SHORT_BINUNICODE",
+    "BINBYTES",
+    "SHORT_BINBYTES",
+    "BINBYTES8",
+    "GLOBAL",
+    "STACK_GLOBAL",
+    "REDUCE",
+    "NEWOBJ",
+    "BUILD",
+    "BINPERSID",
 )
 """Opcodes of protocols 2 to 5; no others are done, as some take the memory that a size claims."""
 
@@ -51,9 +89,20 @@ LoadStorage = Callable[[str, str, int, Sequence[object]], Tensor]
 """Function that returns a flat tensor from its type, key and elements, and what follows these."""
 
 CONTENT_ERRORS: tuple[type[Exception], ...] = (
-    *(InputError, pickle.UnpicklingError, OSError, EOFError, zipfile.BadZipFile, zlib.error),
-    *(struct.error, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError),  # NumPy evaluates its headers
+    InputError,
+    pickle.UnpicklingError,
+    OSError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,  # NumPy evaluates its headers
 )
 """What the readers of weights and programs raise on content that is not what it should be."""
 

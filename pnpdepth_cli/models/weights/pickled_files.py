@@ -109,7 +109,8 @@ def refuse_inflated(archive: zipfile.ZipFile, path: Path) -> None:
     """Raises InputError for an archive whose entries are compressed, or overlap."""
     if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
         raise InputError("it is compressed, which torch never does")
-    claimed, most = sum(info.file_size for info in archive.infolist()), path.stat().st_size
+    claimed = sum(info.file_size for info in archive.infolist())
+    most = path.stat().st_size
     check_claim(f"its entries have {claimed:,} bytes", claimed, most)
 
 

@@ -45,7 +45,8 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     left = 0
     for key, entry in table.items():
-        name, fields = key.decode(), _message(entry)
+        name = key.decode()
+        fields = _message(entry)
         if 7 in fields:
             raise InputError("a variable is in slices")
         if _last(fields, 1) == _TEXT:
@@ -103,7 +104,8 @@ def _block(data: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]:
     if data[offset + size] != 0:
         raise InputError("its index is compressed, which TensorFlow does not do")
     (restarts,) = struct.unpack_from("<I", data, offset + size - 4)
-    at, end = offset, offset + size - 4 * (restarts + 1)
+    at = offset
+    end = offset + size - 4 * (restarts + 1)
     key = b""
     while at < end:
         shared, at = _varint(data, at)
