@@ -103,9 +103,9 @@ def _observe(
             maps[name] = output
 
     with ExitStack() as hooks, torch.enable_grad(), wrap_user_errors("the network's forward"):
-        for name, part in module.named_modules():
-            if name and not isinstance(part, torch.jit.ScriptModule):
-                hooks.enter_context(part.register_forward_hook(partial(keep, name)))
+        for name, submodule in module.named_modules():
+            if name and not isinstance(submodule, torch.jit.ScriptModule):
+                hooks.enter_context(submodule.register_forward_hook(partial(keep, name)))
         inputs = tuple(a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments)
         prediction = prediction_of(module(*inputs))
     if not prediction.requires_grad:

@@ -42,8 +42,10 @@ def _check(owner: object, field: str, good: bool, wanted: str) -> None:
     if not good and value is not getattr(type(owner), field, _check):
         name = getattr(owner, "name", "")
         shown = " ".join(repr(value).split())
-        named = f"{type(owner).__name__} {name!r}" if name else type(owner).__name__
-        raise ModelError(f"{named[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
+        title = type(owner).__name__
+        if name:
+            title += f" {name!r}"
+        raise ModelError(f"{title[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
 
 
 def _check_choice(owner: object, field: str, choices: object) -> None:
@@ -286,7 +288,9 @@ def graph_definition(
         ModelError: The inputs are others than those stated, without any one rgb image.
     """
     kind = str(stated.get("input_kind", "rgb"))
-    wanted = [*kind.split("+"), *["intrinsics"] * bool(stated.get("takes_intrinsics"))]
+    wanted = kind.split("+")
+    if stated.get("takes_intrinsics"):
+        wanted.append("intrinsics")
     # The image, or the sparse depth where there is none, has the sides; 1×3×H×W or 1×H×W×3.
     channels = 3 if "rgb" in kind else 1
     sides = [s[1:] for s in shapes if len(s) == 4 and (s[0] == 1 or not isinstance(s[0], int))]

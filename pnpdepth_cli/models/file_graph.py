@@ -150,7 +150,7 @@ class FileGraph(nn.Module):
         Raises:
             ModelError: A result is too large, or all at a time are.
         """
-        sizes = tuple(each.shape for each in inputs)
+        sizes = tuple(tensor.shape for tensor in inputs)
         if sizes in self._allowed:
             return _Runner(self, math.inf).run(*inputs)
         given = _elements([*inputs, *self.parameters(), *self.buffers()])
@@ -180,8 +180,10 @@ class _Runner(fx.Interpreter):
         args, kwargs = self.fetch_args_kwargs_from_env(node)
         result = getattr(self, node.op)(node.target, args, kwargs)
         if self._most < math.inf and _elements([*self.env.values(), result]) > self._most:
-            fact = f"more than {self._most:,} elements at a time, far more than image and weights"
-            raise ModelError(f"operation {node.name!r}: {fact}")
+            raise ModelError(
+                f"operation {node.name!r}: more than {self._most:,} elements at a time, far more"
+                " than image and weights"
+            )
         return result
 
 
@@ -217,8 +219,8 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         """Runs the operation if its result fits; see TorchDispatchMode."""
         kwargs = kwargs or {}
         expected = _shaped_result(func, args, kwargs)
-        elements = [each.numel() for each in _tensors_in(expected)]
-        in_place_or_view = any(each.alias_info is not None for each in func._schema.returns)
+        elements = [tensor.numel() for tensor in _tensors_in(expected)]
+        in_place_or_view = any(returned.alias_info is not None for returned in func._schema.returns)
         self._left -= 0 if in_place_or_view else sum(elements)
         if max(elements, default=0) > self._largest or self._left < 0:
             raise ModelError(f"a result of {sum(elements):.3g} elements")
@@ -254,19 +256,24 @@ def result_without_values(
     """
     tensors = _tensors_in((args, kwargs))
     first = tensors[0] if tensors else None
-    if first is None or not all(each.is_meta for each in tensors):
+    if first is None or not all(tensor.is_meta for tensor in tensors):
         return func(*args, **kwargs)
     if func._opname in _BATCH_NORMS:
         return torch.empty_like(first), first.new_empty(0), first.new_empty(0)
     plain = torch.Tag.pointwise in func.tags and not func._schema.is_mutable
     plain = plain and func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
-    same = all(each.dtype == first.dtype for each in tensors)
+    same = all(tensor.dtype == first.dtype for tensor in tensors)
     if plain and same and first.dtype == torch.float32:
-        return first.new_empty(_broadcast([each.shape for each in tensors]))
-    if func._opname == "cat" and same and len({each.ndim for each in tensors}) == 1 and first.ndim:
+        return first.new_empty(_broadcast([tensor.shape for tensor in tensors]))
+    if (
+        func._opname == "cat"
+        and same
+        and len({tensor.ndim for tensor in tensors}) == 1
+        and first.ndim
+    ):
         axis = int(args[1]) if len(args) > 1 else 0  # type: ignore[call-overload]
         shape = list(first.shape)
-        shape[axis] = sum(each.shape[axis] for each in tensors)
+        shape[axis] = sum(tensor.shape[axis] for tensor in tensors)
         return first.new_empty(shape)
     return func(*args, **kwargs)
 

@@ -40,7 +40,7 @@ class FrameMap:
             network = (-(-resized[0] // size.of) * size.of, -(-resized[1] // size.of) * size.of)
         elif isinstance(size, Near):
             sides = ((size.height, height), (size.width, width))
-            factors = [wanted / own for wanted, own in sides if wanted]
+            factors = [wanted / side for wanted, side in sides if wanted]
             factor = min(factors, key=lambda f: abs(1 - f), default=1.0)
             rows, columns = (max(1, round(n * factor / size.of)) * size.of for n in (height, width))
             resized = network = (rows, columns)
@@ -48,8 +48,9 @@ class FrameMap:
             resized = network = (size.height, size.width)
             if size.fit == "crop":
                 scale = min(height / size.height, width / size.width)
-                h, w = max(1, round(size.height * scale)), max(1, round(size.width * scale))
-                crop = ((height - h) // 2, (width - w) // 2, h, w)
+                rows = max(1, round(size.height * scale))
+                columns = max(1, round(size.width * scale))
+                crop = ((height - rows) // 2, (width - columns) // 2, rows, columns)
         return cls(image=(height, width), crop=crop, resized=resized, network=network)
 
     def rgb_to_network(self, rgb: Tensor) -> Tensor:

@@ -137,8 +137,10 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
         raise ModelError(f"{file}: it says no size")
     weights = folder / "model.safetensors"
     if not weights.is_file():
-        way_out = "have transformers load the network and write it by save_pretrained"
-        raise ModelError(f"{folder} has no {weights.name}; {way_out}")
+        raise ModelError(
+            f"{folder} has no {weights.name}; have transformers load the network and write it by"
+            " save_pretrained"
+        )
     # The definition, whose network is built when it is needed.
     return definition.ModelDefinition(
         name=Path(os.path.realpath(folder)).name,
@@ -161,8 +163,10 @@ def _check_settings(value: object, *, attention: bool = False) -> None:
     if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
         raise InputError(f"{str(value)[:20]} is larger than any part of a network")
     if attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:
-        way_out = f"only {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
-        raise InputError(f"attn_implementation {value[:60]!r} may fetch and run code; {way_out}")
+        raise InputError(
+            f"attn_implementation {value[:60]!r} may fetch and run code; only"
+            f" {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
+        )
     for key, setting in value.items() if isinstance(value, dict) else ():
         _check_settings(setting, attention=attention or "attn_implementation" in key)
     for setting in value if isinstance(value, list) else ():
@@ -172,8 +176,10 @@ def _check_settings(value: object, *, attention: bool = False) -> None:
 def _read(file: Path, kind: type[_Kind]) -> _Kind:
     """The settings in a JSON file of the folder."""
     if not file.is_file():
-        fact = f"is not a Hugging Face folder: {file.name} is missing"
-        raise ModelError(f"{file.parent} {fact}; take it from the network's page")
+        raise ModelError(
+            f"{file.parent} is not a Hugging Face folder: {file.name} is missing; take it from the"
+            " network's page"
+        )
     check_network_file(file, "the settings", _MOST_JSON_BYTES)
     with wrap_content_errors(str(file), msgspec.ValidationError):
         return msgspec.convert(json.loads(file.read_bytes()), kind)
@@ -188,8 +194,9 @@ def _build(folder: Path, kind: str) -> nn.Module:
 
             network_class = _network_class(kind)
     except ImportError as error:
-        way_out = "pip install 'pnpdepth[hf]'"
-        raise ModelError(f"reading {folder} needs {error.name}: {way_out}") from None
+        raise ModelError(
+            f"reading {folder} needs {error.name}: pip install 'pnpdepth[hf]'"
+        ) from None
     # transformers says nothing of its own.
     logging: Any = utils.logging
     logging.set_verbosity_error()
@@ -206,8 +213,10 @@ def _build(folder: Path, kind: str) -> nn.Module:
     # Every weight must have been there.
     missing = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
     if missing:
-        fact = f"leave {len(missing)} of the network's out or of another shape"
-        raise ModelError(f"{folder}: its weights {fact} ({', '.join(sorted(missing)[:4])})")
+        raise ModelError(
+            f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
+            f" ({', '.join(sorted(missing)[:4])}); take both files from one page"
+        )
     network: nn.Module = module.float()
     return network
 

@@ -207,16 +207,19 @@ class Network:
         tensors: list[tuple[tuple[str, ...], Tensor]] = list(tensors_in(output))
         if len(tensors) != 1:
             paths = ", ".join(".".join(path) for path, _ in tensors)
-            fact = f"gives a {type(output).__name__} with {len(tensors)} tensors in it ({paths})"
-            way_out = "pick the depth as FILE:[0], or by `output` of its definition"
-            raise ModelError(f"{name} {fact}; {way_out}")
+            raise ModelError(
+                f"{name} gives a {type(output).__name__} with {len(tensors)} tensors in it"
+                f" ({paths}); pick the depth as FILE:[0], or by `output` of its definition"
+            )
         # One map, with or without axes of batch and channel.
         tensor = tensors[0][1].float()
         shape = tuple(tensor.shape)
         if shape[:-2] not in ((), (1,), (1, 1)) or len(shape) < 2:
-            fact = f"gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is expected"
-            way_out = "pick a channel as FILE:[0], z of points as FILE:[z]"
-            raise ModelError(f"{name} {fact}; {way_out}, or by `output` of its definition")
+            raise ModelError(
+                f"{name} gives a tensor of shape {shape}, where one depth map (1, 1, h, w) is"
+                " expected; pick a channel as FILE:[0], z of points as FILE:[z], or by `output` of"
+                " its definition"
+            )
         return tensor.reshape(1, 1, *shape[-2:])
 
     def known_of(self, output: object) -> Tensor:
@@ -235,8 +238,8 @@ def _read_nan_gradients_as_zero(tensor: Tensor) -> None:
         seen.add(node)
         node.register_hook(
             lambda gradients, _: tuple(
-                None if each is None else each.nan_to_num(0.0, math.inf, -math.inf)
-                for each in gradients
+                None if gradient is None else gradient.nan_to_num(0.0, math.inf, -math.inf)
+                for gradient in gradients
             )
         )
         nodes += [before for before, _ in node.next_functions]
@@ -413,8 +416,10 @@ def _load(spec: str | ModelDefinition, checkpoint: Path | None, device: str) -> 
         # A module is called as well, but it is made already.
         module = None if isinstance(definition.build, nn.Module) else definition.build()
     if not isinstance(module, nn.Module):
-        wanted = "a class or a function that makes one is expected, as in lambda: net"
-        raise ModelError(f"build of {name} gives no torch module; {wanted}")
+        raise ModelError(
+            f"build of {name} gives no torch module; a class or a function that makes one is"
+            " expected, as in lambda: net"
+        )
     if not isinstance(size := definition.size, Multiple):
         height, width = size.height or size.width or 1, size.width or size.height or 1
         claim = f"{name} takes images of {width}×{height} pixels"

@@ -69,6 +69,8 @@ def _channel_of(output: Tensor, part: str, number: int | None) -> Tensor:
     if part in _AXES and len(maps) == len(_AXES):
         number = _AXES.index(part)
     if number is None or number >= len(maps):
-        known = f"0 to {len(maps) - 1}" + (", or x, y, z" if len(maps) == len(_AXES) else "")
-        raise ModelError(f"an output of {shape} has no channel {part!r}; it has {known}")
+        axes = ", or x, y, z" if len(maps) == len(_AXES) else ""
+        raise ModelError(
+            f"an output of {shape} has no channel {part!r}; it has 0 to {len(maps) - 1}{axes}"
+        )
     return maps[number][None, None]

@@ -89,9 +89,14 @@ def find_definition(spec: str) -> ModelDefinition:
     if spec in known:
         return known[spec]
     near = difflib.get_close_matches(spec, known, n=1)
-    way_out = f"did you mean {near[0]!r}?" if near else "`pnpdepth models` lists all names"
+    if near:
+        raise ModelError(
+            f"model {spec!r} is neither a known name nor a file or folder of a network; did you"
+            f" mean {near[0]!r}?"
+        )
     raise ModelError(
-        f"model {spec!r} is neither a known name nor a file or folder of a network; {way_out}"
+        f"model {spec!r} is neither a known name nor a file or folder of a network; `pnpdepth"
+        " models` lists all names"
     )
 
 
@@ -164,8 +169,8 @@ def _run(file: Path) -> ModuleType:
     check_network_file(file, "model file")
     name = f"pnpdepth_user_model_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
+    if spec is None or spec.loader is None:
+        raise ModelError(f"{file} is no Python file; name it NAME.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses and pickling inside the file look it up
     try:

@@ -29,7 +29,7 @@ def by_shapes(
     if isinstance(module, FileGraph) or is_of_transformers(module):
         # Where a network reads values, or torch knows no shapes, this fails.
         with suppress(Exception), _WithoutValues():  # type: ignore[no-untyped-call]
-            return run(_without_values(module), tuple(each.to("meta") for each in arguments))
+            return run(_without_values(module), tuple(tensor.to("meta") for tensor in arguments))
     return run(module, arguments)
 
 

@@ -104,9 +104,11 @@ def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
 
 
 def _add_node(graph: FileGraph, target: str, inputs: list[_Json], outputs: list[_Json]) -> None:
-    values = [(one, _argument(one["arg"], graph.values)) for one in inputs]
-    positional = [value for one, value in values if one.get("kind") != _KEYWORD]
-    keywords = {one["name"]: value for one, value in values if one.get("kind") == _KEYWORD}
+    values = [(argument, _argument(argument["arg"], graph.values)) for argument in inputs]
+    positional = [value for argument, value in values if argument.get("kind") != _KEYWORD]
+    keywords = {
+        argument["name"]: value for argument, value in values if argument.get("kind") == _KEYWORD
+    }
     named = [name for output in outputs for name in _outputs_in(output)]
     alone = len(outputs) == 1 and "as_tensors" not in outputs[0]
     name = str(named[0] if alone else target.split(".")[-2]).replace(".", "_")
@@ -117,7 +119,7 @@ def _add_node(graph: FileGraph, target: str, inputs: list[_Json], outputs: list[
 def _tensor(content: bytearray, meta: _Json) -> Tensor:
     dtype = _DTYPES[meta["dtype"]]
     flat = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
-    shape, stride = ([one["as_int"] for one in meta[key]] for key in ("sizes", "strides"))
+    shape, stride = ([number["as_int"] for number in meta[key]] for key in ("sizes", "strides"))
     return view_of(flat, meta["storage_offset"]["as_int"], shape, stride)
 
 
@@ -126,8 +128,8 @@ def _function(target: str) -> Callable[..., object]:
     found = _OPERATOR.fullmatch(target)
     if found is not None and not _TOUCHES_FILES.search(found[2]):
         called: Any = torch.ops
-        for part in found.groups():
-            called = getattr(called, part, None)
+        for name in found.groups():
+            called = getattr(called, name, None)
         if isinstance(called, torch._ops.OpOverload):  # and no other attribute on the way
             return called
     raise InputError(f"it calls {target[:80]!r}, which is no operator of torch")
@@ -147,8 +149,11 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return _argument(value, values) if isinstance(value, Mapping) else value
         case "tensors" | "ints" | "floats" | "bools":
             kind = kind.removesuffix("s")
-            each = [v if isinstance(v, Mapping) and "name" not in v else {kind: v} for v in value]
-            return [_argument(one, values) for one in each]
+            entries = [
+                entry if isinstance(entry, Mapping) and "name" not in entry else {kind: entry}
+                for entry in value
+            ]
+            return [_argument(entry, values) for entry in entries]
         case "scalar_type":
             return _DTYPES[value]
         case "memory_format":
@@ -165,8 +170,8 @@ def _outputs_in(stated: _Json) -> list[str | None]:
     match stated:
         case {"as_tensor": {"name": name}}:
             return [str(name)]
-        case {"as_tensors": parts}:
-            return [part["name"] for part in parts]
+        case {"as_tensors": tensors}:
+            return [tensor["name"] for tensor in tensors]
         case {"as_none": _}:
             return [None]
     raise InputError(f"it computes {str([*stated])[:40]}; export it with fixed sizes")

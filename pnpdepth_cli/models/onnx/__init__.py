@@ -100,8 +100,9 @@ def _read(file: Path) -> tuple[ModelProto, bool]:
             import onnxruntime  # noqa: F401
             from google.protobuf.message import DecodeError
     except ImportError as error:
-        way_out = "pip install 'pnpdepth[onnx]'"
-        raise ModelError(f"reading {file} needs {error.name}: {way_out}") from None
+        raise ModelError(
+            f"reading {file} needs {error.name}: pip install 'pnpdepth[onnx]'"
+        ) from None
     more = (DecodeError, onnx.checker.ValidationError)
     with wrap_content_errors(f"ONNX file {file} cannot be read", *more):
         model = onnx.load(str(file), load_external_data=False)
@@ -121,8 +122,9 @@ def _check_covered(model: ModelProto) -> None:
         if not all(isinstance(word, str) for word in words):
             raise InputError("its names are not text in UTF-8")
     if _opset(model) not in _OPSETS:
-        wanted = f"{_OPSETS[0]} to {_OPSETS[-1]}"
-        raise InputError(f"it is of opset {_opset(model)}; export it with one from {wanted}")
+        raise InputError(
+            f"it is of opset {_opset(model)}; export it with one from {_OPSETS[0]} to {_OPSETS[-1]}"
+        )
 
 
 def _load_external(model: ModelProto, folder: Path) -> bool:
@@ -162,8 +164,10 @@ def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
         return wanted
     listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
     fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
-    way_out = f"name the depth as {file}:{next(iter(outputs), 'OUTPUT')}"
-    raise ModelError(f"ONNX file {file} has {fact}; {way_out}; it has {listed}")
+    raise ModelError(
+        f"ONNX file {file} has {fact}; name the depth as {file}:{next(iter(outputs), 'OUTPUT')};"
+        f" it has {listed}"
+    )
 
 
 def _prune(model: ModelProto, output: str) -> bool:
@@ -176,7 +180,7 @@ def _prune(model: ModelProto, output: str) -> bool:
             nodes.append(node)
             needed.update(filter(None, node.input))
     is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
-    outputs = [each for each in graph.output if each.name == output]
+    outputs = [value for value in graph.output if value.name == output]
     kept = type(graph)(node=reversed(nodes), output=outputs)
     graph.ClearField("node")
     graph.ClearField("output")
@@ -194,7 +198,8 @@ def _patch_size(model: ModelProto) -> int | None:
     for node in model.graph.node:
         if node.op_type == "Conv":
             by_name = {a.name: list(a.ints) for a in node.attribute}
-            kernel, stride = by_name.get("kernel_shape", []), by_name.get("strides", [])
+            kernel = by_name.get("kernel_shape", [])
+            stride = by_name.get("strides", [])
             if kernel == stride and kernel and min(kernel) >= 8:
                 return int(kernel[0])
     return None
@@ -219,7 +224,7 @@ def _verify(
             _compare(source, file, module, arguments)
         return [_AGREES]
 
-    sizes = [(tuple(each.shape), each.device.type) for each in arguments]
+    sizes = [(tuple(tensor.shape), tensor.device.type) for tensor in arguments]
     recalled(module, file if is_whole else None, f"agrees for {sizes}", compare, [_AGREES].__eq__)
     return _AGREES
 
@@ -245,8 +250,10 @@ def _compare(
         expected = torch.from_numpy(session.run(None, feed)[0]).float()
     deviation = _deviation(actual, expected)
     if not deviation <= MISMATCH:
-        fact = f"differs from onnxruntime's by {deviation:.2g} of the output's range"
-        raise ModelError(f"ONNX file {file}: its reading by torch {fact}")
+        raise ModelError(
+            f"ONNX file {file}: its reading by torch differs from onnxruntime's by {deviation:.2g}"
+            " of the output's range"
+        )
 
 
 def _deviation(actual: Tensor, expected: Tensor) -> float:

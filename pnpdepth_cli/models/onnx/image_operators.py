@@ -37,7 +37,8 @@ def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> tuple[list[int], li
     """Stride, dilation and pads (begin, end) of each spatial axis."""
     rank = x.ndim - 2
     auto = node.get("auto_pad", "NOTSET")
-    stride, dilation = node.get("strides", [1] * rank), node.get("dilations", [1] * rank)
+    stride = node.get("strides", [1] * rank)
+    dilation = node.get("dilations", [1] * rank)
     if auto in ("NOTSET", "VALID"):
         flat = node.get("pads", [0] * (2 * rank)) if auto == "NOTSET" else [0] * (2 * rank)
         return stride, dilation, list(zip(flat[:rank], flat[rank:], strict=True))

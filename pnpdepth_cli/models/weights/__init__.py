@@ -105,7 +105,7 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
         for name, value in content.items()
         if isinstance(value, Mapping) and value and _only_tensors(value)
     }
-    chosen = key or next((each for each in _STATE_KEYS if each in states), "")
+    chosen = key or next((name for name in _STATE_KEYS if name in states), "")
     if chosen in states:
         others = _some([repr(name) for name in states if name != chosen])
         if others:
@@ -192,8 +192,9 @@ def load_checkpoint(network: nn.Module, definition: ModelDefinition, path: Path)
     }
     misfits = [f"{len(some)} {what} ({_some(some)})" for what, some in problems.items() if some]
     if misfits:
-        fact = f"does not fit network {definition.name!r}"
-        raise ModelError(f"checkpoint {path} {fact}: {'; '.join(misfits)}")
+        raise ModelError(
+            f"checkpoint {path} does not fit network {definition.name!r}: {'; '.join(misfits)}"
+        )
     network.load_state_dict(state, strict=False)
     return notes
 

@@ -220,7 +220,7 @@ class _Unpickler(pickle._Unpickler):
         match function.path:
             case "collections.OrderedDict" | "collections.defaultdict" | "builtins.dict":
                 pairs = first if isinstance(first, list) else []
-                return self._mapping([value for key, one in pairs for value in (key, one)])
+                return self._mapping([entry for pair in pairs for entry in pair])
             case "builtins.set":
                 return first if isinstance(first, list) else []
             case "_codecs.encode" | "builtins.bytes":
@@ -269,7 +269,8 @@ def view_of(storage: Tensor, offset: int, shape: Sequence[int], stride: Sequence
     Raises:
         InputError: It has far more elements than the flat one.
     """
-    shape, stride = tuple(map(int, shape)), tuple(map(int, stride))
+    shape = tuple(map(int, shape))
+    stride = tuple(map(int, stride))
     count = math.prod(shape)
     most = max(len(storage), _MAX_EXPANDED)
     check_claim(f"a tensor has {count:.6g} elements", count, most)
