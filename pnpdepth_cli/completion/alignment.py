@@ -114,8 +114,8 @@ class Alignment:
         is outside.
         """
         low, high = self._limits
-        line = self._line(_held(x, low=self._least_output))
-        return from_space(_held(line, low, high), _READINGS[self.reading].space)
+        line = self._line(_clamp_value(x, low=self._least_output))
+        return from_space(_clamp_value(line, low, high), _READINGS[self.reading].space)
 
     def beyond(self, x: Tensor) -> float:
         """Returns the fraction of the values that `depth` clamps."""
@@ -138,7 +138,10 @@ class Alignment:
 
     @property
     def _least_output(self) -> float:
-        """The x at which depth comes to a bound, below which 1/x or log x must not go."""
+        """The least x whose depth is within the bounds; below it 1/x or log x must not go.
+
+        −∞ for a line in x itself, which has no such end.
+        """
         output = _READINGS[self.reading].output
         if output == "depth":
             return -math.inf
@@ -357,6 +360,7 @@ def _factor(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float
     used = sign * x > 0
     if not bool(used.any()):
         return None
+    # d = scale·x, or 1/d = scale·x: log d is log x, or −log x, and what the scale adds to it.
     log_x = (sign * x[used]).log()
     log_d = d[used].log()
     if reading == "depth":
@@ -382,8 +386,8 @@ def _bounds(d: Tensor) -> Tensor:
     return torch.stack([d.min() / factor, d.max() * factor])
 
 
-def _held(value: Tensor, low: float, high: float = math.inf) -> Tensor:
-    """The value clamped, with the gradient of the value as it is."""
+def _clamp_value(value: Tensor, low: float, high: float = math.inf) -> Tensor:
+    """The value clamped, but with the gradient of the value as it is."""
     clamped = value.clamp(low, high)
     return clamped.detach() + (value - value.detach()) if value.requires_grad else clamped
 

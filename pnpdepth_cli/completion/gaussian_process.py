@@ -175,7 +175,7 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     y, x = (torch.arange(float(side)) / max(height, width) for side in (height, width))
     # u: known log depth, of mean 0 and standard deviation 1; 0 where it is unknown.
     known = log_depth.isfinite()
-    values = log_depth if bool(known.all()) else log_depth[known]  # picking them is slow
+    values = log_depth if bool(known.all()) else log_depth[known]  # picking pixels is slow
     values = values.double().flatten()
     mean = values.mean()
     std = (values.dot(values) / len(values) - mean.square()).clamp_min(0).sqrt()
@@ -406,14 +406,15 @@ def _predict_blocks(field: Residuals, side: int, shift: int) -> tuple[Tensor, Te
     height, width = field.points.size
     rows = math.ceil((height + shift) / side)
     columns = math.ceil((width + shift) / side)
-    # The features, block by block.
+    # The features (rows, columns, side, side, F), block by block; border pixels are repeated.
     padding = (shift, columns * side - shift - width, shift, rows * side - shift - height)
     padded = F.pad(field.features[None], padding, mode="replicate")[0]
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
-    # Each from the points nearest to its middle; then the blocks are put together.
+    # The mean in each block, from the points nearest to its middle.
     middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
     _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)
     values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1))
+    # The blocks side by side.
     values = values.reshape(rows, columns, side, side).permute(0, 2, 1, 3)
     values = values.reshape(rows * side, columns * side)
     # How far pixels are inside their blocks.

@@ -96,8 +96,8 @@ class _Line:
     def least_squares(self) -> tuple[float, float]:
         """Returns least squares of relative errors over all points."""
         if self._space == "log":
-            return _weighted(self._x, self._y, torch.ones_like(self._y))
-        return _weighted(self._x, self._y, self._y**-2)
+            return _weighted_least_squares(self._x, self._y, torch.ones_like(self._y))
+        return _weighted_least_squares(self._x, self._y, self._y**-2)
 
     def least_median(self) -> tuple[float, float] | None:
         """Returns the line through two points with the smallest median error; the seed is fixed.
@@ -140,7 +140,7 @@ class _Line:
                 value = (errors + self._log_y).exp()
                 change = -errors * value
                 weights = _weights(errors, width) / value.square()
-            more_scale, more_shift = _weighted(self._x, change, weights)
+            more_scale, more_shift = _weighted_least_squares(self._x, change, weights)
             # The step is halved until it lowers the loss.
             for halving in range(_HALVINGS):
                 size = 0.5**halving
@@ -163,7 +163,7 @@ class _Line:
         return line if self._space == "log" else line.log()
 
 
-def _weighted(x: Tensor, y: Tensor, weights: Tensor) -> tuple[float, float]:
+def _weighted_least_squares(x: Tensor, y: Tensor, weights: Tensor) -> tuple[float, float]:
     """Weighted least squares of y = scale·x + shift; the scale is 0 where x is the same."""
     total = weights.sum()
     mean_x = (weights @ x) / total

@@ -33,6 +33,7 @@ def checked_loss(name: str) -> Loss:
     function: Loss = LOSSES[name]
 
     def checked(predicted: Tensor, true: Tensor) -> Tensor:
+        """The loss, of one element."""
         with wrap_user_errors(f"loss {name!r}"):
             value = function(predicted, true)
             if value.numel() != 1:

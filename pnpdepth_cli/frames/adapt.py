@@ -103,7 +103,10 @@ def learn(
     """
     if "sparse" not in network.definition.input_kind:
         name = network.definition.name
-        raise UsageError(f"network {name!r} takes no sparse depth, so none can be hidden from it")
+        raise UsageError(
+            f"network {name!r} takes no sparse depth, so none can be hidden from it; adapt one that"
+            " takes it"
+        )
     # Some frames are for validation.
     lessons = [_lesson(network, name, frame) for name, frame in frames]
     every = max(2, min(5, len(lessons) // 3))
@@ -124,7 +127,10 @@ def learn(
                 with torch.enable_grad():
                     loss = loss_of(theta)
                 if not bool(loss.isfinite()):
-                    raise DivergedError(f"the loss is not finite after {step} updates of weights")
+                    raise DivergedError(
+                        f"the loss is not finite after {step} updates of weights; use the network's"
+                        " own ones, without `adapt`"
+                    )
                 with wrap_user_errors("the gradient of the network"):
                     loss.backward()  # type: ignore[no-untyped-call]
                 optimiser.step()

@@ -105,7 +105,7 @@ class NetworkExpert(Expert):
     def dense(self) -> Tensor:
         """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
         if self.mirrored is None:
-            return _less_updated(self.whole, self.not_updated)
+            return _mix_with_aligned(self.whole, self.not_updated)
         return weighted_mean([(self.whole.updated, 1), (self.mirrored, 1)])
 
 
@@ -192,7 +192,7 @@ def expert_of(
     if len(split.points):
         again = network.tuned or network.always_updated or not network.takes_points
         of_kept = network.refine(kept, updates=updates and again and not_updated < 1)
-        field = ResidualField(_less_updated(of_kept, not_updated), kept.points, kept.rgb)
+        field = ResidualField(_mix_with_aligned(of_kept, not_updated), kept.points, kept.rgb)
         at = field.depth(split.points.xy, kind=split.propagation)
         updated = split.points.sample(of_kept.updated)
         # Updates that the user states may do harm, such as at a layer near to the depth.
@@ -288,7 +288,7 @@ def strength_of(unexplained: float) -> float:
     return min(1.0, max(0.0, (WEAK - unexplained) / (WEAK - STRONG)))
 
 
-def _less_updated(prediction: Prediction, not_updated: float) -> Tensor:
+def _mix_with_aligned(prediction: Prediction, not_updated: float) -> Tensor:
     """The mean (H, W) of updated and aligned depth, the latter of which has this part.
 
     The steps of the updates are large against the error of a strong network, which they make worse.

@@ -145,7 +145,8 @@ class Method:
             resolve_definition(network, first, lambda: [frame.registered() for frame in more()])
             for network in networks
         ]
-        # The included network joins, unless it is there.
+        # The included network has no part where `alone` or a missing image excludes it. Else it
+        # joins, unless it is the user's.
         if self._maps and (asked.method == "alone" or first.rgb is None):
             resolved = [network for network in resolved if not network.definition.takes_prior]
         named = {network.definition.name for network in resolved}

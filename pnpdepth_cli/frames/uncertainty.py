@@ -239,11 +239,11 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     ratio = ratio[ratio.isfinite()].sort().values
     if not len(ratio):
         return typical
-    # The residuals, in σ, that the fractions are within.
+    # How many σ hold 68 % of the residuals, which should be one, and 95 %, which should be two.
     ranks = [min(math.ceil(fraction * (len(ratio) + 1)), len(ratio)) - 1 for fraction in _WITHIN]
-    one, two = (max(float(ratio[rank]), 1e-12) for rank in ranks)
+    of_68, of_95 = (max(float(ratio[rank]), 1e-12) for rank in ranks)
     # Means of logarithms: of the two, and with the typical factor.
-    of_residuals = (1 - _TAIL) * math.log(one) + _TAIL * math.log(two / 2)
+    of_residuals = (1 - _TAIL) * math.log(of_68) + _TAIL * math.log(of_95 / 2)
     weight = len(ratio) / (len(ratio) + _TYPICAL_WEIGHT)
     low, high = CALIBRATION_RANGE
     factor = math.exp(weight * of_residuals + (1 - weight) * math.log(typical))

@@ -53,8 +53,8 @@ class ValidatedFrame(ValidationPoints):
             share = torch.full_like(gain, 1 / len(gain))
         # The mean over its standard error.
         mean = (share * gain).sum()
-        error = (share.square() * (gain - mean).square()).sum().sqrt()
-        return float(mean / error.clamp_min(1e-12))
+        standard_error = (share.square() * (gain - mean).square()).sum().sqrt()
+        return float(mean / standard_error.clamp_min(1e-12))
 
 
 def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:

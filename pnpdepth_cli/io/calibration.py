@@ -102,7 +102,9 @@ class _Fields:
         if numbers is None or not (np.abs(numbers) <= _LARGEST).all():
             raise InputError(f"{self.path}: {name} is not made of a camera's numbers; correct it")
         if count is not None and len(numbers) != count:
-            raise InputError(f"{self.path}: {name} has {len(numbers)} numbers, not {count}")
+            raise InputError(
+                f"{self.path}: {name} has {len(numbers)} numbers, not {count}; correct it"
+            )
         return numbers
 
     def matrix(self, *names: str, columns: int = 3) -> Floats:
@@ -153,7 +155,10 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
         numbers = fields.numbers("Tr", "Tr_velo_cam", "Tr_velo_to_cam")
         return _kitti(fields, camera, "KITTI", pose_of_matrix(path, "Tr", numbers))
     if unknown := sorted(set(fields.values) - set(_PLAIN)):
-        raise InputError(f"{path}: the name {unknown[0]!r} is none of {', '.join(_PLAIN)}")
+        raise InputError(
+            f"{path}: the name {unknown[0]!r} is none of {', '.join(_PLAIN)}; correct it, or take"
+            " it out"
+        )
     return _single(fields, camera, source)
 
 
@@ -278,7 +283,9 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
         fx, fy, cx, cy = numbers
         numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
     if len(numbers) not in (9, 16):
-        raise InputError(f"{path}: K has {len(numbers)} numbers, not 4, 9 or 16")
+        raise InputError(
+            f"{path}: K has {len(numbers)} numbers; give 4 (fx fy cx cy), 9 or 16 of a matrix"
+        )
     matrix = np.reshape(numbers, (math.isqrt(len(numbers)), -1))[:3, :3]
     matrix = _check_intrinsics(path, matrix)
     lens, distortion = _lens(fields)
@@ -317,7 +324,7 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
     if lens is None:
         raise InputError(
             f"{fields.path}: distortion model {one_line(model)[:30]!r} is none of"
-            f" {', '.join(_LENSES)}"
+            f" {', '.join(_LENSES)}; calibrate the camera with one of these"
         )
     coefficients = tuple(fields.numbers(*_OF_LENS, optional=True))
     if lens == "radial-tangential" and not any(coefficients):
@@ -325,7 +332,7 @@ def _lens(fields: _Fields) -> tuple[str, tuple[float, ...]]:
     if len(coefficients) not in _COEFFICIENTS[lens]:
         raise InputError(
             f"{fields.path}: {len(coefficients)} coefficients of {lens} distortion, which has"
-            f" {_COEFFICIENTS[lens]}"
+            f" {_COEFFICIENTS[lens]}; correct them, or their model"
         )
     return lens, coefficients
 
@@ -335,16 +342,19 @@ def _named_values(path: Path, text: str) -> _Fields:
     before, *parts = _FIELD.split(_COMMENT.sub("", text))
     names, values = parts[::2], parts[1::2]
     if before.strip():
-        raise InputError(f"{path}: {one_line(before)[:60]!r} has no name before it")
+        raise InputError(
+            f"{path}: {one_line(before)[:60]!r} has no name before it; write it as `name: value`"
+        )
     if len(set(names)) < len(names):
         raise InputError(f"{path} has a name twice ({one_line(', '.join(names))}); keep one")
     return _Fields(path, dict(zip(names, values, strict=True)))
 
 
 def _check_intrinsics(path: Path, matrix: Floats) -> Floats:
-    bottom = np.array_equal(matrix[2], [0, 0, 1])
-    if not (bottom and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
-        raise InputError(f"{path}: the intrinsics are not fx s cx, 0 fy cy, 0 0 1")
+    """The matrix (3, 3). InputError if it is not that of a pinhole camera."""
+    has_last_row = np.array_equal(matrix[2], [0, 0, 1])
+    if not (has_last_row and matrix[0, 0] > 0 and matrix[1, 1] > 0 and matrix[1, 0] == 0):
+        raise InputError(f"{path}: the intrinsics are not fx s cx, 0 fy cy, 0 0 1; correct them")
     return matrix
 
 

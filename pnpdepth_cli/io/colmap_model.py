@@ -216,6 +216,7 @@ def _count(stream: io.BytesIO) -> int:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    """Number and camera of each entry of cameras.bin."""
     stream = io.BytesIO(read_bytes(path))
     for _ in range(_count(stream)):
         number, model, width, height = _records(stream, _CAMERA).item()

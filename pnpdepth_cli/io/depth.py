@@ -401,19 +401,20 @@ def describe_range(
     """
     values = np.asarray(depth, dtype=np.float64)
     known = values[np.isfinite(values) & (values > 0)]
-    source, _, assumed = reading
-    hint = f"; {option} to change" if assumed else ""
+    hint = f"; {option} to change" if reading.assumed else ""
     if known.size == 0:
-        return f"no {noun} with known depth ({source}{hint})"
-    by_kitti = assumed and source.endswith(f"÷ {KITTI_SCALE:g}")
+        return f"no {noun} with known depth ({reading.source}{hint})"
+    # Near depths by KITTI's scale may be millimetres of a room.
+    by_kitti = reading.assumed and reading.source.endswith(f"÷ {KITTI_SCALE:g}")
     if by_kitti and float(known.max()) < _FARTHEST_INDOORS_M:
         low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
         hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
+    # How many there are, and from where to where.
     count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
     low = metres(float(known.min()))
     high = metres(float(known.max()))
     extent = low if low == high else f"{low}–{high}"
-    return f"{count}, {extent} {unit} ({source}{hint})"
+    return f"{count}, {extent} {unit} ({reading.source}{hint})"
 
 
 def metres(value: float) -> str:

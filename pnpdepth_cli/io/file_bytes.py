@@ -243,7 +243,9 @@ def read_json(path: Path) -> dict[str, Any]:
         text = data.decode("utf-8-sig")
         content = json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_finite)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON ({one_line(error)})") from error
+        raise InputError(
+            f"{path} is not valid JSON ({one_line(error)}); correct it, or write it again"
+        ) from error
     if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object at its top level; create it again")
     return content
@@ -289,7 +291,9 @@ def parse_yaml(path: Path, text: str) -> object:
     except ImportError:
         raise UsageError(f"reading {path} needs PyYAML: pip install 'pnpdepth[ros]'") from None
     if len(text) > _LONGEST_YAML:
-        raise InputError(f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}")
+        raise InputError(
+            f"{path} has {len(text):,} characters, more than {_LONGEST_YAML:,}; keep what is needed"
+        )
 
     text = _OPENCV_HEADER.sub("", text)
     try:
@@ -301,7 +305,9 @@ def parse_yaml(path: Path, text: str) -> object:
                 break
         return next(yaml.load_all(text, yaml.BaseLoader), None)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is not valid YAML ({one_line(error)})") from error
+        raise InputError(
+            f"{path} is not valid YAML ({one_line(error)}); correct it, or write it again"
+        ) from error
 
 
 def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
@@ -334,10 +340,15 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
             numbers = [float(word) for word in words]
         except ValueError:
             numbers = []
-        if len(numbers) != count:
-            or_header = "" if rows or header else ", nor the header x y depth or x y z"
+        if len(numbers) != count and (rows or header):
             raise InputError(
-                f"{path}, line {number}: {' '.join(words)[:80]!r} is not {count} numbers{or_header}"
+                f"{path}, line {number}: {' '.join(words)[:80]!r} is not {count} numbers; correct"
+                " it, or take it out"
+            )
+        if len(numbers) != count:
+            raise InputError(
+                f"{path}, line {number}: {' '.join(words)[:80]!r} is not {count} numbers, nor the"
+                " header x y depth or x y z"
             )
         rows.append(numbers)
     return np.array(rows or np.empty((0, 3)), np.float64), header

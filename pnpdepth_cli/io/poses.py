@@ -73,7 +73,9 @@ def numbers_in(value: object) -> list[float] | None:
 def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
     """Returns the pose of a 3×4 or 4×4 matrix by rows. Raises InputError if it is none."""
     if len(numbers) not in (12, 16):
-        raise InputError(f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16")
+        raise InputError(
+            f"{path}: {name} has {len(numbers)} numbers instead of 12 or 16; correct it"
+        )
     matrix = np.reshape(numbers, (-1, 4))
     if len(numbers) == 16 and not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise InputError(f"{path}: the last row of {name} is not 0 0 0 1; correct it")
@@ -85,7 +87,10 @@ def pose_of_quaternion(path: Path, numbers: list[float]) -> Extrinsics:
     translation, xyzw = np.split(np.array(numbers), [3])
     length = float(np.linalg.norm(xyzw))
     if not abs(length - 1) < 0.01:
-        raise InputError(f"{path}: the quaternion has length {length:.3g} instead of 1")
+        raise InputError(
+            f"{path}: the quaternion has length {length:.3g} instead of 1; correct it, x y z w in"
+            " this order"
+        )
     return check_pose(path, "the quaternion", rotation_of(np.roll(xyzw, 1)), translation)
 
 
@@ -99,7 +104,7 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         raise InputError(f"{path}: {name} is no rotation (R·Rᵀ is off by {off:.2g}); correct it")
     if not (np.abs(translation) < _FARTHEST_M).all():
-        raise InputError(f"{path}: a translation of {translation} m is of no sensor")
+        raise InputError(f"{path}: a translation of {translation} m is of no sensor; correct it")
     return Extrinsics(rotation, translation)
 
 
@@ -117,7 +122,9 @@ def read_oxts(paths: Sequence[Path]) -> Floats:
     packets = [numbers_in(file_bytes.read_text(path)) or [] for path in paths]
     for path, packet in zip(paths, packets, strict=True):
         if len(packet) != _OXTS_COLUMNS or not np.isfinite(packet[:6]).all():
-            raise InputError(f"{path} is no packet of {_OXTS_COLUMNS} numbers of KITTI's oxts")
+            raise InputError(
+                f"{path} is no packet of {_OXTS_COLUMNS} numbers of KITTI's oxts; copy it again"
+            )
     latitude, longitude, altitude, roll, pitch, yaw = np.array(packets)[:, :6].T
     scale_m = _EARTH_RADIUS_M * np.cos(np.radians(latitude[0]))
     east = scale_m * np.radians(longitude)
@@ -152,7 +159,9 @@ def _pose_of_transform(path: Path, content: object) -> Extrinsics:
             numbers = numbers_in([x, y, z, qx, qy, qz, qw])
             if numbers is not None and len(numbers) == 7:
                 return pose_of_quaternion(path, numbers)
-    raise InputError(f"{path} holds no matrix, no tx ty tz qx qy qz qw, no ROS transform")
+    raise InputError(
+        f"{path} holds no pose; give a matrix, tx ty tz qx qy qz qw, or a transform of ROS"
+    )
 
 
 def read_poses(path: Path) -> Floats:
@@ -233,7 +242,9 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
             if not np.isfinite(poses[index]).all() or not is_rotation(poses[index, :, :3]):
                 raise ValueError(f"the pose of {name} is no rotation")
     except (LookupError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is no transforms.json ({file_bytes.one_line(error)})") from error
+        raise InputError(
+            f"{path} is no transforms.json ({file_bytes.one_line(error)}); give Nerfstudio's"
+        ) from error
     return poses
 
 
@@ -275,7 +286,7 @@ def _rows(path: Path) -> tuple[Floats, Floats]:
     """The numbers (N, 12 or 8) of the rows and their poses (N, 3, 4); at least one."""
     rows, _ = file_bytes.read_rows(path, file_bytes.read_bytes(path))
     if not len(rows) or rows.shape[1] not in (_KITTI_COLUMNS, _TUM_COLUMNS):
-        raise InputError(f"{path} has no rows of 12 numbers (KITTI) or 8 (TUM)")
+        raise InputError(f"{path} has no poses; give rows of 12 numbers (KITTI) or 8 (TUM)")
     if rows.shape[1] == _KITTI_COLUMNS:
         poses = rows.reshape(-1, 3, 4)
     else:
@@ -283,7 +294,7 @@ def _rows(path: Path) -> tuple[Floats, Floats]:
         poses = np.concatenate([turns, rows[:, 1:4, None]], axis=2)
     for number, pose in enumerate(poses, start=1):
         if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
-            raise InputError(f"{path}: row {number} holds no rotation")
+            raise InputError(f"{path}: row {number} holds no rotation; correct it")
     return rows, poses
 
 
@@ -327,5 +338,7 @@ def read_trajectory(path: Path) -> Trajectory:
     """Returns the trajectory in a file with rows of time, position and quaternion x y z w."""
     rows, poses = _rows(path)
     if rows.shape[1] != _TUM_COLUMNS or not np.isfinite(rows[:, 0]).all():
-        raise InputError(f"{path} has no rows of time, position and quaternion x y z w")
+        raise InputError(
+            f"{path} is no trajectory; give rows of time, position and quaternion x y z w (TUM)"
+        )
     return trajectory_of(rows[:, 0], poses)

@@ -245,7 +245,7 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
         while (bgr := dict(last).get(index)) is None:
             decoded = next(frames, None)
             if decoded is None:
-                raise InputError(f"{path} has no frame {index:,}")
+                raise InputError(f"{path} has no frame {index:,}; it ends before, or is cut short")
             last.append(decoded)
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 

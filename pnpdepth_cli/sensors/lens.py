@@ -90,7 +90,7 @@ def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     directions from outside the field of view inside it.
     """
     with np.errstate(all="ignore"):
-        shown = _distorted(plane, lens, coefficients)
+        shown = _distort_anywhere(plane, lens, coefficients)
         shown[np.hypot(*plane.T) > largest_radius(lens, coefficients)] = np.nan
     return shown
 
@@ -131,30 +131,33 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
     # The derivatives [[a, b], [c, d]] of what is shown, a column for each axis of the plane.
     columns = []
     for axis in np.eye(2) * _NEWTON_DIFFERENCE:
-        ahead = _distorted(plane + axis, lens, coefficients)
-        behind = _distorted(plane - axis, lens, coefficients)
+        ahead = _distort_anywhere(plane + axis, lens, coefficients)
+        behind = _distort_anywhere(plane - axis, lens, coefficients)
         columns.append((ahead - behind) / (2 * _NEWTON_DIFFERENCE))
     a, c = columns[0].T
     b, d = columns[1].T
     # Their inverse, applied to the error.
-    x, y = (_distorted(plane, lens, coefficients) - shown).T
+    x, y = (_distort_anywhere(plane, lens, coefficients) - shown).T
     return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
 
 
 @functools.lru_cache(maxsize=64)
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
-    """Radius before and after the lens, without its tangential parts."""
+    """Radii on the plane of rays ever farther from the axis, and where the lens shows them.
+
+    Its tangential parts, which are small, are left out.
+    """
     if lens == "fisheye":
         radius = np.tan(np.linspace(0, _WIDEST_ANGLE_RAD, _SAMPLES))
     else:
         radius = np.linspace(0, _WIDEST_PLANE, _SAMPLES)
         coefficients = tuple(c if i in _RADIAL else 0.0 for i, c in enumerate(coefficients))
     with np.errstate(all="ignore"):
-        shown = _distorted(np.column_stack([radius, 0 * radius]), lens, coefficients)
+        shown = _distort_anywhere(np.column_stack([radius, 0 * radius]), lens, coefficients)
     return radius, shown[:, 0]
 
 
-def _distorted(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
+def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
     """The points (N, 2) by the lens model, also beyond where it turns back."""
     if not len(plane):  # which OpenCV refuses
         return plane.copy()

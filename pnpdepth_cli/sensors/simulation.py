@@ -130,7 +130,10 @@ def lidar_of(
         raise UsageError("give --sensor, or --beams and --vertical-fov")
     top_deg, bottom_deg = vertical_fov
     if not -90 <= bottom_deg <= top_deg <= 90 or (top_deg == bottom_deg and beams > 1):
-        raise UsageError(f"there is no field of view from {top_deg:g}° down to {bottom_deg:g}°")
+        raise UsageError(
+            f"there is no field of view from {top_deg:g}° down to {bottom_deg:g}°; give TOP and"
+            " BOTTOM from 90° to −90°, or two equal ones of one beam"
+        )
     elevations = evenly_spaced(top_deg, (top_deg - bottom_deg) / max(beams - 1, 1), beams)
     return Lidar(name=f"{beams} beams", elevations_deg=elevations, azimuth_step_deg=0.2)
 
@@ -202,7 +205,10 @@ def sample_points(
         raise unequal_sizes("the image", image.shape, "the depth", size)
     known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
     if not known.size:
-        raise NoPointsError("the depth map has no pixel with known depth to sample from")
+        raise NoPointsError(
+            "the depth map has no pixel with known depth to sample from; give one with depth above"
+            " 0"
+        )
     wanted = pattern.wanted(known.size)
     # The known pixels of the pattern.
     match pattern.kind:
@@ -254,7 +260,7 @@ def _lines(count: int, height: int) -> Pixels:
 def _corners(image: NDArray[np.float32] | None, wanted: int) -> Pixels:
     """The pixels of ORB corners, the strongest first, as structure from motion has its points."""
     if image is None:
-        raise UsageError("pattern 'features' needs the image that the depth belongs to")
+        raise UsageError("pattern 'features' needs the image that the depth belongs to; give it")
     grey = cv2.cvtColor(image.clip(0, 1), cv2.COLOR_RGB2GRAY)
     # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]

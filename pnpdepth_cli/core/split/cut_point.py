@@ -36,9 +36,13 @@ class CutPoint:
     @classmethod
     def find(cls, network: nn.Module, layer: str) -> CutPoint:
         """Returns the cut point of that name. Raises ModelError if there is no such submodule."""
+        # The notation.
         match = _NAME.fullmatch(layer)
         if match is None or match["call"] == "0":
-            raise ModelError(f"layer {layer!r}: the form is NAME, NAME#CALL or NAME[OUTPUT]")
+            raise ModelError(
+                f"layer {layer!r} is no layer's name; the form is NAME, NAME#CALL or NAME[OUTPUT]"
+            )
+        # The submodule of that name.
         name = match["module"]
         modules = dict(network.named_modules(remove_duplicate=False))
         if name not in modules or not name:
@@ -48,6 +52,7 @@ class CutPoint:
                 hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
             raise ModelError(f"layer {name!r} is not in this network; {hint}")
         module = modules[name]
+        # What is around it, and around submodules with hooks.
         hooked = [n for n, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
         names = [n for n, m in modules.items() if m is module]  # several where it is shared
         return cls(

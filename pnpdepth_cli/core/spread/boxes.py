@@ -116,7 +116,7 @@ def everywhere(call: Call) -> Spread:
 @rule("where", "masked_fill", "addcmul", "lerp", "prelu", "_prelu_kernel", "native_dropout")
 @rule("native_batch_norm", "_native_batch_norm_legit", "_native_batch_norm_legit_no_training")
 def pointwise(call: Call) -> Spread:
-    """Returns boxes of results that depend on the same element of an input, which may broadcast."""
+    """Returns boxes of results that depend on one element of the input, which may be broadcast."""
     if "batch_norm" in call.name and (call.place != 0 or call.args[5] is True):  # it trains
         return everywhere(call)
     new_axes = len(call.shape) - call.source.ndim

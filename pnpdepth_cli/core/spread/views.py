@@ -30,7 +30,7 @@ def part_of(call: Call, position: int) -> Spread:
     axis = (call.args[2] if len(call.args) > 2 else 0) % call.source.ndim
     sizes = call.args[1]  # one size of all parts, or the size of each
     start = position * sizes if isinstance(sizes, int) else sum(sizes[:position])
-    return Spread.from_axes(_cropped(call, axis, start, 1, call.shape[axis]))
+    return Spread.from_axes(_crop(call, axis, start, 1, call.shape[axis]))
 
 
 @rule("cat")
@@ -66,7 +66,7 @@ def stack(call: Call) -> Spread:
     return Spread.from_axes(axes)
 
 
-def _cropped(call: Call, axis: int, start: int, step: int, count: int) -> list[AxisRange]:
+def _crop(call: Call, axis: int, start: int, step: int, count: int) -> list[AxisRange]:
     """The ranges of boxes where every step-th index from the start is kept along one axis."""
     axes = call.spread.axes()
     empty = call.spread.empty()
@@ -92,14 +92,14 @@ def slice_(call: Call) -> Spread:
     elif start < 0:  # counted from the end
         start += size
     start = min(max(start, 0), size)
-    return Spread.from_axes(_cropped(call, axis, start, step, call.shape[axis]))
+    return Spread.from_axes(_crop(call, axis, start, step, call.shape[axis]))
 
 
 @rule("select")
 def select(call: Call) -> Spread:
     """Returns boxes of `tensor[index]` along an axis, which goes."""
     axis = call.args[1] % call.source.ndim
-    axes = _cropped(call, axis, call.args[2] % call.source.shape[axis], 1, 1)
+    axes = _crop(call, axis, call.args[2] % call.source.shape[axis], 1, 1)
     # A box that the index misses is empty, which another axis has to say.
     first, last = axes.pop(axis)
     missed = first > last
@@ -170,7 +170,7 @@ def reshape(call: Call) -> Spread:
     new_axes: list[AxisRange] = []
     while old_sizes or new_sizes:
         group = _first_group(old_sizes, new_sizes)
-        new_axes += _regrouped(old_axes[: len(group.old)], group, call.spread.empty())
+        new_axes += _regroup(old_axes[: len(group.old)], group, call.spread.empty())
         old_sizes = old_sizes[len(group.old) :]
         new_sizes = new_sizes[len(group.new) :]
         old_axes = old_axes[len(group.old) :]
@@ -196,7 +196,7 @@ def _first_group(old_sizes: list[int], new_sizes: list[int]) -> _Group:
     return _Group(old, new)
 
 
-def _regrouped(axes: list[AxisRange], group: _Group, empty: Tensor) -> list[AxisRange]:
+def _regroup(axes: list[AxisRange], group: _Group, empty: Tensor) -> list[AxisRange]:
     """The ranges of the new axes of a group, from those of its old axes."""
     if group.old == group.new:
         return axes

@@ -80,9 +80,12 @@ def image_file(message: Message, topic: str) -> tuple[str, bytes]:
             raise InputError(f"{topic}: {kind!r} is no JPEG and no PNG; name another --topic")
         return suffix, data
     # The pixels, in blue, green and red.
-    if (encoding := str(message.encoding)) not in _CHANNELS:
-        known = ", ".join(_CHANNELS)
-        raise InputError(f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {known}")
+    encoding = str(message.encoding)
+    if encoding not in _CHANNELS:
+        raise InputError(
+            f"{topic}: encoding {one_line(encoding)[:30]!r} is none of {', '.join(_CHANNELS)}; name"
+            " another --topic"
+        )
     channels = _CHANNELS[encoding]
     layout = np.dtype("u1" if channels == 1 else ("u1", channels))
     pixels = np.ascontiguousarray(_grid(message, topic, layout, int(message.step)))
