@@ -108,12 +108,12 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         ValueError: One of the two files is missing, or there are two of a kind.
     """
-    if "fc1.weight" in state or "conv3.weight" in state:
-        there = "coarse" if "fc1.weight" in state else "fine"
-        raise ValueError(
-            f"this is the {there} network only; name a folder with one file coarse*.pth and one"
-            " fine*.pth in it"
-        )
+    for layer, network in (("fc1.weight", "coarse"), ("conv3.weight", "fine")):
+        if layer in state:
+            raise ValueError(
+                f"this is the {network} network only; name a folder with one file coarse*.pth and"
+                " one fine*.pth in it"
+            )
     renamed: dict[str, Tensor] = {}
     files: dict[str, str] = {}
     for name, tensor in state.items():

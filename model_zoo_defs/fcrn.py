@@ -127,6 +127,7 @@ class FCRN(nn.Module):
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
+        # ResNet-50 down to 1/32.
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3)
         self.bn_conv1 = batch_norm(width)
         self.relu = nn.ReLU()
@@ -141,6 +142,7 @@ class FCRN(nn.Module):
                 self.add_module(f"{name}{letter}", block)
                 self.trunk.append(f"{name}{letter}")
                 channels = 4 * middle
+        # Four up-projections, each to twice the size and half the channels.
         self.layer1 = nn.Conv2d(channels, channels // 2, 1)
         channels //= 2
         self.layer1_BN = batch_norm(channels)
@@ -148,9 +150,8 @@ class FCRN(nn.Module):
             self.add_module(name, UpProjection(channels))
             channels //= 2
         self.ConvPred = nn.Conv2d(channels, 1, 3, padding=1)
-        self.ConvPred.bias = nn.Parameter(
-            torch.full((1,), 2.0)
-        )  # at 0 m the ReLU would pass no gradient
+        # Untrained depth is 2 m: at 0 m the ReLU would pass no gradient.
+        self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))
 
     def forward(self, rgb: Tensor) -> Tensor:
         x = self.pool(self.relu(self.bn_conv1(self.conv1(rgb))))

@@ -107,6 +107,7 @@ def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
 def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
     tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
     if kit.chance(0.65):
+        # Two slopes from eaves to ridge, gables, chimney and gutter.
         rise = kit.size(1.5, 4.5)
         eave = kit.size(0.2, 0.6)
         w = width / 2 + 0.1
@@ -125,11 +126,13 @@ def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin:
         group.add(box(0.6, 0.5, 1.6), skin, (kit.size(-0.3, 0.3) * width, deep * 0.4, ridge - 0.9))
         group.add(rod((-w, -eave, low), (w, -eave, low), 0.06), kit.metal())
     else:
+        # A flat roof.
         group.add(
             box(width + 0.2, deep + 0.2, 0.3),
             kit.surface("plain", vivid=0.0),
             (0, deep / 2, height),
         )
+    # A downpipe.
     group.add(cylinder(0.045, height), kit.metal(), (width / 2 - 0.15, -0.06, 0))
 
 

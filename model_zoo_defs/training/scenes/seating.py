@@ -32,6 +32,7 @@ def cushion(
 def chair(kit: Kit) -> Group:
     """Returns a chair with legs and an open back."""
     group = Group()
+    # Size and materials.
     wood = kit.wood() if kit.chance(0.65) else kit.metal()
     seat = kit.surface("fabric", "plain", tile_m=0.3) if kit.chance(0.6) else wood
     w = kit.size(0.38, 0.5)
@@ -40,6 +41,7 @@ def chair(kit: Kit) -> Group:
     back = kit.size(0.75, 1.1)
     t = kit.size(0.02, 0.045)
     y = -d / 2
+    # Seat and legs.
     if kit.chance(0.5):
         group.add(box(w, d, 0.04), seat, (0, y, h - 0.04))
     else:
@@ -48,6 +50,7 @@ def chair(kit: Kit) -> Group:
         x = sx * (w / 2 - t / 2)
         group.add(box(t, t, h), wood, (x, -d + t / 2, 0))
         group.add(box(t, t, back), wood, (x, -t / 2, 0))
+    # Back: boards, bars or a panel.
     style = int(kit.rng.integers(3))
     if style == 0:
         for z in np.linspace(h + 0.1, back - 0.06, int(kit.rng.integers(2, 5))):
@@ -88,16 +91,19 @@ def sofa(kit: Kit) -> Group:
     """Returns a sofa or armchair with cushions."""
     group = Group()
     cloth = kit.surface("fabric", "plain", "stripes", "mottled", tile_m=0.4)
+    # Size.
     seats = int(kit.rng.integers(1, 4))
     each = kit.size(0.55, 0.75)
     d = kit.size(0.75, 0.95)
     h = kit.size(0.38, 0.46)
     w = seats * each
     arm = kit.size(0.12, 0.25)
+    # Body, back and arms.
     group.add(box(w + 2 * arm, d, h * 0.6), cloth, (0, -d / 2, 0.06))
     cushion(kit, group, (w + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
     for side in (-1, 1):
         cushion(kit, group, (arm, d, h * 1.4), (side * (w + arm) / 2, -d / 2, h * 0.75), cloth)
+    # A cushion for each seat, and pillows.
     for index in range(seats):
         x = (index - (seats - 1) / 2) * each
         cushion(kit, group, (each, d * 0.75, 0.18), (x, -d * 0.58, h), cloth)
