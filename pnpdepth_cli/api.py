@@ -27,10 +27,6 @@ from pnpdepth_cli.frames.frame import DepthMap as DepthMap
 from pnpdepth_cli.frames.frame import Refined as Refined
 from pnpdepth_cli.frames.frame import Registration as Registration
 from pnpdepth_cli.frames.frame import Validation as Validation
-from pnpdepth_cli.frames.refiner import Pair as Pair
-from pnpdepth_cli.frames.refiner import Refiner as Refiner
-from pnpdepth_cli.frames.refiner import Unit as Unit
-from pnpdepth_cli.frames.refiner import in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
 from pnpdepth_cli.models import network as networks
 from pnpdepth_cli.models.definition import Fixed as Fixed
@@ -41,6 +37,10 @@ from pnpdepth_cli.models.definition import Normalisation as Normalisation
 from pnpdepth_cli.models.definition import assume_definition
 from pnpdepth_cli.models.network import Network as Network
 from pnpdepth_cli.points import SparsePoints as SparsePoints
+from pnpdepth_cli.refiner import Pair as Pair
+from pnpdepth_cli.refiner import Refiner as Refiner
+from pnpdepth_cli.refiner import Unit as Unit
+from pnpdepth_cli.refiner import in_metres
 from pnpdepth_cli.settings import Settings as Settings
 
 

@@ -38,7 +38,8 @@ MAY_IMPORT = {
         *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
-    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames"},
+    "refiner": {*GROUND_FLOOR, "completion", "models", "frames", "commands"},
+    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames", "refiner"},
 }
 
 

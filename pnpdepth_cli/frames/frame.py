@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from os import PathLike
+from pathlib import Path
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -148,6 +150,13 @@ class Prediction:
         return len(self.losses) - 1
 
 
+class Saver(Protocol):
+    """What writes a refined frame; made above this package, which knows no files."""
+
+    def __call__(self, refined: Refined, path: Path, *, overwrite: bool) -> None:
+        """Writes the frame."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Refined:
     """A refined frame; maps have the image's size."""
@@ -183,6 +192,27 @@ class Refined:
     """Weights of the experts in the result, by name; their sum is 1."""
     registration: ImageRegistration | None = None
     """How the image was moved to the points. None: it was not."""
+    saver: Saver | None = field(default=None, repr=False, compare=False)
+    """What `save` writes with. None for a frame that no Refiner made."""
+
+    def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
+        """Writes the depth, and beside it the record that the command line writes.
+
+        The suffix names the format: .png has 16-bit codes and their scale, .exr, .npy, .npz, .pfm
+        and .tiff have float32 metres. NAME.json is the record of NAME_depth.png and of NAME.png.
+        With `uncertainty`, NAME_sigma.png and NAME_valid.png are written too. All files are
+        written, or none.
+
+        Args:
+            path: The depth file; its folder is made.
+            overwrite: Whether files that exist are replaced.
+
+        Raises:
+            UsageError: A file exists, cannot be written, or has no suffix of a depth file.
+        """
+        if self.saver is None:
+            raise UsageError("only a frame that `refine` or a Refiner returned can be saved")
+        self.saver(self, Path(path), overwrite=overwrite)
 
     def __repr__(self) -> str:
         height, width = self.depth.shape

@@ -256,8 +256,8 @@ def _refined(
         )
     elif not_updated > 0:
         notes.append(
-            f"{experts.own.name} is strong: its depth makes points predict each other far better;"
-            f" {not_updated:.0%} of it is without updates of z"
+            f"{experts.own.name} is strong: with its depth the points predict each other far"
+            f" better than without; {not_updated:.0%} of it is taken before the updates of z"
         )
     if pipeline.unused and not own.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)

@@ -85,10 +85,15 @@ def remove_outdated(outputs: Outputs) -> None:
     written = {path for kind, path in outputs.items() if kind != "improvement"}  # not of each frame
     outdated = {record.with_name(record.stem + end) for end in endings} - written
     for path in (record, *sorted(outdated)):
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise cannot_write(path, error) from error
+        remove(path)
+
+
+def remove(path: Path) -> None:
+    """Removes the file if it exists. Raises OutputError if it cannot be removed."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def output_scale(inputs: Frame) -> float:

@@ -126,7 +126,8 @@ def write_refined(
         folder: Output folder of that batch, which the record's paths start from.
     """
     frame = within_range(outputs, inputs, without_unknown(request, inputs, frame))
-    record = _record_of(request, method, inputs, frame)
+    record = record_of(request, method, inputs, frame)
+    record = scored(record, inputs, frame, with_baselines=request.baselines)
     make_folder(outputs["depth"].parent, below=folder)
     remove_outdated(outputs)
     with all_or_none(outputs.values()):
@@ -149,19 +150,21 @@ def write_refined(
     return record
 
 
-def _record_of(
+def record_of(
     request: RefineRequest, method: Method, frame: Frame, refined: Refined
 ) -> frame_record.FrameRecord:
-    """The record of a refined frame, without its outputs and times."""
+    """Returns the record of a refined frame, without its errors, outputs and times."""
     # What the frame is called, and what the networks say.
     network, files = method.own.network, request.files
-    is_map = network.definition.input_kind == "map"
+    spec = request.model
+    if network.definition.input_kind == "map":
+        spec = str(files.depths[0]) if files.depths else "array"
     weights = network.checkpoint
     first = files.image_file or files.sparse
     of_networks = [note for member in method.members for note in member.network.notes]
     held_out = _held_out(frame)
     own_used = len(frame.own) - len(held_out)
-    # Status, files, method, settings, points and errors, in the order of the record.
+    # Status, files, method, settings and points, in the order of the record.
     return frame_record.FrameRecord(
         name=files.name or (first.stem if first else ""),
         group=files.group,
@@ -174,7 +177,7 @@ def _record_of(
         camera=frame_record.CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
         model=frame_record.ModelRecord(
             name=network.definition.name,
-            spec=str(files.depths[0]) if is_map else request.model,
+            spec=spec,
             checkpoint=str(weights) if weights else None,
             checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
         ),
@@ -207,9 +210,22 @@ def _record_of(
         ),
         weights=dict(refined.weights),
         loss=list(refined.losses),
-        errors=_errors_of(refined, frame, with_baselines=request.baselines),
-        improved_fraction=_improved_fraction(refined, frame),
         notes=[note for note in (*frame.notes, *of_networks, *refined.notes) if note],
+    )
+
+
+def scored(
+    record: frame_record.FrameRecord,
+    frame: Frame,
+    refined: Refined,
+    *,
+    with_baselines: bool = False,
+) -> frame_record.FrameRecord:
+    """Returns the record with the errors of the refined depth, by what the frame knows."""
+    return replace(
+        record,
+        errors=_errors_of(refined, frame, with_baselines=with_baselines),
+        improved_fraction=_improved_fraction(refined, frame),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -14,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.commands.refinement.refine_request import RefineRequest
+from pnpdepth_cli.commands.refinement.save_refined import FrameSaver
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
 from pnpdepth_cli.frames.frame import (
@@ -150,14 +153,17 @@ class Refiner:
         frame = frame_of_arrays(image, sparse, self._register, unit, camera, depth)
         with self._lock:
             method = self._method_for(frame)
+            start = time.perf_counter()
             refined = method.refine(frame, with_stages=stages)
+            seconds = time.perf_counter() - start
         notes = [*method.own.network.notes, *frame.notes, *refined.notes]
         if self._register == "auto" and self._differs(frame, refined):
             notes.append(
                 "note: images of this size were moved to their points in different ways;"
                 " `share_registration` decides once for a sequence"
             )
-        refined = replace(refined, notes=tuple(notes))
+        saver = FrameSaver.of(self._request(), method, frame, refined, seconds)
+        refined = replace(refined, notes=tuple(notes), saver=saver)
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
@@ -177,6 +183,15 @@ class Refiner:
         if read:
             with self._lock:
                 self._method_for(read[0]).share_registration(read)
+
+    def _request(self) -> RefineRequest:
+        """What the command line would be asked, for the record."""
+        return RefineRequest(
+            model=self._networks[0].definition.name,
+            method=self._asked,
+            uncertainty=self._uncertainty,
+            keep_measured=self._keep_measured,
+        )
 
     def _differs(self, frame: Frame, refined: Refined) -> bool:
         """Whether this image was moved otherwise than the earlier ones of its size."""
