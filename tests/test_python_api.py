@@ -104,8 +104,8 @@ def test_the_record_of_a_saved_frame_is_that_of_the_command_line(
     pnp.refine(network, rgb, sparse).save(tmp_path / "rgb_depth.png")
     command = FrameRecord.read(tmp_path / "command" / "rgb.json").to_json()
     python = FrameRecord.read(tmp_path / "rgb.json").to_json()
-    # What the two do not share is of files, of times, and of panels for a person.
-    assert command.keys() - python.keys() <= {"inputs", "figures", "camera"}
+    # What the two do not share is of files, of notes on them, and of panels for a person.
+    assert command.keys() - python.keys() <= {"inputs", "figures", "camera", "notes"}
     assert python.keys() <= command.keys()
     for part in ("name", "status", "size", "points", "model", "method", "settings", "versions"):
         assert python[part] == command[part], part
