@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _NAMES = (
     "load_network",
     "refine",
-    "save",
     "score",
     "Refiner",
     "Refined",

@@ -14,7 +14,6 @@ from pnpdepth_cli.camera import Camera as Camera
 from pnpdepth_cli.completion.alignment import Alignment as Alignment
 from pnpdepth_cli.completion.image_registration import ImageRegistration as ImageRegistration
 from pnpdepth_cli.core.split import Split as Split
-from pnpdepth_cli.dataset.saved_result import save as save
 from pnpdepth_cli.errors import DeviceError as DeviceError
 from pnpdepth_cli.errors import DivergedError as DivergedError
 from pnpdepth_cli.errors import InputError as InputError
@@ -28,10 +27,6 @@ from pnpdepth_cli.frames.frame import Refined as Refined
 from pnpdepth_cli.frames.frame import Registration as Registration
 from pnpdepth_cli.frames.frame import UsedNetwork as UsedNetwork
 from pnpdepth_cli.frames.frame import Validation as Validation
-from pnpdepth_cli.frames.refiner import Pair as Pair
-from pnpdepth_cli.frames.refiner import Refiner as Refiner
-from pnpdepth_cli.frames.refiner import Unit as Unit
-from pnpdepth_cli.frames.refiner import in_metres
 from pnpdepth_cli.measures import DELTA_THRESHOLDS, with_thresholds
 from pnpdepth_cli.measures import Scores as Scores
 from pnpdepth_cli.measures import score as score_tensors
@@ -44,6 +39,10 @@ from pnpdepth_cli.models.definition import Normalisation as Normalisation
 from pnpdepth_cli.models.definition import assume_definition
 from pnpdepth_cli.models.network import Network as Network
 from pnpdepth_cli.points import SparsePoints as SparsePoints
+from pnpdepth_cli.refiner import Pair as Pair
+from pnpdepth_cli.refiner import Refiner as Refiner
+from pnpdepth_cli.refiner import Unit as Unit
+from pnpdepth_cli.refiner import in_metres
 from pnpdepth_cli.settings import Settings as Settings
 
 

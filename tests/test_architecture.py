@@ -48,7 +48,8 @@ MAY_IMPORT = {
         *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
-    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames", "dataset"},
+    "refiner": {*GROUND_FLOOR, "completion", "models", "frames", "dataset"},
+    "api": {*GROUND_FLOOR, "core", "completion", "models", "frames", "refiner"},
 }
 
 IN_COMMANDS = {

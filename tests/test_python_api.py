@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +20,11 @@ from torch import nn
 import pnpdepth_cli as pnp
 from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.cli.main import run
-from pnpdepth_cli.frames.refiner import frame_of_arrays
+from pnpdepth_cli.commands.shared.results import result_frames
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.refiner import frame_of_arrays
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "indoor"
 Frame = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -37,6 +41,11 @@ def network() -> pnp.Network:
 def frame() -> Frame:
     """A part of the sample."""
     return read_rgb(SAMPLE / "rgb.png").values[PART], read_depth(SAMPLE / "sparse.png").values[PART]
+
+
+@pytest.fixture(scope="module")
+def refined(network: pnp.Network, frame: Frame) -> pnp.Refined:
+    return pnp.refine(network, *frame)
 
 
 def test_the_public_names_are_these() -> None:
@@ -76,6 +85,96 @@ def test_arrays_are_refined_like_files(network: pnp.Network, frame: Frame, tmp_p
     assert np.array_equal(refined.depth, np.load(tmp_path / "depth.npy"))
     truth = read_depth(SAMPLE / "gt.png").values[PART]
     assert pnp.score(refined.depth, truth)["mae"] < pnp.score(refined.before, truth)["mae"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".npy", ".npz", ".pfm", ".tiff"])
+def test_a_refined_frame_is_saved_as_the_command_line_writes_it(
+    refined: pnp.Refined, suffix: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "new" / f"room_depth{suffix}"
+    refined.save(path)
+    saved = read_depth(path)
+    # Half a code of a 16-bit PNG; the others hold the same numbers.
+    half_code = 0.5001 / (saved.reading.scale or np.inf)
+    np.testing.assert_allclose(saved.values, refined.depth, rtol=0, atol=half_code)
+    assert {file.name for file in path.parent.iterdir()} == {path.name, "room.json"}
+    (result,) = result_frames(path.parent)
+    assert result.record.name == "room"
+    assert result.record.refined().outputs["depth"] == str(path)
+    assert result.record.refined().weights == refined.weights
+    assert run(["eval", str(path), str(path)]) == 0
+
+
+def test_the_record_of_a_saved_frame_is_that_of_the_command_line(
+    network: pnp.Network, tmp_path: Path
+) -> None:
+    files = [str(SAMPLE / "rgb.png"), "--sparse", str(SAMPLE / "sparse.png")]
+    assert run(["refine", *files, "-o", str(tmp_path / "command")]) == 0
+    rgb, sparse = read_rgb(SAMPLE / "rgb.png").values, read_depth(SAMPLE / "sparse.png").values
+    pnp.refine(network, rgb, sparse).save(tmp_path / "rgb_depth.png")
+    command = FrameRecord.read(tmp_path / "command" / "rgb.json").to_json()
+    python = FrameRecord.read(tmp_path / "rgb.json").to_json()
+    # What the two do not share is of files, of notes on them, and of panels for a person.
+    assert command.keys() - python.keys() <= {"inputs", "notes"}
+    assert python.keys() <= command.keys()
+    assert python["name"] == command["name"]
+    assert python["status"] == command["status"]
+    result, of_command = python["result"], command["result"]
+    assert of_command.keys() - result.keys() <= {"figures", "camera", "seconds", "peak_memory_mb"}
+    for part in ("size", "points", "model", "method", "settings", "versions"):
+        assert result[part] == of_command[part], part
+    assert result["loss"] == pytest.approx(of_command["loss"], rel=1e-4)
+    after = [record["errors"]["validation"]["after"]["mae"] for record in (python, command)]
+    assert after[0] == pytest.approx(after[1], rel=1e-3)
+
+
+def test_no_file_is_replaced_by_a_saved_frame_unless_it_may_be(
+    refined: pnp.Refined, tmp_path: Path
+) -> None:
+    (tmp_path / "room.json").write_text("of the user")
+    with pytest.raises(pnp.UsageError, match=r"room\.json exists; overwrite=True"):
+        refined.save(tmp_path / "room.png")
+    assert [file.name for file in tmp_path.iterdir()] == ["room.json"]
+    refined.save(tmp_path / "room.png", overwrite=True)
+    assert FrameRecord.read(tmp_path / "room.json").name == "room"
+
+
+def test_the_record_of_a_saved_frame_is_of_the_depth_that_is_written(
+    refined: pnp.Refined, tmp_path: Path
+) -> None:
+    doubled = replace(refined, depth=2 * refined.depth)
+    doubled.save(tmp_path / "doubled.npy")
+    refined.save(tmp_path / "refined.npy")
+    errors = [
+        FrameRecord.read(tmp_path / name).errors["used"]["after"]["mae"]
+        for name in ("doubled.json", "refined.json")
+    ]
+    assert errors[0] == pytest.approx(refined.used.depth.mean().item(), rel=0.1)
+    assert errors[1] is not None
+    assert errors[1] < 0.1
+
+
+def test_a_frame_with_standard_deviation_is_saved_with_it_also_by_another_process(
+    network: pnp.Network, frame: Frame, tmp_path: Path
+) -> None:
+    refined = pickle.loads(pickle.dumps(pnp.refine(network, *frame, uncertainty=True)))
+    refined.save(tmp_path / "room_depth.npy")
+    (result,) = result_frames(tmp_path)
+    assert result.sigma is not None
+    assert result.valid is not None
+    np.testing.assert_array_equal(read_depth(result.sigma).values, refined.sigma)
+    np.testing.assert_array_equal(result.read()[1], refined.valid & (refined.depth > 0))
+
+
+def test_what_cannot_be_saved_leaves_no_file(refined: pnp.Refined, tmp_path: Path) -> None:
+    with pytest.raises(pnp.UsageError, match="room.jpg"):
+        refined.save(tmp_path / "room.jpg")
+    with pytest.raises(pnp.UsageError, match="Refiner"):
+        replace(refined, saver=None).save(tmp_path / "room.png")
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(pnp.UsageError, match="no regular file"):
+        refined.save(tmp_path / "folder.png", overwrite=True)
+    assert [file.name for file in tmp_path.iterdir()] == ["folder.png"]
 
 
 def test_a_refiner_takes_maps_rows_and_points_alike(network: pnp.Network, frame: Frame) -> None:

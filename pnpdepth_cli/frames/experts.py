@@ -186,7 +186,8 @@ def expert_of(
     # The network predicts from all points, and the validation points from the others.
     of_whole = known or network.refine(whole, updates=updates)
     of_kept = of_whole
-    not_updated = 0.0 if network.always_updated else strength_of(unexplained)
+    is_updated = network.settings.iterations > 0  # a depth map is not: it has no z
+    not_updated = strength_of(unexplained) if is_updated and not network.always_updated else 0.0
     at = updated = split.points.depth
     harm = None
     if len(split.points):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -140,6 +141,13 @@ class Prediction:
         return len(self.losses) - 1
 
 
+class Saver(Protocol):
+    """What writes a refined frame; made above this package, which knows no files."""
+
+    def __call__(self, refined: Refined, path: Path, *, overwrite: bool) -> None:
+        """Writes the frame."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class UsedNetwork:
     """A network as it was used, with nothing left open."""
@@ -201,12 +209,27 @@ class Refined:
     """The networks with their settings, the user's first."""
     camera: Camera | None = None
     """The camera of the frame. None: unknown."""
+    saver: Saver | None = field(default=None, repr=False, compare=False)
+    """What `save` writes with. None for a frame that no Refiner made."""
 
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the depth and its record; `pnpdepth_cli.save` says how."""
-        import pnpdepth_cli  # the public door, which knows files; this module does not
+    def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
+        """Writes the depth, and beside it the record that the command line writes.
 
-        pnpdepth_cli.save(self, path, overwrite=overwrite)
+        The suffix names the format: .png has 16-bit codes and their scale, .exr, .npy, .npz, .pfm
+        and .tiff have float32 metres. NAME.json is the record of NAME_depth.png and of NAME.png.
+        With `uncertainty`, NAME_sigma.png and NAME_valid.png are written too. All files are
+        written, or none.
+
+        Args:
+            path: The depth file; its folder is made.
+            overwrite: Whether files that exist are replaced.
+
+        Raises:
+            UsageError: A file exists, cannot be written, or has no suffix of a depth file.
+        """
+        if self.saver is None:
+            raise UsageError("only a frame that `refine` or a Refiner returned can be saved")
+        self.saver(self, Path(path), overwrite=overwrite)
 
     def __repr__(self) -> str:
         height, width = self.depth.shape

@@ -288,8 +288,8 @@ def _notes(
         )
     elif own.not_updated > 0:
         notes.append(
-            f"{own.name} is strong: its depth makes points predict each other far better;"
-            f" {own.not_updated:.0%} of it is without updates of z"
+            f"{own.name} is strong: with its depth the points predict each other far better than"
+            f" without; {own.not_updated:.0%} of it is taken before the updates of z"
         )
     if pipeline.unused and not own.whole.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)

@@ -110,6 +110,14 @@ def remove_leftovers(folder: Path) -> int:
     return len(leftovers)
 
 
+def remove_file(path: Path) -> None:
+    """Removes the file if it exists. Raises OutputError if it cannot be removed."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
 def cannot_write(path: Path, error: OSError) -> OutputError:
     """Returns the error that says why; a StorageError where no other file name would help."""
     reason = " ".join(str(error.strerror or error).split()).lower()

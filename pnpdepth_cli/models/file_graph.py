@@ -25,6 +25,13 @@ _ACTIVATION_ELEMENTS = 1 << 28
 _ACTIVATION_GROWTH = 64
 """One activation may have so many elements (1 GB), or so many times those of input and weights."""
 
+_WORK_PER_PIXEL = 1 << 24
+"""Products summed, and elements read, for each pixel of the first input. Depth Anything V2 has
+3.4e6 with ViT-L and about 8e6 with ViT-g, Depth Pro about 4e6 (parameters × tokens ÷ pixels)."""
+
+_LEAST_PIXELS = 1 << 16
+"""Inputs of fewer pixels may take as much arithmetic as one of 256×256: half a minute of a core."""
+
 _NUMBERS = ("item", "_local_scalar_dense", "equal")
 """Operators of torch whose result is a Python number."""
 
@@ -148,14 +155,16 @@ class FileGraph(nn.Module):
         """Returns the output, or a tuple of several.
 
         Raises:
-            ModelError: A result is too large, or all at a time are.
+            ModelError: A result is too large, all at a time are, or it is too much arithmetic.
         """
         sizes = tuple(tensor.shape for tensor in inputs)
         if sizes in self._allowed:
             return _Runner(self, math.inf).run(*inputs)
         given = _elements([*inputs, *self.parameters(), *self.buffers()])
         largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
-        with SizeLimit(largest):
+        pixels = max([each.shape[-2:].numel() for each in inputs], default=0)
+        work = _WORK_PER_PIXEL * max(pixels, _LEAST_PIXELS)
+        with SizeLimit(largest, work=work, work_is="of any published depth network"):
             result = _Runner(self, 2 * largest).run(*inputs)
         self._allowed.add(sizes)
         return result
@@ -198,6 +207,7 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         largest: Elements of one result.
         in_all: Elements of all results together, or no limit.
         work: Elements read and products summed by all operations together, or no limit.
+        work_is: What `work` is far more than, for the message.
     """
 
     @classmethod
@@ -205,9 +215,18 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         # As in `Watch`: without this mark, torch would import its whole compiler.
         return False
 
-    def __init__(self, largest: int, in_all: float = math.inf, work: float = math.inf) -> None:
+    def __init__(
+        self,
+        largest: int,
+        in_all: float = math.inf,
+        work: float = math.inf,
+        work_is: str = "on constants that networks have",
+    ) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._largest, self._left, self._work = largest, in_all, work
+        self._largest = largest
+        self._left = in_all
+        self._work = work
+        self._work_is = work_is
 
     def __torch_dispatch__(
         self,
@@ -228,7 +247,7 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         if elements and func.overloadpacket in flop_registry:
             self._work -= flop_registry[func.overloadpacket](*args, **kwargs, out_val=expected) / 2
         if self._work < 0:
-            raise ModelError("far more arithmetic on constants than networks have")
+            raise ModelError(f"far more arithmetic than that {self._work_is}")
         return func(*args, **kwargs)
 
 

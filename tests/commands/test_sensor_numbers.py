@@ -24,8 +24,8 @@ from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.frames.frame import Frame
-from pnpdepth_cli.frames.refiner import frame_of_arrays
 from pnpdepth_cli.io.rgb import read_rgb
+from pnpdepth_cli.refiner import frame_of_arrays
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 INDOOR = STREET.parent / "indoor"

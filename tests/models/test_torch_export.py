@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -227,3 +228,29 @@ def test_pickles_libraries_and_code_in_archives_stay_unread(archive: Path, tmp_p
     rgb = torch.rand(1, 3, 32, 48)
     assert torch.equal(network.module(rgb), load_network(str(archive), None).module(rgb))
     assert not trap.exists()
+
+
+class Products(nn.Module):
+    """A product of 4e12 multiplications, of a weight of a few bytes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1, 16000))
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        rows = self.weight.expand(16000, -1)
+        return rgb[:, :1] + torch.mm(rows, rows.T)[0, 0]
+
+
+def test_a_program_of_endless_products_is_refused_before_they_are_made(tmp_path: Path) -> None:
+    file = tmp_path / "slow.pt2"
+    # Exported on the meta device: nothing is multiplied here either.
+    with torch.device("meta"):
+        program = torch.export.export(Products().eval(), (torch.rand(1, 3, 32, 48),))
+    program.state_dict["weight"] = nn.Parameter(torch.ones(1, 16000))
+    torch.export.save(program, file)
+    network = exported_definition(file).build()
+    start = time.process_time()
+    with pytest.raises(ModelError, match="arithmetic"):
+        network(torch.rand(1, 3, 32, 48))
+    assert time.process_time() - start < 10

@@ -20,7 +20,7 @@ from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Refined
-from pnpdepth_cli.io.atomic import cannot_write
+from pnpdepth_cli.io.atomic import remove_file
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
@@ -84,10 +84,7 @@ def remove_outdated(outputs: Outputs) -> None:
     written = {path for kind, path in outputs.items() if kind != "improvement"}  # not of each frame
     outdated = {record.with_name(record.stem + end) for end in endings} - written
     for path in (record, *sorted(outdated)):
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise cannot_write(path, error) from error
+        remove_file(path)
 
 
 def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -> Refined:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.dataset.saved_result import save
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
 from pnpdepth_cli.frames.frame import (
@@ -84,7 +85,9 @@ class Refiner:
         adapt: Sequence[Pair] = (),
     ) -> None:
         self._networks = list(network) if isinstance(network, Sequence) else [network]
-        if not self._networks or not all(isinstance(each, Network) for each in self._networks):
+        if not self._networks or not all(
+            isinstance(network, Network) for network in self._networks
+        ):
             raise UsageError("network must be from load_network, or several in a list")
         if not isinstance(settings, Settings | None):
             raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
@@ -157,7 +160,7 @@ class Refiner:
                 "note: images of this size were moved to their points in different ways;"
                 " `share_registration` decides once for a sequence"
             )
-        refined = replace(refined, notes=tuple(notes))
+        refined = replace(refined, notes=tuple(notes), saver=save)
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
@@ -192,7 +195,7 @@ class Refiner:
             raise UsageError("this Refiner is closed; make another one, or stay inside its `with`")
         if self._method is None:
             with ExitStack() as opening:
-                opening.enter_context(_opened([each.module for each in self._networks]))
+                opening.enter_context(_opened([network.module for network in self._networks]))
                 networks = list(self._networks)
                 if self._adapt:
                     resolved = resolve_definition(networks[0], first.registered())
@@ -210,15 +213,16 @@ class Refiner:
 
     def _adapt_network(self, network: Network, opening: ExitStack) -> Network:
         """The network with the weights that it learnt, if they are better, and a note on them."""
-        why, own = too_little(len(self._adapt), self._adapt[0]), "the network's own weights: "
+        why = too_little(len(self._adapt), self._adapt[0])
+        weights = "the network's own weights: "
         if why is None:
             named = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
             learnt = learn(network, named, seed=self._asked.seed)
             why = str(learnt)
             if learnt.is_better:
-                own = ""
+                weights = ""
                 opening.enter_context(weights_in_place(network, learnt.weights))
-        return replace(network, notes=(*network.notes, f"adapt: {own}{why}"))
+        return replace(network, notes=(*network.notes, f"adapt: {weights}{why}"))
 
 
 @contextmanager
@@ -226,8 +230,10 @@ def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
     """Inside, no other refiner opens these modules: two cuts of one would disturb each other."""
     with _OPENING:
         if len(set(modules)) < len(modules) or not _OPEN.isdisjoint(modules):
-            hint = "close that one, share it between threads, or load the network again"
-            raise UsageError(f"a network is in use by another Refiner: {hint}")
+            raise UsageError(
+                "a network is in use by another Refiner: close that one, share it between threads,"
+                " or load the network again"
+            )
         _OPEN.update(modules)
     try:
         yield
@@ -254,12 +260,15 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
         return (values / UNITS[unit]).astype(np.float32)
     known = values[np.isfinite(values) & (values > 0)]
     if values.dtype.kind in "iu":
-        fact = f"of {values.dtype}"
-    elif known.size and np.median(known) > FARTHEST_MEDIAN_M:
-        fact = f"{np.median(known):,.0f} in the median, which is too far for metres"
-    else:
-        return values.astype(np.float32)
-    raise InputError(f'{what} is {fact}; give its unit, such as unit="mm" or unit="m"')
+        raise InputError(
+            f'{what} is of {values.dtype}; give its unit, such as unit="mm" or unit="m"'
+        )
+    if known.size and np.median(known) > FARTHEST_MEDIAN_M:
+        raise InputError(
+            f"{what} is {np.median(known):,.0f} in the median, which is too far for metres; give"
+            ' its unit, such as unit="mm" or unit="m"'
+        )
+    return values.astype(np.float32)
 
 
 def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
@@ -310,8 +319,8 @@ def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iter
     maps: list[Any] = [depth]
     if isinstance(depth, list | tuple) and (not depth or np.ndim(depth[0]) > 1):
         maps = [*depth]
-    for given in maps:
-        values = _numbers(given, "the depth map").astype(np.float32)
+    for numbers in maps:
+        values = _numbers(numbers, "the depth map").astype(np.float32)
         if values.shape != size:
             raise InputError(f"the depth map is {values.shape}, but the image is {size}")
         known = np.isfinite(values)
