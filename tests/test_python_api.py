@@ -51,27 +51,39 @@ def refined(network: pnp.Network, frame: Frame) -> pnp.Refined:
 def test_the_public_names_are_these() -> None:
     assert {*pnp.__all__} == {
         "__version__",
-        *(
-            "load_network",
-            "refine",
-            "save",
-            "score",
-            "Refiner",
-            "Refined",
-            "Settings",
-            "Scores",
-            "Split",
-        ),
-        *("Network", "ModelDefinition", "Normalisation", "Fixed", "Multiple", "Near"),
-        *("SparsePoints", "Camera", "Alignment", "ImageRegistration", "Validation", "UsedNetwork"),
-        *("DepthMap", "Pair", "Registration", "Unit"),
-        *("PnpDepthError", "UsageError", "InputError", "ModelError"),
-        *("NoPointsError", "DivergedError", "DeviceError", "OutputError"),
+        "load_network",
+        "refine",
+        "score",
+        "Refiner",
+        "Refined",
+        "Settings",
+        "Scores",
+        "Split",
+        "Network",
+        "ModelDefinition",
+        "Normalisation",
+        "Fixed",
+        "Multiple",
+        "Near",
+        "SparsePoints",
+        "Camera",
+        "Alignment",
+        "ImageRegistration",
+        "Validation",
+        "UsedNetwork",
+        "DepthMap",
+        "Pair",
+        "Registration",
+        "Unit",
+        "PnpDepthError",
+        "UsageError",
+        "InputError",
+        "ModelError",
+        "NoPointsError",
+        "DivergedError",
+        "DeviceError",
+        "OutputError",
     }
-    assert all(getattr(pnp, name) is not None for name in pnp.__all__)
-    assert set(pnp.__all__) <= set(dir(pnp))
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = pnp.nothing
 
 
 def test_arrays_are_refined_like_files(network: pnp.Network, frame: Frame, tmp_path: Path) -> None:
@@ -167,7 +179,7 @@ def test_a_frame_with_standard_deviation_is_saved_with_it_also_by_another_proces
 
 
 def test_what_cannot_be_saved_leaves_no_file(refined: pnp.Refined, tmp_path: Path) -> None:
-    with pytest.raises(pnp.UsageError, match="room.jpg"):
+    with pytest.raises(pnp.UsageError, match=r"room\.jpg"):
         refined.save(tmp_path / "room.jpg")
     with pytest.raises(pnp.UsageError, match="Refiner"):
         replace(refined, saver=None).save(tmp_path / "room.png")
