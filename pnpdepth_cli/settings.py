@@ -6,7 +6,6 @@ A network's definition, the command line, the Python API and the records have th
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, asdict, dataclass, field, fields, replace
@@ -102,6 +101,8 @@ class Settings:
         """Raises UsageError for a name that is no setting, with the likely one."""
         known = [setting.name for setting in fields(cls)]
         for name in values.keys() - {*known}:
+            import difflib
+
             likely = difflib.get_close_matches(name, known, n=1)
             if likely:
                 raise UsageError(f"there is no setting {name!r}; did you mean {likely[0]!r}?")

@@ -222,25 +222,39 @@ def expert_of(
     )
 
 
-def expert_of_user(network: OpenNetwork, split: ValidatedFrame, judged: Judged) -> NetworkExpert:
+def expert_of_user(
+    network: OpenNetwork, split: ValidatedFrame, judged: Judged, *, needs_trust: bool = False
+) -> NetworkExpert:
     """Returns the expert of a user's network, z updated as far as the network is not strong.
 
     Args:
         network: The network, open.
         split: The frame and its validation points.
         judged: How its outliers were told.
+        needs_trust: Whether only what `trust` trusts gets into the result.
     """
     whole = judged.by(network)
     unexplained = 1.0
+    updates = True
     # What its depth without updates leaves unexplained decides whether z is updated.
     if not network.takes_points:
         whole = whole or network.refine(split.whole, updates=network.always_updated)
         unexplained = unexplained_by(whole.aligned, split, judged)
-        wanted = network.always_updated or strength_of(unexplained) < 1
+        # Without trust, which is in the aligned depth, updates would not reach the result.
+        stated = network.always_updated or network.tuned
+        if needs_trust and not stated:
+            updates = trust_in_image(whole.aligned, split.whole.points) > 0
+        wanted = network.always_updated or (updates and strength_of(unexplained) < 1)
         if wanted and not whole.updates and network.is_updated(split.whole):
             whole = network.refine(split.whole)
     return expert_of(
-        network, split, network.name, known=whole, user=network, unexplained=unexplained
+        network,
+        split,
+        network.name,
+        known=whole,
+        user=network,
+        updates=updates,
+        unexplained=unexplained,
     )
 
 
@@ -338,7 +352,7 @@ def fused_experts(
     """
     # The user's networks predict.
     users = [network for network in networks if network is not fusing]
-    own = [expert_of_user(network, split, judged) for network in users]
+    own = [expert_of_user(network, split, judged, needs_trust=True) for network in users]
     # The network that takes a prior predicts without one.
     alone = expert_of(fusing, split, fusing.name, known=judged.by(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
@@ -376,13 +390,9 @@ def trust(
 ) -> float:
     """Returns 0…1, the part of its prior weights that a network gets, by what it explains.
 
-    The aligned depth of a network that takes the image alone explains a fraction of the variance of
-    log depth. The fraction is 1 − PRESS / SS, by a line through the other points (Allen, "The
-    relationship between variable selection and data augmentation and a method for prediction",
-    1974).
-
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points is that of `alone`, and none if it is twice that.
+    the validation points is that of `alone`, and none if it is twice that. Another one has what
+    `trust_in_image` says.
 
     Args:
         network: The network, open.
@@ -390,15 +400,28 @@ def trust(
         split: The frame and its validation points.
         alone: The network that takes a prior, without one.
     """
+    if not network.takes_points:
+        return trust_in_image(expert.whole.aligned, split.whole.points)
     # A network that takes the points: by its error beside that of `alone`.
-    if network.takes_points:
-        if not len(split.points):
-            return 0.0
-        ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
-        return min(1.0, max(0.0, 2.0 - ratio))
-    # Another one: x is its log depth at the points, y theirs.
-    points = split.whole.points
-    at = points.sample(expert.whole.aligned).double()
+    if not len(split.points):
+        return 0.0
+    ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
+    return min(1.0, max(0.0, 2.0 - ratio))
+
+
+def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
+    """Returns 0…1, the trust in a network that takes the image alone, by what it explains.
+
+    Its aligned depth explains a fraction of the variance of log depth. The fraction is
+    1 − PRESS / SS, by a line through the other points (Allen, "The relationship between variable
+    selection and data augmentation and a method for prediction", 1974).
+
+    Args:
+        aligned: (H, W) metres, 0 = unknown, the network's depth, z not updated.
+        points: The frame's points without outliers.
+    """
+    # x is its log depth at the points, y theirs.
+    at = points.sample(aligned).double()
     x = log_of(at[at > 0])
     y = log_of(points.depth[at > 0].double())
     count = len(x)
@@ -407,11 +430,12 @@ def trust(
     x = x - x.mean()
     y = y - y.mean()
     slope = (x @ y) / (x @ x).clamp_min(1e-12)
+    if slope <= 0:
+        return 0.0  # it says that far is near
     # Errors at each point of a line through the others, and of their mean.
     left_out = (y - slope * x) / (1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12))
     total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
-    # A line that falls says that far is near.
-    explained = float(1 - left_out.square().sum() / total) if slope > 0 else 0.0
+    explained = float(1 - left_out.square().sum() / total)
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))
 
 

@@ -118,6 +118,17 @@ def test_a_useless_network_has_no_part_which_is_said() -> None:
     assert not [note for note in alone.notes if "no part" in note]
 
 
+@pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])
+def test_z_of_a_useless_network_is_updated_only_if_the_user_says_so(
+    stated: bool, updates: int
+) -> None:
+    settings = ClosedSettings(iterations=3, lr="5%", align="affine")
+    network = member(Noise, settings=settings, always_updated=stated)
+    result = refined(frame_in_memory(100), network, compact())
+    assert len(result.losses) - 1 == updates
+    assert result.weights["noise"] == 0
+
+
 def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None:
     frame = frame_in_memory(60)
     members = (member(Brightness, settings=ALIGNED), compact())

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-import psutil
-
 if TYPE_CHECKING:
     import torch
 
@@ -69,5 +67,7 @@ def _peak_resident_bytes() -> int:
     if status.exists():
         line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
         return int(line.split()[1]) * 1024
+    import psutil
+
     memory = psutil.Process().memory_info()
     return int(getattr(memory, "peak_wset", memory.rss))
