@@ -67,7 +67,8 @@ def list_layers(
         raise errors.UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    frame, measured = FrameMap.fit(network.definition.size, *_SYNTHETIC_SIZE), []
+    frame = FrameMap.fit(network.definition.size, *_SYNTHETIC_SIZE)
+    measured = []
     with errors.out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
