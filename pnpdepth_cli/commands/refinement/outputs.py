@@ -204,6 +204,7 @@ def write_outputs(
 def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     """The held-out points, else the validation points, with the depths there; None without any."""
     held_out, validation = inputs.held_out, frame.validation
+    # Held-out points have no part in the result; validation points choose and weigh its experts.
     if len(held_out):
         maps = (
             torch.from_numpy(frame.before),
