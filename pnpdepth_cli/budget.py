@@ -11,16 +11,22 @@ from pathlib import Path
 
 from pnpdepth_cli.errors import InputError, ModelError
 
-_MOST_PIXELS = 64_000_000  # of the largest common cameras
+_MOST_PIXELS = 64_000_000
+"""Of the largest common cameras."""
 _MOST_FILE_BYTES = 1 << 30
 _FILE_BYTES_PER_PIXEL = 4
-_DECODED_BYTES_PER_PIXEL = 8  # of four channels of 16 bits
-_BYTES_PER_PIXEL = 64  # of memory that reading and drawing takes at most
+_DECODED_BYTES_PER_PIXEL = 8
+"""Of four channels of 16 bits."""
+_BYTES_PER_PIXEL = 64
+"""Memory that reading and drawing takes at most."""
 _MOST_NETWORK_PIXELS = 4096 * 4096
 """The largest input of a published depth network is 1536×1536 (Depth Pro)."""
-_BYTES_PER_NETWORK_PIXEL = 1024  # of memory: 64 channels in float32, their gradients, and copies
+_BYTES_PER_NETWORK_PIXEL = 1024
+"""Memory of 64 channels in float32, their gradients, and copies."""
 _UNBACKED_VALUES = 1 << 25
-_VALUES_PER_BYTE = 1032  # the highest ratio of deflate; no codec read here is far above it
+"""Values that any file may claim."""
+_VALUES_PER_BYTE = 1032
+"""The highest ratio of deflate; no codec read here is far above it."""
 
 
 def max_pixels() -> int:
@@ -66,7 +72,8 @@ def check_claim(
     The claim begins the message, as in "a.png has 9 pixels"; the way out ends it.
     """
     if not 0 <= size <= most:
-        raise error(f"{claim}, more than {most:,}{f'; {way_out}' if way_out else ''}")
+        text = f"{claim}, more than {most:,}"
+        raise error(f"{text}; {way_out}" if way_out else text)
 
 
 def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
@@ -76,13 +83,14 @@ def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
     file in the message, as in "checkpoint".
     """
     if not path.exists():
-        raise ModelError(f"{kind} {path} does not exist")
+        raise ModelError(f"{kind} {path} does not exist; check the path")
     if not path.is_file():
         raise ModelError(f"{kind} {path} is no regular file; save its content to a file first")
-    size, most = path.stat().st_size, most or max_decoded_bytes()
+    size = path.stat().st_size
     if not size:  # also of what /proc shows as files, some of which never end
         raise ModelError(f"{kind} {path} is empty (0 bytes); copy or create it again")
-    check_claim(f"{kind} {path} has {size:,} bytes", size, most, error=ModelError)
+    claim = f"{kind} {path} has {size:,} bytes"
+    check_claim(claim, size, most or max_decoded_bytes(), error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

@@ -31,7 +31,8 @@ class Camera:
 
     def resized(self, height: int, width: int) -> Camera:
         """Returns the camera of its images, whose size is known, in height × width pixels."""
-        assert self.size is not None
+        if self.size is None:
+            raise ValueError("a camera whose image size is unknown cannot be resized")
         intrinsics = self.intrinsics.copy()
         intrinsics[:2, 2] += 0.5
         intrinsics[:2] *= np.array([[width / self.size[1]], [height / self.size[0]]])

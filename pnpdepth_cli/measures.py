@@ -152,7 +152,8 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
         for key, value in values.items():
             total, count = sums.get(key, (0.0, 0))
             if value is not None and math.isfinite(value):
-                total, count = total + value, count + 1
+                total += value
+                count += 1
             sums[key] = total, count
     return {key: total / count if count else None for key, (total, count) in sums.items()}
 
@@ -248,7 +249,7 @@ def _boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
     span = range(-radius, radius + 1)
     disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
     counts = _boundary_counts(predicted, truth, disc, margin=radius)
-    both, own, true = (each.sum(axis=0) for each in counts)
+    both, own, true = (of_places.sum(axis=0) for of_places in counts)
     return _weigh(2 * both, own + true, [ratio - 1 for ratio in _RATIOS])
 
 
@@ -270,18 +271,22 @@ def _boundary_counts(
         rows = slice(1 + margin + down, 1 + height - margin + down)
         return rows, slice(1 + margin + right, 1 + width - margin + right)
 
-    counts, pairs, ratios = [], 0, np.array(_RATIOS)[:, None]
+    counts = []
+    pairs = 0
+    ratios = np.array(_RATIOS)[:, None]
+    here = moved(0, 0)
     for offset in offsets:
         # the pixels and their neighbours, and by which factor these are farther
-        here, there = moved(0, 0), moved(*offset)
+        there = moved(*offset)
         known = (truth[here] > 0) & (truth[there] > 0)
         pairs += int(np.count_nonzero(known))
         factors = []
         for image in (predicted, truth):
-            own, other = (image[part][known].astype(np.float64) for part in (here, there))
-            factors.append(np.divide(other, own, out=np.zeros_like(own), where=own > 0))
+            depth = image[here][known].astype(np.float64)
+            beside = image[there][known].astype(np.float64)
+            factors.append(np.divide(beside, depth, out=np.zeros_like(depth), where=depth > 0))
         is_own, is_true = (factor > ratios for factor in factors)
-        counts.append([each.sum(axis=1) for each in (is_own & is_true, is_own, is_true)])
+        counts.append([edges.sum(axis=1) for edges in (is_own & is_true, is_own, is_true)])
     return np.array(counts, np.float64).swapaxes(0, 1) * (1.0 if pairs else math.nan)
 
 
@@ -415,7 +420,8 @@ def score(
     """
     known = ground_truth.isfinite() & (ground_truth > 0)
     scored = known & predicted.isfinite() & (predicted > 0)
-    p, g = predicted[scored].double(), ground_truth[scored].double()
+    p = predicted[scored].double()
+    g = ground_truth[scored].double()
     return Scores(
         values_by_key={
             measure.key: float(measure.of_pixels(p, g))

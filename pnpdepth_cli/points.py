@@ -105,8 +105,11 @@ class SparsePoints(Generic[A]):
         """Returns these points and others of the same frame."""
         import torch
 
-        xy, depth = torch.cat([self.xy, others.xy]), torch.cat([self.depth, others.depth])
-        return replace(self, xy=xy, depth=depth)
+        return replace(
+            self,
+            xy=torch.cat([self.xy, others.xy]),
+            depth=torch.cat([self.depth, others.depth]),
+        )
 
     def tensors(self, device: torch.device | str = "cpu") -> SparsePoints[Tensor]:
         """Returns the points as tensors on the device; arrays already there are not copied."""
@@ -176,6 +179,7 @@ def in_frame(xy: Any, size: Size, *, closed: bool = False) -> Any:
         closed: Whether the right and bottom edges of the frame belong to it.
     """
     x, y = xy[:, 0], xy[:, 1]
-    right, bottom = size[1] - 0.5, size[0] - 0.5
+    right = size[1] - 0.5
+    bottom = size[0] - 0.5
     inside = (x <= right) & (y <= bottom) if closed else (x < right) & (y < bottom)
     return (x >= -0.5) & (y >= -0.5) & inside

@@ -8,7 +8,7 @@ no library.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pnpdepth_cli.errors import InputError, UsageError
 
@@ -22,6 +22,15 @@ if TYPE_CHECKING:
     Points = SparsePoints[NDArray[np.float32]]
 
 KITTI_DEVKIT = "kitti-devkit"
+
+
+class _Window(NamedTuple):
+    """A rectangle of an image, in pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +48,10 @@ class FramePart:
 
     def __str__(self) -> str:
         size = "all" if self.crop is None else f"{self.crop[1]}×{self.crop[0]} at the {self.anchor}"
-        averaged = f", averaged over {self.blocks}×{self.blocks} pixels" * (self.blocks > 1)
-        return f"{size} of the {'halved ' * self.halved}frame{averaged}"
+        text = f"{size} of the halved frame" if self.halved else f"{size} of the frame"
+        if self.blocks > 1:
+            text += f", averaged over {self.blocks}×{self.blocks} pixels"
+        return text
 
     @property
     def factor(self) -> int:
@@ -69,19 +80,21 @@ class FramePart:
         intrinsics[:2, 2] -= (left, top)
         return replace(camera, intrinsics=intrinsics, size=(height, width))
 
-    def _window(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
-        """(top, left, height, width) after halving or averaging."""
+    def _window(self, size: tuple[int, int]) -> _Window:
+        """The crop of an image (H, W) after halving or averaging."""
         height, width = (side // self.factor for side in size)
         if self.crop is None:
-            return 0, 0, height, width
+            return _Window(0, 0, height, width)
         rows, columns = self.crop
         if rows > height or columns > width:
+            at = f" at 1/{self.factor}" if self.factor > 1 else ""
             raise InputError(
                 f"the protocol needs {columns}×{rows} pixels but the frame has"
-                f" {width}×{height}{f' at 1/{self.factor}' * (self.factor > 1)}"
+                f" {width}×{height}{at};"
+                " --protocol whole takes frames of any size"
             )
         top = height - rows if self.anchor == "bottom" else (height - rows) // 2
-        return top, (width - columns) // 2, rows, columns
+        return _Window(top, (width - columns) // 2, rows, columns)
 
 
 def _block_means(image: NDArray[Any], side: int) -> NDArray[Any]:

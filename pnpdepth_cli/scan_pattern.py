@@ -15,8 +15,13 @@ MIN_LINES = 12
 """With fewer scan lines, leaving some out is another task than filling in between them."""
 
 _MIN_POINTS = 500
-_ACROSS_OVER_ALONG = 1.5  # at least: spacing across over spacing along scan lines
-_ALONG, _ACROSS = 3.0, 0.35  # spacings to the next point of a line, at most
+"""Fewer points show no pattern."""
+_ACROSS_OVER_ALONG = 1.5
+"""Spacing across scan lines over that along them, at least."""
+_ALONG = 3.0
+"""Spacings along a line to its next point, at most."""
+_ACROSS = 0.35
+"""Spacings across lines to the next point of the same line, at most."""
 
 
 def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | None:
@@ -29,7 +34,8 @@ def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | 
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
     if len(x) < _MIN_POINTS:
         return None
-    along, across = _median_gap(x, y), _median_gap(y, x)
+    along = _median_gap(x, y)
+    across = _median_gap(y, x)
     is_scan = _ACROSS_OVER_ALONG * along <= across < np.inf
     return (along, across) if is_scan else None
 
@@ -42,7 +48,8 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     """
     if (spacing := scan_pattern(xy, size)) is None:
         return None
-    xy, (along_px, across_px) = np.asarray(xy, np.float64), spacing
+    xy = np.asarray(xy, np.float64)
+    along_px, across_px = spacing
     reach = np.array([_ALONG * along_px, max(1.0, _ACROSS * across_px)])
     first, second = cKDTree(xy / reach).query_pairs(1.0, p=np.inf, output_type="ndarray").T
     left = np.where(xy[first, 0] <= xy[second, 0], first, second)

@@ -31,12 +31,12 @@ def option(default: Any, help: str, **details: object) -> Any:
 
 def options_of(group: type) -> list[Field[Any]]:
     """Returns the fields of a dataclass that were made by `option`, in their order."""
-    return [each for each in fields(group) if each.metadata]
+    return [declared for declared in fields(group) if declared.metadata]
 
 
-def flag_of(each: Field[Any]) -> str:
+def flag_of(declared: Field[Any]) -> str:
     """Returns how the command line spells a field, such as `--lr`."""
-    return str(each.metadata.get("flag", f"--{each.name.replace('_', '-')}"))
+    return str(declared.metadata.get("flag", f"--{declared.name.replace('_', '-')}"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +134,8 @@ class Settings:
 
     def given(self) -> dict[str, Any]:
         """Returns the fields that are not open."""
-        values = ((each, getattr(self, each.name)) for each in fields(self))
-        return {each.name: value for each, value in values if value != each.default}
+        values = ((setting, getattr(self, setting.name)) for setting in fields(self))
+        return {setting.name: value for setting, value in values if value != setting.default}
 
     def over(self, others: Settings) -> Settings:
         """Returns these settings, and the others' where these are open."""
@@ -143,7 +143,7 @@ class Settings:
 
     def closed(self) -> ClosedSettings:
         """Returns these settings, and the paper's where these are open."""
-        names = {each.name for each in fields(ClosedSettings)}
+        names = {setting.name for setting in fields(ClosedSettings)}
         return ClosedSettings(**{k: v for k, v in self.given().items() if k in names})
 
 
@@ -181,9 +181,9 @@ def _is_step(value: object) -> bool:
 
 
 _NAMES: Mapping[str, Collection[str]] = {"schedule": choices.SCHEDULES} | {
-    each.name: each.metadata["choices"]
-    for each in options_of(Settings)
-    if "choices" in each.metadata
+    setting.name: setting.metadata["choices"]
+    for setting in options_of(Settings)
+    if "choices" in setting.metadata
 }
 _CHECKS: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),

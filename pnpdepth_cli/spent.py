@@ -17,7 +17,8 @@ def spent_on(part: str) -> Iterator[None]:
     if parts is None:
         yield
         return
-    start, before = time.perf_counter(), sum(parts.values())
+    start = time.perf_counter()
+    before = sum(parts.values())
     try:
         yield
     finally:
@@ -34,6 +35,6 @@ def parts_of(seconds: dict[str, float], stage: str) -> Iterator[None]:
         yield
     finally:
         _noted.reset(token)
-        for part, spent in parts.items():
-            name = f"{stage}: {part}"
-            seconds[name] = round(seconds.get(name, 0.0) + spent, 4)
+        for name, spent in parts.items():
+            key = f"{stage}: {name}"
+            seconds[key] = round(seconds.get(key, 0.0) + spent, 4)

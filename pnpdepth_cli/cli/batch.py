@@ -220,7 +220,8 @@ def _combinations(
         raise UsageError("--vary: an option or a value comes twice; leave one out")
     combinations = dict[str, tuple[dict[str, str], dict[str, object]]]()
     for words in itertools.product(*axes):
-        texts, values = dict[str, str](), dict[str, object]()
+        texts = dict[str, str]()
+        values = dict[str, object]()
         names = [option.opts[-1].removeprefix("--") for option in varying]
         without_updates = dict(zip(names, words, strict=True)).get("iterations") == "0"
         for name, option, word in zip(names, varying, words, strict=True):
@@ -246,7 +247,7 @@ def _option(context: click.Context, name: str) -> click.Option:
     if f"--{name}" not in flags:
         known = ", ".join(flag.removeprefix("--") for flag in flags)
         raise UsageError(f"--vary {name}: choose from {known}")
-    option = next(each for each in command.params if each.opts[-1] == f"--{name}")
+    option = next(found for found in command.params if found.opts[-1] == f"--{name}")
     assert isinstance(option, click.Option)
     if context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE:
         raise UsageError(f"--{name} is varied; leave it out besides")

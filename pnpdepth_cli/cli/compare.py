@@ -70,14 +70,17 @@ def command(
         plot_comparison,
     )
 
+    # All that can be wrong is found before anything is compared.
     inputs = [Path(run) for run in runs]
     check_tables(csv, latex, inputs=inputs, overwrite=overwrite, as_json=as_json)
     comparison = compare(runs, columns=columns)
     if plot is not None:
         plot_comparison(comparison, plot, overwrite=overwrite)
     print_notes(comparison.notes)
-    for_csv, for_latex = comparison_values(comparison), methods_table(comparison)
-    to_stdout = write_tables({csv: for_csv.csv(), latex: for_latex.latex()})
+    # The comparison, as tables and as JSON.
+    to_stdout = write_tables(
+        {csv: comparison_values(comparison).csv(), latex: methods_table(comparison).latex()}
+    )
     if as_json:
         print_json(comparison.to_json())
     elif not to_stdout:

@@ -26,12 +26,14 @@ Exit codes: 0 done · 1 a bug of this program · 2 wrong usage or output · 3 in
 layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some frames failed ·
 130 interrupted. Networks in .py files are code and are run."""
 
-_TRIM_THRESHOLD = -1  # of mallopt, as in malloc.h
+_TRIM_THRESHOLD = -1
 _MMAP_MAX = -4
+"""Parameters of mallopt, as in malloc.h."""
 _KEPT_BYTES = 1 << 30
 """Free bytes at the end of the heap that are not given back."""
 
-_LONGEST = 2000  # most characters of a message; a longer one loses its middle
+_LONGEST = 2000
+"""Most characters of a message; a longer one loses its middle."""
 
 _OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """What the operating system says of a disk that takes no more; anything else is of an input."""
@@ -136,8 +138,11 @@ def run(arguments: list[str]) -> int:
         if errors.is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)
         traceback.print_exception(error)
-        fact = f"internal error ({type(error).__name__}: {error})"
-        return _end(f"{fact}; it is a bug of this program, please report it", 1)
+        return _end(
+            f"internal error ({type(error).__name__}: {error}); it is a bug of this program, please"
+            " report it",
+            1,
+        )
 
 
 def _end(message: object, code: int) -> int:
@@ -147,6 +152,9 @@ def _end(message: object, code: int) -> int:
             sys.stdout.flush()
     except OSError:  # it is full
         sys.stdout = None
-    text, half = printable(message), _LONGEST // 2
-    say(f"pnpdepth: {text if len(text) <= _LONGEST else f'{text[:half]} … {text[-half:]}'}")
+    text = printable(message)
+    if len(text) > _LONGEST:
+        half = _LONGEST // 2
+        text = f"{text[:half]} … {text[-half:]}"
+    say(f"pnpdepth: {text}")
     return code

@@ -34,12 +34,12 @@ def command(context: click.Context, as_json: bool) -> None:
     columns = ("name", "takes", "size", "gives", "params", "weights", "defaults")
     rows = [
         (
-            *(each[key] for key in ("name", "input_kind", "size", "output_kind")),
-            f"{each['parameters']:,}",
-            "shipped" if each["checkpoint"] else "yours",
-            "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}".format(**each),
+            *(network[key] for key in ("name", "input_kind", "size", "output_kind")),
+            f"{network['parameters']:,}",
+            "shipped" if network["checkpoint"] else "yours",
+            "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}".format(**network),
         )
-        for each in listed
+        for network in listed
     ]
     print_table(Table(title="networks", columns=columns, rows=rows))
 

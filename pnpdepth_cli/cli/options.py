@@ -27,8 +27,10 @@ class _File(click.Path):
 
 
 FILE = _File(path_type=Path)
-_WITHOUT = (None, False, 0, math.inf)  # defaults that are no value to show
+_WITHOUT = (None, False, 0, math.inf)
+"""Defaults that are no value to show."""
 _NAME_COLUMN = 22
+"""Characters of the column of names in the help."""
 NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
 """The options of the network, a group of the help."""
 _HELP = ("--help", "--help-all")
@@ -78,9 +80,10 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
     """Returns a decorator that adds the options of dataclasses, but those of some fields."""
 
     def decorate(command: Command) -> Command:
-        declared = [each for group in groups for each in options_of(group)]
-        for each in reversed(declared):
-            command = command if each.name in without else click_option(each)(command)
+        declared = [field for group in groups for field in options_of(group)]
+        for field in reversed(declared):  # the option of a decorator above comes first in the help
+            if field.name not in without:
+                command = click_option(field)(command)
         return command
 
     return decorate
@@ -97,9 +100,9 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
 
 
 _DECLARED = {
-    each.name: each
+    field.name: field
     for group in (BatchRequest, RefineRequest, Settings, ReadOptions)
-    for each in options_of(group)
+    for field in options_of(group)
 }
 _MODEL = _DECLARED["model"]
 model = click_option(_MODEL)
@@ -141,7 +144,7 @@ def sparse_files(command: Command) -> Command:
 
 def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
     """Returns the options of this group by name; they are removed from `values`."""
-    names = [each.name for each in options_of(group)]
+    names = [field.name for field in options_of(group)]
     return {name: values.pop(name) for name in names if name in values}
 
 
@@ -174,6 +177,7 @@ class GroupedCommand(click.Command):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
+        # A dataclass stands for its options that are named nowhere else.
         named = {member for members in groups.values() for member in members}
 
         def flags(member: str | type) -> list[str]:

@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from pnpdepth_cli.commands.shared.sparse_files import Written
 
 _STDOUT = Path("-")
-_WIDE = 1000  # columns of what is no terminal
-_NAMED = 3  # names of frames that are listed with a warning or note
+_WIDE = 1000
+"""Columns of what is no terminal."""
+_NAMED = 3
+"""Names of frames that are listed with a warning or note."""
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
 
 
@@ -110,9 +112,15 @@ def _times(seconds: Mapping[str, float]) -> str:
     for stage, spent in seconds.items():
         if ": " in stage:  # a part of another
             continue
-        own = {name: each for name, each in seconds.items() if name.startswith(f"{stage}: ")}
-        shown = [f"{name.partition(': ')[2]} {each:.2f}" for name, each in own.items()]
-        texts.append(f"{stage} {spent:.2f} s" + (f" ({', '.join(shown)})" if shown else ""))
+        text = f"{stage} {spent:.2f} s"
+        parts = [
+            f"{name.partition(': ')[2]} {spent_on:.2f}"
+            for name, spent_on in seconds.items()
+            if name.startswith(f"{stage}: ")
+        ]
+        if parts:
+            text += f" ({', '.join(parts)})"
+        texts.append(text)
     return ", ".join(texts)
 
 
@@ -154,6 +162,6 @@ def print_sparse(written: Written) -> None:
     """Prints the end of `pnpdepth project`, `sample` and `simulate`: notes, points, files."""
     points, notes, files = written
     print_notes(notes)
-    count, (height, width) = len(points), points.size
-    share = f"{count / (height * width):.2%} of {width}×{height} pixels"
-    say(f"wrote {count:,} points, {share}: {'  '.join(map(str, files))}")
+    height, width = points.size
+    share = f"{len(points) / (height * width):.2%} of {width}×{height} pixels"
+    say(f"wrote {len(points):,} points, {share}: {'  '.join(map(str, files))}")

@@ -20,9 +20,13 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 _SETTING = re.compile(r"`(\w+)`")
-_FLAGS = {e.name: flag_of(e) for e in (*options_of(Settings), *options_of(RefineRequest))}
+_FLAGS = {
+    field.name: flag_of(field) for field in (*options_of(Settings), *options_of(RefineRequest))
+}
 _LINE_EVERY_S = 60.0
+"""Seconds between lines of progress where there is no terminal."""
 _SHOWN_AFTER_S = 1.0
+"""Seconds after which a bar is shown."""
 INTERRUPTED = 128 + signal.SIGINT
 """The exit code after Ctrl-C."""
 
@@ -62,6 +66,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         nonlocal bar, began, printed_at
         from tqdm import tqdm
 
+        # The bar is made when there is something to show.
         now = time.monotonic()
         if bar is None:
             tqdm.monitor_interval = 0  # without its thread, image libraries can be silenced
@@ -70,6 +75,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
                 delay=_SHOWN_AFTER_S,
             )  # fmt: skip
             began = printed_at = now
+        # Where there is no terminal, a line now and then.
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:
             printed_at = now
             say(tqdm.format_meter(done, total, now - began, 0, title, unit=unit))

@@ -22,7 +22,8 @@ from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
 from pnpdepth_cli.sensors import point_cloud
 
-_IN_MEMORY = 12  # depth maps of neighbouring views that are kept, with their points
+_IN_MEMORY = 12
+"""Depth maps of neighbouring views that are kept, with their points."""
 
 
 def write_depth_cloud(
@@ -134,6 +135,7 @@ def _parts(
 ) -> Iterator[point_cloud.PointCloud]:
     """Yields the clouds of all depth maps in the world. Raises InputError if there is no point."""
 
+    # A depth map is read once, though several views around it need it.
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def depth_and_camera(index: int) -> tuple[NDArray[np.float32], Camera]:
         depth = _depth(request, frames[index], notes)
@@ -146,6 +148,7 @@ def _parts(
         depth, camera = depth_and_camera(index)
         return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
 
+    # Pixels on which enough views agree, as coloured points.
     empty = True
     for index, frame in enumerate(frames):
         show(index, len(frames))
@@ -155,9 +158,9 @@ def _parts(
             depth = point_cloud.consistent_depth(view(index), map(view, near), request.min_views)
         image = request.image or frame.image
         rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
-        for part in point_cloud.cloud_from_depth(depth, camera, rgb):
-            empty &= not len(part.xyz)
-            yield part.transform(poses[index])
+        for cloud in point_cloud.cloud_from_depth(depth, camera, rgb):
+            empty &= not len(cloud.xyz)
+            yield cloud.transform(poses[index])
     if empty:
         raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
 

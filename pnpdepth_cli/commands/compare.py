@@ -40,13 +40,18 @@ Means = dict[str, float | None]
 Rows = list[list[int | float | None]]
 """The values of a frame a row."""
 ALPHA = 0.05
+"""Adjusted p below which a difference counts."""
 _SUMMARY = "summary.json"
-_PAPER = EvalRequest(prediction=Path(), ground_truth=Path())  # as batches score
+_PAPER = EvalRequest(prediction=Path(), ground_truth=Path())
+"""How batches score."""
 _STARS = (0.05, 0.01, 0.001)
+"""p below which a cell has one, two, three stars."""
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
 _SIDE_INCHES = 3.2
-_SEED = "seed"  # an option whose values are draws of the same
+"""Side of a panel of a plot."""
+_SEED = "seed"
+"""An option whose values are draws of the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +72,7 @@ class Run:
     def rows(self, names: Sequence[str], keys: Sequence[str], stage: str = AFTER) -> Rows:
         """Returns the values of a stage with these keys for each frame; None for what it lacks."""
         scores = (self.frames[name].errors[GT].get(stage, {}) for name in names)
-        return [[*map(own.get, keys)] for own in scores]
+        return [[of_frame.get(key) for key in keys] for of_frame in scores]
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,8 @@ class Gain:
     """The same by the number of tests, of all measures and runs."""
 
 
-_OF_GAIN = [each.name for each in fields(Gain)]
+_OF_GAIN = [declared.name for declared in fields(Gain)]
+"""The columns of a gain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +149,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
             no frame in common.
     """
     if len(paths) < 2:
-        raise UsageError("two runs at least are needed to compare")
+        raise UsageError("two runs at least are needed to compare; name another one")
     runs = [_read_run(path) for path in paths]
     names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
@@ -207,17 +213,23 @@ def _shared(
     first = runs[0]
     for run in runs[1:]:
         for rule in sorted({*first.scoring, *run.scoring}):
-            own, others = first.scoring.get(rule), run.scoring.get(rule)
-            if own != others:
-                fact = f"were scored by different rules ({rule} {own} and {others})"
-                raise InputError(f"{first.path} and {run.path} {fact}; score both by one protocol")
+            value = first.scoring.get(rule)
+            another = run.scoring.get(rule)
+            if value != another:
+                raise InputError(
+                    f"{first.path} and {run.path} were scored by different rules ({rule} {value}"
+                    f" and {another}); score both by one protocol"
+                )
     names = tuple(name for name in first.frames if all(name in run.frames for run in runs))
     if not names:
-        own, other = (some_names(run.frames) for run in (first, runs[-1]))
-        raise InputError(f"the runs have no scored frame in common: {own}; and {other}")
+        raise InputError(
+            f"the runs have no scored frame in common: {some_names(first.frames)}; and"
+            f" {some_names(runs[-1].frames)}; compare runs on the same frames"
+        )
     shared = set.intersection(*({measure.key for measure in run.measures} for run in runs))
     every = [measure for measure in first.measures if measure.key in shared]
-    return names, choose_measures(every, columns or [each.key for each in every if each.main])
+    main = [measure.key for measure in every if measure.main]
+    return names, choose_measures(every, columns or main)
 
 
 def _gains(
@@ -227,18 +239,27 @@ def _gains(
     clusters: Clusters,
 ) -> Iterator[dict[str, Gain]]:
     """The gains of each run but the first by measure, of values (runs, frames, measures)."""
-    first, *others = values.transpose(0, 2, 1)
+    # p of each run and measure, and the same adjusted for all of these tests.
+    reference, *others = values.transpose(0, 2, 1)
     swap = functools.partial(statistics.swap_p_value, clusters=clusters)
-    p_values = np.array([[*map(swap, first, other)] for other in others])
+    p_values = np.array([[*map(swap, reference, of_run)] for of_run in others])
     adjusted = statistics.holm(p_values)
-    for run, other in enumerate(others):
+    # The gains, with their intervals.
+    for run, of_run in enumerate(others):
         gains = {}
         for place, measure in enumerate(measures):
             change = functools.partial(statistics.gain, sign=measure.sign)
-            before, after = np.array([means[each][measure.key] for each in (0, run + 1)], float)
-            ends = statistics.interval(change, (first[place], other[place]), clusters)
-            ps = float(p_values[run, place]), float(adjusted[run, place])
-            gains[measure.key] = Gain(float(change(before, after)), *ends, *ps)
+            before, after = np.array(
+                [means[0][measure.key], means[run + 1][measure.key]], float
+            )  # None becomes NaN
+            low, high = statistics.interval(change, (reference[place], of_run[place]), clusters)
+            gains[measure.key] = Gain(
+                percent=float(change(before, after)),
+                low_percent=low,
+                high_percent=high,
+                p_value=float(p_values[run, place]),
+                p_adjusted=float(adjusted[run, place]),
+            )
         yield gains
 
 
@@ -247,33 +268,46 @@ def _notes(runs: Sequence[Run], found: Comparison, known: NDArray[np.bool_]) -> 
     # Frames, pixels and measures that not all runs have.
     for run in runs:
         if unshared := [name for name in run.frames if name not in found.frames]:
-            fact = f"{count_of(len(unshared), 'frame')} of {run.path} not scored in all runs"
-            yield f"warning: {fact}, left out: {some_names(unshared)}"
+            yield (
+                f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
+                f" left out: {some_names(unshared)}"
+            )
     pixels = zip(*(run.rows(found.frames, ["pixels"]) for run in runs), strict=True)
-    if others := sum(any(own != each[0] for own in each) for each in pixels):
+    unequal = sum(any(count != counts[0] for count in counts) for counts in pixels)
+    if unequal:
         shares = ", ".join(COVERAGE.text(run.coverage) for run in found.runs)
-        fact = f"with other numbers of scored pixels in the runs (coverage: {shares})"
-        why = "a run that leaves hard pixels empty looks better; this is no ranking"
-        yield f"warning: {count_of(others, 'frame')} {fact}, and {why}"
+        yield (
+            f"warning: {count_of(unequal, 'frame')} with other numbers of scored pixels in the runs"
+            f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
+            " no ranking"
+        )
     for measure, has in zip(found.measures, known.T, strict=True):
         if not has.all():
-            of = f"{has.sum():,} of {len(has):,} frames"
-            yield f"{measure.title}: over {of}; the others lack it in a run"
+            yield (
+                f"{measure.title}: over {has.sum():,} of {len(has):,} frames; the others lack it in"
+                " a run"
+            )
     # The frames that count as independent.
     yield from found.clusters.notes()
-    smallest, tests = 2.0 ** (1 - found.clusters.count), len(found.measures) * (len(runs) - 1)
+    # Each cluster can be swapped or not; swapping all is swapping none.
+    smallest = 2.0 ** (1 - found.clusters.count)
+    tests = len(found.measures) * (len(runs) - 1)
     if len(known) > 1 and tests * smallest >= ALPHA:
-        least = f"p is at least {smallest:.2g}, adjusted {min(1.0, tests * smallest):.2g}"
-        few = f"{found.clusters.text} are too few independent ones"
-        yield f"warning: {few} to conclude anything from {tests} tests: {least}"
+        yield (
+            f"warning: {found.clusters.text} are too few independent ones to conclude anything from"
+            f" {tests} tests: p is at least {smallest:.2g}, adjusted"
+            f" {min(1.0, tests * smallest):.2g}"
+        )
 
 
 def _read_run(text: str) -> Run:
     """The run in a file, or in the summary of a batch's folder."""
     # The file, and which side of the refinement.
-    path, stage = Path(text), AFTER
+    path = Path(text)
+    stage = AFTER
     if text.endswith(f":{BEFORE}") and not path.exists():
-        path, stage = Path(text.removesuffix(f":{BEFORE}")), BEFORE
+        path = Path(text.removesuffix(f":{BEFORE}"))
+        stage = BEFORE
     path = path / _SUMMARY if path.is_dir() else path
     name = Path(os.path.realpath(path)).parent.name if path.name == _SUMMARY else path.stem
     content = read_json(path)
@@ -288,18 +322,19 @@ def _read_run(text: str) -> Run:
         return Run(
             name=f"{name}:before" if stage == BEFORE else name,
             path=text,
-            measures=[m for m in measures if all(m.key in own for own in scores)],
+            measures=[m for m in measures if all(m.key in of_frame for of_frame in scores)],
             scoring=dict(content.get("scoring") or _PAPER.scoring),
             frames={
-                frame.name: replace(frame, errors={GT: frame.errors[GT] | {AFTER: own}})
-                for frame, own in zip(scored, scores, strict=True)
+                frame.name: replace(frame, errors={GT: frame.errors[GT] | {AFTER: of_frame}})
+                for frame, of_frame in zip(scored, scores, strict=True)
             },
             varied={str(key): str(value) for key, value in content.get("varied", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        why = f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))})"
-        hint = "give what eval --json printed, or the summary of a batch with ground truth"
-        raise InputError(f"{why}; {hint}") from error
+        raise InputError(
+            f"{path} does not hold scores as pnpdepth writes them ({one_line(repr(error))}); give"
+            " what eval --json printed, or the summary of a batch with ground truth"
+        ) from error
 
 
 def _read_measure(entry: Mapping[str, Any]) -> Measure:
@@ -317,7 +352,7 @@ def comparison_table(comparison: Comparison) -> Table:
         for run in comparison.runs:
             row = [measure.heading, run.name, measure.text(run.mean[measure.key])]
             if not run.gains:
-                rows.append([*row, *"––––"])
+                rows.append([*row, "–", "–", "–", "–"])
                 continue
             found = run.gains[measure.key]
             percents = (found.percent, found.low_percent, found.high_percent)
@@ -362,9 +397,10 @@ def methods_table(comparison: Comparison) -> Table:
         best = measure.text(pick((mean for mean in means if mean is not None), default=None))
         for row, run, mean in zip(rows, runs, means, strict=True):
             p = run.gains[measure.key].p_adjusted if run.gains else math.nan
-            text, is_known = measure.text(mean), mean is not None and measure.sign != 0
+            text = measure.text(mean)
+            is_best = mean is not None and measure.sign != 0 and text == best
             stars = "*" * sum(p < limit for limit in _STARS)
-            row.append((text + stars, "bold" if is_known and text == best else ""))
+            row.append((text + stars, "bold" if is_best else ""))
     best = f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold"
     marks = f"*, **, ***: differs from {comparison.reference.name} with p < 0.05, 0.01, 0.001"
     return Table(
@@ -375,10 +411,14 @@ def methods_table(comparison: Comparison) -> Table:
 
 
 def _describe_tests(comparison: Comparison) -> str:
-    others, measures = len(comparison.runs) - 1, len(comparison.measures)
-    tests = count_of(measures, "measure") + (f" of {others} runs" if others > 1 else "")
-    tested = f"over {comparison.clusters.text}, p adjusted for {tests} (Holm)"
-    return tested + WITHOUT_SPARSE * bool(comparison.scoring.get("exclude_sparse"))
+    others = len(comparison.runs) - 1
+    tests = count_of(len(comparison.measures), "measure")
+    if others > 1:
+        tests += f" of {others} runs"
+    text = f"over {comparison.clusters.text}, p adjusted for {tests} (Holm)"
+    if comparison.scoring.get("exclude_sparse"):
+        text += WITHOUT_SPARSE
+    return text
 
 
 def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = False) -> None:
@@ -401,45 +441,61 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
         from matplotlib.figure import Figure
     except ImportError:
         raise UsageError("--plot needs matplotlib: pip install 'pnpdepth[plot]'") from None
-    # where each value lies, and the runs of each line in this order
     across, positions = _axis(comparison.runs)
-    lines = defaultdict[str, dict[float, list[ComparedRun]]](dict)
-    names = [*dict.fromkeys(_labels(run, across) for run in comparison.runs)]
-    full = max(map(len, names))
-    for run in sorted(comparison.runs, key=lambda run: positions[run.varied[across]]):
-        # A run without an option, as it has no effect there, is a point of each of its lines.
-        own = {*_labels(run, across)}
-        for labels in names:
-            if len(labels) == full and own <= {*labels}:
-                lines[", ".join(labels)].setdefault(positions[run.varied[across]], []).append(run)
-    # a column of two panels for each measure
+    lines = _lines(comparison.runs, across, positions)
+    # A column of two panels for each measure.
     measures = comparison.measures
-    size = _SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES
+    size = (_SIDE_INCHES * len(measures) + 1, 2 * _SIDE_INCHES)
     with mpl.rc_context({"svg.hashsalt": "pnpdepth", "font.size": 8, "axes.grid": True}):
         figure = Figure(size, layout="constrained", dpi=150)
         panels = figure.subplots(2, len(measures), squeeze=False, sharex=True)
         for measure, above, below in zip(measures, *panels, strict=True):
             for number, (label, line) in enumerate(lines.items()):
-                x, key = [*line], measure.key
-                means = [
-                    np.mean(np.array([[run.before[key], run.mean[key]] for run in runs], float), 0)
-                    for runs in line.values()
-                ]  # None becomes NaN
-                before, after = np.array(means).T * measure.shown_factor
+                before, after = _along(line, measure)
                 improved = statistics.gain(before, after, measure.sign)
-                above.plot(x, before, f"C{number}--", linewidth=0.8)
-                above.plot(x, after, f"C{number}o-", label=label or "after refinement")
-                below.plot(x, improved, f"C{number}o-")
+                above.plot([*line], before, f"C{number}--", linewidth=0.8)
+                above.plot([*line], after, f"C{number}o-", label=label or "after refinement")
+                below.plot([*line], improved, f"C{number}o-")
             above.set_ylabel(measure.heading)
             below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=across)
             below.set_xscale("log" if min(positions.values()) > 0 else "linear")
             below.set_xticks([*positions.values()], [*positions])
             below.set_xticks([], minor=True)
+        # One legend for all.
         panels[0][0].plot([], "k--", linewidth=0.8, label="before refinement")
         figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center")
         with atomic_path(path) as temporary:
             metadata = {_CHANGING[path.suffix]: None}
             figure.savefig(temporary, format=path.suffix[1:], metadata=metadata)
+
+
+Line = dict[float, list[ComparedRun]]
+"""The runs of a line by where they lie along the axis, in order; several differ in their seed."""
+
+
+def _lines(
+    runs: Sequence[ComparedRun], across: str, positions: Mapping[str, float]
+) -> dict[str, Line]:
+    """The lines of a plot by their label: one for each combination of the other options."""
+    names = [*dict.fromkeys(_labels(run, across) for run in runs)]
+    full = max(map(len, names))
+    lines = defaultdict[str, Line](dict)
+    for run in sorted(runs, key=lambda run: positions[run.varied[across]]):
+        # A run without an option, as it has no effect there, is a point of each of its lines.
+        stated = {*_labels(run, across)}
+        for labels in names:
+            if len(labels) == full and stated <= {*labels}:
+                lines[", ".join(labels)].setdefault(positions[run.varied[across]], []).append(run)
+    return lines
+
+
+def _along(line: Line, measure: Measure) -> NDArray[np.float64]:
+    """(2, points) the means before and after refinement, in the unit of tables; NaN if unknown."""
+    means = []
+    for runs in line.values():
+        pairs = [[run.before[measure.key], run.mean[measure.key]] for run in runs]
+        means.append(np.mean(np.array(pairs, float), axis=0))  # None becomes NaN
+    return np.array(means).T * measure.shown_factor
 
 
 def _axis(runs: Sequence[ComparedRun]) -> tuple[str, dict[str, float]]:

@@ -75,8 +75,10 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
     record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
     # What the program needs must be in the record.
     if camera is None:
-        hint = "refine it with a COLMAP model or --calib"
-        raise InputError(f"{result.depth} lacks a record with its camera; {hint}")
+        raise InputError(
+            f"{result.depth} lacks a record with its camera; refine it with a COLMAP model or"
+            " --calib"
+        )
     if image is None:
         raise InputError(f"{result.depth} lacks its image: {result.lost_image}")
     if export.needs_pose and pose is None:
@@ -91,8 +93,10 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         raise InputError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
     if isinstance(image, Path) and size not in sizes_of(image):
-        hint = "refine the whole image (--protocol whole)"
-        raise InputError(f"{result.depth} is not of the size of {image}; {hint}")
+        raise InputError(
+            f"{result.depth} is not of the size of {image}; refine the whole image (--protocol"
+            " whole)"
+        )
     path = output / "images" / name
     folder = Path(os.path.realpath(output))
     if isinstance(image, Path) and Path(os.path.realpath(image)).is_relative_to(folder):

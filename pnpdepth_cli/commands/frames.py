@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +57,17 @@ _FOLDERS = {
 """Names of the files that are written to each folder; any other file there is the user's."""
 _CALIBRATION = "calib.txt"
 _COMPARED_FRAMES = 5
-_LONGEST_GAP_S = 0.5  # longest time between two poses that one is interpolated from
-_DELAYS = 20  # messages of each topic, from the first, whose delay is measured
-_SLOWEST_S = 1.0  # a larger difference of delays is that of two clocks
-_REGISTERED = re.compile("aligned|registered")  # in topics of registered depth
-_SAME_K = 0.05  # relative difference of intrinsics of one camera that was calibrated twice
+"""Frames whose edges tell whether the images are rectified."""
+_LONGEST_GAP_S = 0.5
+"""Longest time between two poses that one is interpolated from."""
+_DELAYS = 20
+"""Messages of each topic, from the first, whose delay is measured."""
+_SLOWEST_S = 1.0
+"""A larger difference of delays is that of two clocks."""
+_REGISTERED = re.compile("aligned|registered")
+"""In topics of registered depth."""
+_SAME_K = 0.05
+"""Relative difference of intrinsics of one camera that was calibrated twice."""
 
 Say = Callable[[str], None]
 
@@ -156,7 +163,8 @@ def has_frames(request: FramesRequest) -> bool:
     path = request.output / RECORD
     if not path.is_file():
         return False
-    identity, record = plain(_identity(request) | {"complete": True}), read_json(path)
+    identity = plain(_identity(request) | {"complete": True})
+    record = read_json(path)
     return all(record.get(name) == value for name, value in identity.items())
 
 
@@ -193,18 +201,30 @@ def _written(folder: Path, name: str) -> list[Path]:
     return sorted(p for p in (folder / name).iterdir() if _FOLDERS[name].fullmatch(p.name))
 
 
-def _write_pairs(
-    request: FramesRequest, bag: Bag, sensors: Sensors, offset: float
-) -> tuple[list[float], int, Counter[str]]:
-    """Writes images with their scans; returns times, images without a scan, dropped points.
+class _Pairs(NamedTuple):
+    """What was written of a bag."""
+
+    times: list[float]
+    """Seconds, of each image that was written with its scan."""
+    lost: int
+    """Number of images without a scan."""
+    dropped: Counter[str]
+    """Numbers of points that were dropped, by the reason."""
+
+
+def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset: float) -> _Pairs:
+    """Writes images with their scans.
 
     The files are rgb/NAME and sparse/NAME; the name is the image's time.
     """
-    lost, times, dropped = 0, list[float](), Counter[str]()
+    lost = 0
+    times = list[float]()
+    dropped = Counter[str]()
     first, last = request.between or (0, math.inf)
     numbers = itertools.count()
     pairs = messages.nearest_pairs(stream(bag, sensors, offset), request.tolerance)
     for time_s, image, scan in pairs:
+        # Pairs are counted, of which the user may want some.
         if scan is None:
             lost += 1
             continue
@@ -219,6 +239,7 @@ def _write_pairs(
             continue
         dropped.update(counts)
         times.append(time_s)
+        # The image as it is in the bag, and its depth map or cloud.
         name = f"{time_s:.6f}".replace(".", "_")
         suffix, data = messages.image_file(image, sensors.images)
         with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
@@ -228,7 +249,7 @@ def _write_pairs(
             write_depth(sparse.with_suffix(".exr"), values)
         else:
             write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
-    return times, lost, dropped
+    return _Pairs(times, lost, dropped)
 
 
 def _write_calibration(
@@ -236,12 +257,15 @@ def _write_calibration(
 ) -> tuple[str, bool]:
     """Writes calib.txt if there is a calibration; returns the camera's frame_id, and whether."""
     # The camera, from camera_info.
-    topics = sensors.images, sensors.points
-    camera, points = (messages.frame_of(next(bag.messages([each]))[2]) for each in topics)
+    camera, points = (
+        messages.frame_of(next(bag.messages([topic]))[2])
+        for topic in (sensors.images, sensors.points)
+    )
     if (of_bag := messages.camera_of_bag(bag, sensors.images)) is None:
         say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
         return camera, False
-    calibration, camera = of_bag[0], of_bag[1] or camera
+    calibration, named = of_bag
+    camera = named or camera
     source = calibration.camera.source
     # The pose of the scanner, from static transforms.
     if (scanner := messages.static_pose(bag, camera, points)) is not None:
@@ -266,7 +290,8 @@ def _write_calibration(
 
 def _some_frames(folder: Path) -> Iterator[tuple[NDArray[np.float32], NDArray[np.floating]]]:
     """Yields the image and the points of a few frames."""
-    scans, images = _written(folder, "sparse"), _written(folder, "rgb")
+    scans = _written(folder, "sparse")
+    images = _written(folder, "rgb")
     step = math.ceil(len(scans) / _COMPARED_FRAMES)
     for image, scan in zip(images[::step], scans[::step], strict=True):
         yield read_rgb(image).values, read_scan(scan)[0]
@@ -286,6 +311,7 @@ def _write_poses(
     request: FramesRequest, bag: Bag, camera: str, times: Sequence[float], say: Say
 ) -> str | None:
     """Writes poses.txt if the bag has a pose for every frame; returns the topic, else None."""
+    # The one topic, and its trajectory of the camera.
     topics = messages.poses_topics(bag, request.topics)
     if len(topics) != 1:
         if topics:
@@ -296,6 +322,7 @@ def _write_poses(
     if trajectory is None:
         say(f"warning: no transforms tie the camera's frame {camera} to the poses of {topic}")
         return None
+    # A row for each frame: time, place and turn, as TUM has them.
     rows = list[str]()
     for time_s in times:
         if (pose := trajectory.at(time_s, _LONGEST_GAP_S)) is not None:
@@ -334,7 +361,9 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     """
     # Topics of images hold colours or depth, which the first message tells.
     topics = bag.topics(IMAGES)
-    first = {n: each[2] for n in topics for each in itertools.islice(bag.messages([n]), 1)}
+    first = {
+        name: found[2] for name in topics for found in itertools.islice(bag.messages([name]), 1)
+    }
     depths = {n: topics[n] for n, message in first.items() if messages.is_depth(message, n)}
     if not set(wanted) & set(depths) and len(first) > 1:
         # grey images of 16 bits beside others: named by the user, or nothing else gives points
@@ -346,7 +375,8 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
             say(f"topics: {name}, grey images of 16 bits, is taken for depth")
     colours = {name: topics[name] for name in first if name not in depths}
     # Points are clouds, unless depth images are named or alone.
-    images, clouds = choose_topic(bag, wanted, colours, "images"), bag.topics(CLOUDS)
+    images = choose_topic(bag, wanted, colours, "images")
+    clouds = bag.topics(CLOUDS)
     if not depths or (clouds and not set(wanted) & set(depths)):
         points = choose_topic(bag, wanted, clouds, f"points ({CLOUDS[0]} or depth images)")
         return Sensors(images=images, points=points)
@@ -357,8 +387,8 @@ def sensors_of(bag: Bag, wanted: Sequence[str], say: Say) -> Sensors:
     points = choose_topic(bag, wanted, usable, "depth images")
     same = Sensors(images=images, points=points, is_map=True)
     # They may be of a camera of their own.
-    found = messages.camera_of_bag(bag, images), messages.camera_of_bag(bag, points)
-    of_images, of_depth = (None if each is None else each[0].camera for each in found)
+    found = [messages.camera_of_bag(bag, topic) for topic in (images, points)]
+    of_images, of_depth = (None if of_bag is None else of_bag[0].camera for of_bag in found)
     if of_depth is None:
         _say_unregistered(points, points in registered, say)
         return same

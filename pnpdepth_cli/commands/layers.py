@@ -60,6 +60,7 @@ def list_layers(
         UsageError: The definition lists no layers.
         ModelError, DeviceError: As in loading.
     """
+    # The layers to measure.
     network = load_network(model, checkpoint)
     submodules = [name for name, _ in network.module.named_modules() if name]
     names = submodules if every else list(network.definition.layers)
@@ -67,7 +68,9 @@ def list_layers(
         raise errors.UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
-    frame, measured = FrameMap.fit(network.definition.size, *_SYNTHETIC_SIZE), []
+    # What a whole pass costs, then what lies behind each cut.
+    frame = FrameMap.fit(network.definition.size, *_SYNTHETIC_SIZE)
+    measured = []
     with errors.out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:

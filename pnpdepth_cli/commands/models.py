@@ -29,7 +29,8 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting needs no memory.
     with errors.wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
-    defaults, path = definition.defaults.closed(), definition.checkpoint
+    defaults = definition.defaults.closed()
+    path = definition.checkpoint
     stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
         **{key: getattr(definition, key) for key in stated},
@@ -75,6 +76,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         DeviceError: The device is missing or too small.
         InputError: The image cannot be read.
     """
+    # The network, and a frame for it.
     network = load_network(model, checkpoint)
     definition = network.definition
     rgb = None
@@ -87,6 +89,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         notes = [*network.notes, *network.verify(arguments)]
         if "rgb" in definition.input_kind and definition.normalisation is None:
             notes.append("input: rgb range 'unit' is assumed; --normalise of refine states one")
+        # One pass, and one with a cut at each layer.
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
         known = raw[raw.isfinite()]

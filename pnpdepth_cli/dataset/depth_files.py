@@ -13,8 +13,10 @@ from pnpdepth_cli.io.depth import metres, write_depth
 from pnpdepth_cli.io.formats import KITTI_SCALE, LARGEST_CODE, format_of_suffix
 from pnpdepth_cli.points import SparsePoints
 
-_BEYOND_POINTS = 1.5  # depths up to this multiple of the farthest point fit
-_LEAST_CODES = 25.6  # of the nearest point: 2 % of rounding
+_BEYOND_POINTS = 1.5
+"""Depths up to this multiple of the farthest point fit the codes of a file."""
+_LEAST_CODES = 25.6
+"""Codes of the nearest point, at least: 2 % of rounding."""
 
 
 def integer_scale(points: SparsePoints, stated: float | None = None) -> float:
@@ -29,7 +31,8 @@ def integer_scale(points: SparsePoints, stated: float | None = None) -> float:
     """
     if stated is not None:
         return stated
-    nearest, farthest = float(points.depth.min()), float(points.depth.max())
+    nearest = float(points.depth.min())
+    farthest = float(points.depth.max())
     finest = LARGEST_CODE / (_BEYOND_POINTS * farthest)
     if finest < KITTI_SCALE:
         return _power_of_ten(finest)
@@ -53,10 +56,10 @@ def within_range(frame: Refined, path: Path, scale: float) -> Refined:
     clipped = known & ((frame.depth > farthest) | (frame.depth < 0.5 / scale))
     if not clipped.any():
         return frame
-    limits = f"{metres(float(nearest))}–{metres(float(farthest))} m"
     note = (
-        f"warning: {int(clipped.sum()):,} of {clipped.size:,} pixels clipped to {limits}, what a"
-        f" 16-bit PNG with {scale:g} codes per metre holds; EXR and NPY hold every depth"
+        f"warning: {int(clipped.sum()):,} of {clipped.size:,} pixels clipped to"
+        f" {metres(float(nearest))}–{metres(float(farthest))} m, what a 16-bit PNG with {scale:g}"
+        " codes per metre holds; EXR and NPY hold every depth"
     )
     after = np.where(clipped, np.clip(frame.depth, nearest, farthest), frame.depth)
     return replace(frame, depth=after, notes=(*frame.notes, note))

@@ -155,10 +155,13 @@ def _errors_of(refined: Refined, frame: ReadFrame, *, with_baselines: bool) -> d
                 if name != LINEAR:
                     yield name, BASELINES[name](points, before)
 
-    errors, validation = dict[str, Stages](), refined.validation
+    errors = dict[str, Stages]()
+    validation = refined.validation
     held_out = frame.held_out
-    before, after = torch.from_numpy(refined.before), torch.from_numpy(refined.depth)
-    maps, beside = {BEFORE: before, AFTER: after}, dict[str, Tensor]()
+    before = torch.from_numpy(refined.before)
+    after = torch.from_numpy(refined.depth)
+    maps = {BEFORE: before, AFTER: after}
+    beside = dict[str, Tensor]()
     if frame.gt is not None or len(held_out):
         beside[LINEAR] = linear(frame.points)
     # Against the truth, all others are scored on the pixels where the result is known.
@@ -190,8 +193,11 @@ def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
     for name, depth in maps.items():
         error = (points.sample(depth) - points.depth)[points.known_in(depth)].double()
         if len(error):
-            mae, rmse = float(error.abs().mean()), float(error.square().mean().sqrt())
-            stages[name] = {"mae": mae, "rmse": rmse, "points": len(error)}
+            stages[name] = {
+                "mae": float(error.abs().mean()),
+                "rmse": float(error.square().mean().sqrt()),
+                "points": len(error),
+            }
     return stages if AFTER in stages and BEFORE in stages else {}
 
 

@@ -19,6 +19,7 @@ from pnpdepth_cli.commands.shared.results import ResultFrame
 from pnpdepth_cli.dataset.arrays import image_of_size, read_image
 from pnpdepth_cli.dataset.frame_files import ImageSource
 from pnpdepth_cli.dataset.frame_record import Pose
+from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.sensors.point_cloud import PointCloud, cloud_from_depth
 
@@ -67,14 +68,21 @@ class ExportFrame:
                 pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
                 Image.fromarray(pixels).save(temporary, "PNG")
 
+    def placed(self) -> Pose:
+        """Returns the pose. Raises InputError if it is unknown."""
+        if self.pose is None:
+            raise InputError(
+                f"{self.result.depth} lacks a pose in its record; `batch --poses` gives it"
+            )
+        return self.pose
+
     def start_points(self, frames: int) -> PointCloud:
         """Returns the frame's share of the points to begin with, in the world's coordinates."""
-        assert self.pose is not None
         rgb = image_of_size(self.image, self.size)
-        parts = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
-        step = max(1, sum(len(part.xyz) for part in parts) * frames // _START_POINTS)
-        columns = (np.concatenate(column)[::step] for column in zip(*parts, strict=True))
-        return PointCloud(*columns).transform(self.pose)
+        clouds = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
+        step = max(1, sum(len(cloud.xyz) for cloud in clouds) * frames // _START_POINTS)
+        columns = (np.concatenate(column)[::step] for column in zip(*clouds, strict=True))
+        return PointCloud(*columns).transform(self.placed())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +106,8 @@ def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
     count = sum(frame.camera.has_lens for frame in frames)
     if not count:
         return []
-    fact = f"{count:,} of {len(frames):,} images have lens distortion, and so has their depth"
-    hint = "run COLMAP's image_undistorter and refine its output"
-    return [f"warning: {fact}; {taker} takes undistorted ones: {hint}"]
+    return [
+        f"warning: {count:,} of {len(frames):,} images have lens distortion, and so has their"
+        f" depth; {taker} takes undistorted ones: run COLMAP's image_undistorter and refine its"
+        " output"
+    ]

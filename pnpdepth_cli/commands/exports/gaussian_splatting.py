@@ -47,7 +47,7 @@ def _model(folder: Path) -> Path:
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     names = [_PARAMETERS]
     if _needs_model(folder, frames):
-        names += [f"{part}.txt" for part in MODEL_PARTS]
+        names += [f"{name}.txt" for name in MODEL_PARTS]
     depths = (_depth_image(folder, frame) for frame in frames)
     return [*depths, *(_model(folder) / name for name in names)]
 
@@ -67,7 +67,8 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     if _needs_model(folder, frames):
         _write_model(_model(folder), frames)
     # Depth and image of each frame.
-    masked, clipped, largest = 0, 0, scale * LARGEST_CODE / _CODES
+    largest = scale * LARGEST_CODE / _CODES
+    masked = clipped = 0
     for frame in frames:
         inverse, valid = _inverse(frame)
         masked += int((~valid).sum())
@@ -87,8 +88,10 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
             depth = "0, which 3DGS reads as infinitely far"
         notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
     if not model_files(_model(folder)):
-        hint = "refine undistorted images with poses"
-        notes.append(f"warning: sparse/0 has no model, which 3DGS needs to train; {hint}")
+        notes.append(
+            "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"
+            " with poses"
+        )
     return [*notes, *distortion_note(frames, "3DGS")]
 
 
@@ -106,11 +109,11 @@ def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]
 
 def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
     """Writes cameras, poses, and points of the depth as text of COLMAP, in units of the model."""
-    lines = {part: [_OURS.decode()] for part in MODEL_PARTS}
+    lines = {name: [_OURS.decode()] for name in MODEL_PARTS}
     for number, frame in enumerate(frames, 1):
-        cloud, pose, unit = frame.start_points(len(frames)), frame.pose, frame.unit_scale
-        assert pose is not None
-        assert cloud.rgb is not None
+        cloud = frame.start_points(len(frames))
+        pose = frame.placed()
+        unit = frame.unit_scale
         (fx, _, cx), (_, fy, cy), _ = frame.camera.intrinsics
         height, width = frame.size
         # COLMAP counts pixels from the image's corner, and its poses lead to the camera
@@ -119,12 +122,13 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
         shift = " ".join(map(str, -pose[:, :3].T @ pose[:, 3] / unit))
         lines["cameras"].append(f"{number} PINHOLE {width} {height} {lens}\n")
         lines["images"].append(f"{number} {w} {x} {y} {z} {shift} {number} {frame.image_name}\n\n")
-        for point, (red, green, blue) in zip(cloud.xyz / unit, cloud.rgb, strict=True):
+        colours = () if cloud.rgb is None else cloud.rgb
+        for point, (red, green, blue) in zip(cloud.xyz / unit, colours, strict=True):
             place = " ".join(f"{value:.7g}" for value in point)
             index = len(lines["points3D"])
             lines["points3D"].append(f"{index} {place} {red} {green} {blue} 0\n")
-    for part, text in lines.items():
-        write_text(folder / f"{part}.txt", "".join(text))
+    for name, text in lines.items():
+        write_text(folder / f"{name}.txt", "".join(text))
 
 
 EXPORT = Export(needs_pose=False, files=_files, write=_write, copies_images=True)

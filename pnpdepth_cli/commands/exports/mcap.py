@@ -32,7 +32,8 @@ from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.point_cloud import cloud_from_depth
 
 _BAG = "results"
-_WORLD, _CAMERA = "world", "camera"
+_WORLD = "world"
+_CAMERA = "camera"
 _STEP_NS = 100_000_000
 """Time between frames whose names hold no time."""
 _TIME = re.compile(r"(?:^|[^\d._])(\d{1,10})[._](\d{6,9})$")
@@ -42,7 +43,8 @@ _LENSES = {
     "fisheye": (("equidistant", 4),),
 }
 """ROS' models of each lens, and how many coefficients they have."""
-_FLOAT32, _UINT32 = 7, 6  # of sensor_msgs/PointField
+_FLOAT32 = 7
+"""Of sensor_msgs/PointField."""
 
 _Fields = dict[str, Any]
 
@@ -111,9 +113,9 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
     points = _points_used(frame, notes)
     if points is not None:
         yield message("/camera/points_used", "sensor_msgs/msg/PointCloud2", _cloud(points))
-    parts = list(cloud_from_depth(depth, frame.camera, rgb))
-    xyz = np.concatenate([part.xyz for part in parts])
-    colours = np.concatenate([part.rgb for part in parts if part.rgb is not None])
+    clouds = list(cloud_from_depth(depth, frame.camera, rgb))
+    xyz = np.concatenate([cloud.xyz for cloud in clouds])
+    colours = np.concatenate([cloud.rgb for cloud in clouds if cloud.rgb is not None])
     yield message("/camera/cloud", "sensor_msgs/msg/PointCloud2", _cloud(xyz, colours))
 
 
@@ -132,8 +134,10 @@ def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
     models = _LENSES.get(camera.lens, ())
     model = next(((name, count) for name, count in models if len(given) <= count), None)
     if model is None:
-        fact = f"{camera.lens} with {len(given)} coefficients"
-        raise InputError(f"ROS knows no lens {fact}; refine undistorted images")
+        raise InputError(
+            f"ROS knows no lens {camera.lens} with {len(given)} coefficients; refine undistorted"
+            " images"
+        )
     name, count = model
     projection = np.column_stack([camera.intrinsics, np.zeros(3)])
     return {
@@ -191,17 +195,19 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
 
     None, with a note, where their files are gone or give other points.
     """
-    record, result = frame.result.record, frame.result.record.result
-    sparse = record.inputs.get("sparse")
+    sparse = frame.result.record.inputs.get("sparse")
+    result = frame.result.record.result
     if sparse is None or result is None:
         return None
     points = result.points
+    # The files and options that the record names.
     source = Path(sparse.path)
+    is_sampled = sparse.kind == "sampled"
     files = FrameFiles(
         name=frame.result.name,
         image=frame.image,
-        sparse=None if sparse.sampled else source,
-        gt=source if sparse.sampled else None,
+        sparse=None if is_sampled else source,
+        gt=source if is_sampled else None,
         sparse_scale=sparse.scale,
         gt_scale=sparse.scale,
         sparse_mask=None if sparse.mask is None else Path(sparse.mask),
@@ -223,7 +229,9 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
     except (PnpDepthError, ValueError) as error:
         notes.append(f"warning: {frame.result.name}: its points are left out: {error}")
         return None
-    used, ends = read.points, (float(read.own.depth.min()), float(read.own.depth.max()))
+    # They must be the points of the record: as many, from the same nearest to the same farthest.
+    used = read.points
+    ends = (float(read.own.depth.min()), float(read.own.depth.max()))
     wanted = points.used - (points.moved or 0)
     if len(used) != wanted or not np.allclose(ends, (points.nearest, points.farthest), rtol=1e-6):
         notes.append(

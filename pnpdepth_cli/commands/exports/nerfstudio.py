@@ -46,8 +46,10 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     # The program takes lenses of one kind.
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
-        fact = f"the cameras have lenses of several kinds ({', '.join(lenses)})"
-        raise InputError(f"{fact}, but Nerfstudio takes one; undistort the images first")
+        raise InputError(
+            f"the cameras have lenses of several kinds ({', '.join(lenses)}), but Nerfstudio takes"
+            " one; undistort the images first"
+        )
     # Units of a code: Nerfstudio's default, or as many as the farthest depth needs.
     farthest = max(float(frame.valid_depth().max()) for frame in frames)
     fitting = [factor for factor in _FACTORS if np.rint(farthest / factor) <= LARGEST_CODE]
@@ -84,17 +86,18 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
     """The frame's entry in transforms.json."""
     # The coefficients of the lens, if the program has all of them.
-    camera, pose = frame.camera, frame.pose
-    assert pose is not None
+    camera = frame.camera
     _, names = _LENSES[camera.lens]
     values = dict(zip(names, camera.distortion, strict=False))
     if any(camera.distortion[len(names) :]):
-        fact = f"{camera.lens} with {len(camera.distortion)} coefficients"
-        raise InputError(f"{frame.image}: Nerfstudio knows no lens {fact}; undistort images first")
+        raise InputError(
+            f"{frame.image}: Nerfstudio knows no lens {camera.lens} with"
+            f" {len(camera.distortion)} coefficients; undistort images first"
+        )
     image = os.path.relpath(os.path.realpath(frame.image_path), os.path.realpath(folder))
     # The pose, with Nerfstudio's axes: y up, z backwards.
     matrix = np.eye(4)
-    matrix[:3] = pose
+    matrix[:3] = frame.placed()
     matrix[:3, 1:3] *= -1
     # Principal points count from the image's corner.
     intrinsics = camera.intrinsics

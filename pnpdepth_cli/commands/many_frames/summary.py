@@ -74,6 +74,7 @@ def write_summary(
         settings: What decides the results.
         records: The records of the frames that are done or failed.
     """
+    # Frames that failed are counted, and have no part in means.
     refined = [record for record in records if record.status != "failed"]
     results = [record.result for record in refined if record.result is not None]
     weights = _weights_of(results)
@@ -94,6 +95,7 @@ def write_summary(
         unmatched=[*found.unmatched],
         varied=dict(request.varied),
     )
+    # The files, with all records.
     frames = [record.to_json() for record in records]
     write_json(request.output / JSON, {**asdict(summary), "frames": frames})
     write_text(request.output / CSV, _table(summary, records).csv())

@@ -37,7 +37,8 @@ from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
 
-_MUCH = 0.1  # part of an image outside of the points from which it is said
+_MUCH = 0.1
+"""Fraction of an image outside of the points above which a note says so."""
 
 LARGEST_VIEW = 200_000
 """Most points of a 3D view, but for what its borders round."""
@@ -57,7 +58,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     sources = [files.image, files.sparse, *files.depths, files.gt, request.reading.scan.calib]
     inputs = [path for path in sources if isinstance(path, Path)]
     output = request.output or Path(f"{inputs[0].stem}_refined")
-    suffix, formats = output.suffix.lower(), " ".join(DEPTH_SUFFIXES)
+    suffix = output.suffix.lower()
+    formats = " ".join(DEPTH_SUFFIXES)
     # A depth file alone, or all files in a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.uncertainty:
@@ -99,10 +101,13 @@ def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -
     if frame.valid is not None or not is_scan:
         return frame
     outside = 1 - float(in_hull(frame.used).double().mean())
-    fact = f"{100 * outside:.0f} % of the pixels lie outside of the scan's points"
-    hint = "their depth is a guess; --unknown zero writes 0 where points do not support it"
-    note = f"note: {fact}, and {hint}"
-    return replace(frame, notes=(*frame.notes, note)) if outside > _MUCH else frame
+    if outside <= _MUCH:
+        return frame
+    note = (
+        f"note: {100 * outside:.0f} % of the pixels lie outside of the scan's points, and their"
+        " depth is a guess; --unknown zero writes 0 where points do not support it"
+    )
+    return replace(frame, notes=(*frame.notes, note))
 
 
 def write_outputs(
@@ -129,25 +134,28 @@ def write_outputs(
     # Images for a person.
     figures = {}
     if "preview" in outputs:
-        xy, depth = inputs.own.xy.numpy(), inputs.own.depth.numpy()
+        xy = inputs.own.xy.numpy()
+        depth = inputs.own.depth.numpy()
         figures["preview"] = preview(
             image, xy, depth, frame.before, frame.depth, outputs["preview"], inputs.unit, made_by
         )
-    path, unit = outputs.get("improvement"), inputs.unit
+    path = outputs.get("improvement")
+    unit = inputs.unit
     if path is not None and inputs.gt is not None:
         figures["improvement"] = improvement(
             image, frame.before, frame.depth, inputs.gt, path, unit
         )
     elif path is not None and (points := _unseen_points(inputs, frame)) is not None:
         figures["improvement"] = improvement_at_points(image, points, inputs.size, path, unit)
-    if "view" in outputs:
-        _write_view(outputs["view"], inputs, frame)
+    if "view" in outputs and inputs.camera is not None:
+        _write_view(outputs["view"], inputs, frame, inputs.camera)
     return figures
 
 
 def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     """The held-out points, else the validation points, with the depths there; None without any."""
     held_out, validation = inputs.held_out, frame.validation
+    # Held-out points have no part in the result; validation points choose and weigh its experts.
     if len(held_out):
         maps = (
             torch.from_numpy(frame.before),
@@ -155,11 +163,13 @@ def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
             linear(inputs.points),
         )
         before, after, between = (held_out.sample(depth).numpy() for depth in maps)
-        points, what = held_out, "held-out points"
+        points = held_out
+        what = "held-out points"
     elif validation is not None and len(validation.points):
         stages = (BEFORE, AFTER, LINEAR)
         before, after, between = (validation.predicted[stage].numpy() for stage in stages)
-        points, what = validation.points, "validation points"
+        points = validation.points
+        what = "validation points"
     else:
         return None
     return PointErrors(
@@ -172,14 +182,13 @@ def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     )
 
 
-def _write_view(path: Path, inputs: ReadFrame, frame: Refined) -> None:
+def _write_view(path: Path, inputs: ReadFrame, frame: Refined, camera: Camera) -> None:
     """Writes the 3D view for a report: depths, the ground truth if known, colours and camera.
 
     Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than
     `LARGEST_VIEW` is thinned to every n-th row and column. In the JSON, depths are base64 of
     uint16, 0 = unknown, else logarithmic over `range`.
     """
-    assert inputs.camera is not None
     # Depths without the points between surfaces, on a grid of few enough pixels.
     height, width = inputs.size
     stride = math.ceil(math.sqrt(height * width / LARGEST_VIEW))
@@ -194,7 +203,7 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined) -> None:
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
     far = max(far, near * 1.001)
-    rays = _rays(inputs.camera, (height, width))
+    rays = _rays(camera, (height, width))
     write_json(
         path,
         {
@@ -204,7 +213,7 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined) -> None:
             "range": [near, far],
             "middle": float(np.median(known)) if len(known) else 1.0,
             "farthest": far,
-            "spacing": stride / float(inputs.camera.intrinsics[0, 0]),
+            "spacing": stride / float(camera.intrinsics[0, 0]),
             "unit": inputs.unit,
             "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
             "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},

@@ -69,11 +69,13 @@ def write_sparse_files(
         notes: Lines for a person.
         rgb: The image.
     """
+    # The points, and an image of them.
     make_folder(files["sparse"].parent)
     image = as_depth_image(points)
     write_sparse(files["sparse"], points.xy, points.depth, image)
     if rgb is not None:
         overlay(rgb, points.xy, points.depth, files["overlay"])
+    # The record.
     content = {
         "version": __version__,
         **settings,

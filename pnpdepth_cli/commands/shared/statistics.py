@@ -20,6 +20,7 @@ from pnpdepth_cli.commands.shared.tables import count_of
 Floats = NDArray[np.float64]
 
 LEVEL = 0.95
+"""Probability with which an interval holds the mean."""
 MIN_CLUSTERS = 5
 """Fewer give no interval: with lognormal errors (σ 0.5) even a corrected one misses too often."""
 BLOCK_BIAS = 0.1
@@ -57,8 +58,10 @@ class Clusters:
         """Returns that frames are not independent, unless each of them is a cluster."""
         if self.count == len(self.ids):
             return []
-        fact = f"{len(self.ids):,} frames count as {self.text}"
-        return [f"frames of one sequence are not independent: {fact}"]
+        return [
+            "frames of one sequence are not independent:"
+            f" {len(self.ids):,} frames count as {self.text}"
+        ]
 
 
 def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
@@ -71,7 +74,7 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
     number = {name: index for index, name in enumerate(dict.fromkeys(groups))}
     frames = len(groups)
     if 1 < len(number) < frames:
-        ids = np.array([number[own] for own in groups])
+        ids = np.array([number[name] for name in groups])
         return Clusters(ids=ids, text=f"{len(number):,} groups of frames")
     length = block_length(series) if len(number) == 1 else 1
     if length == 1:
@@ -150,14 +153,17 @@ def interval(
     from scipy import stats
 
     sums, counts = _sums(values, clusters)
-    size, whole, frames = len(counts), sums.sum(axis=1), counts.sum()
+    size = len(counts)
+    whole = sums.sum(axis=1)
+    frames = counts.sum()
     if size < MIN_CLUSTERS:
         return math.nan, math.nan
     value = float(statistic(*(whole / frames)))
     without = statistic(*((whole[:, None] - sums) / (frames - counts)))
     pseudo = size * value - (size - 1) * without
     # standard error of the mean, and its skewness, unless the pseudo-values are equal
-    error, skew = float(stats.sem(pseudo)), 0.0
+    error = float(stats.sem(pseudo))
+    skew = 0.0
     if error > 1e-8 * max(abs(value), 1.0):
         skew = float(stats.skew(pseudo, bias=False)) / math.sqrt(size)
     reach = float(stats.t.ppf((1 + LEVEL) / 2, size - 1))

@@ -50,9 +50,12 @@ _LATEX = str.maketrans(
         "…": r"\ldots{}", "σ": r"$\sigma$", "\n": " ",
     }
 )  # fmt: skip
-_NAMED = 5  # of a long list
-_SEPARATOR = re.compile(r"([_/\-])")  # of the parts of a frame's name
-_LEAST_SAVED = 8  # characters for which a name is shortened
+_NAMED = 5
+"""Names of a long list that are shown."""
+_SEPARATOR = re.compile(r"([_/\-])")
+"""Of the parts of a frame's name."""
+_LEAST_SAVED = 8
+"""Characters for which a name is shortened."""
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
@@ -94,7 +97,13 @@ class Table:
             f"% {' '.join(self.title.split())}",
             r"% needs \usepackage{booktabs}",
             rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
-            *(r"\toprule", header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", ""),
+            r"\toprule",
+            header,
+            r"\midrule",
+            *rows,
+            r"\bottomrule",
+            r"\end{tabular}",
+            "",
         )
         return "\n".join(lines)
 
@@ -120,7 +129,7 @@ def _in_latex(text: str, style: Style) -> str:
 
 def count_of(number: float, noun: str) -> str:
     """Returns a text such as `1 frame` or `2,000 frames`."""
-    return f"{number:,} {noun}{'s' * (number != 1)}"
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def some_names(names: Iterable[str]) -> str:
@@ -138,9 +147,11 @@ def short_names(names: Sequence[str]) -> list[str]:
     """
     parts = [_SEPARATOR.split(name) for name in names]
     start = _shared_parts(parts)
-    end = _shared_parts([own[:start:-1] for own in parts])
-    inner = ["".join(own[start : len(own) - end]) for own in parts]
-    short = [f"{'…' * (start > 0)}{text}{'…' * (end > 0)}" for text in inner]
+    end = _shared_parts([of_name[:start:-1] for of_name in parts])
+    before = "…" if start else ""
+    after = "…" if end else ""
+    inner = ["".join(of_name[start : len(of_name) - end]) for of_name in parts]
+    short = [f"{before}{text}{after}" for text in inner]
     if len(names) < 2 or len(short[0]) + _LEAST_SAVED > len(names[0]):
         return [*names]
     return [names[0], *short[1:]]
@@ -196,7 +207,8 @@ def _table(
     """A row for each stage in the order of the titles: its errors, also against linear ones."""
     shown = [stage for stage in titles if stage in by_stage]
     last = AFTER
-    scores, linear = by_stage[last], by_stage.get(LINEAR, {})
+    scores = by_stage[last]
+    linear = by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
     measures = [m for m in chosen if m.key in scores and (keys or m.main)]
     # How many pixels, points or frames they are of.
@@ -205,7 +217,7 @@ def _table(
         count = count_of(scores["frames"] or 0, "frame")
     elif "coverage" in scores:
         count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
-    remark = ", where a change proves nothing" * (basis == USED)
+    remark = ", where a change proves nothing" if basis == USED else ""
     # The rows.
     rows = []
     for stage in shown:
@@ -268,8 +280,8 @@ def weights_text(weights: Mapping[str, float]) -> str:
 def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
     """Returns mean and range of each expert's weight in the frames of a batch, as text."""
     return ", ".join(
-        f"{name} {each['mean']:.0%} ({each['least']:.0%} to {each['largest']:.0%})"
-        for name, each in weights.items()
+        f"{name} {weight['mean']:.0%} ({weight['least']:.0%} to {weight['largest']:.0%})"
+        for name, weight in weights.items()
     )
 
 
