@@ -12,7 +12,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -299,17 +299,21 @@ def parse_yaml(path: Path, text: str) -> object:
         raise InputError(f"{path} is not valid YAML ({one_line(error)})") from error
 
 
-def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
+def read_rows(
+    path: Path, data: bytes, names: Sequence[str] = ()
+) -> tuple[NDArray[np.float64], list[str]]:
     """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
 
-    A first line that begins with x y depth or x y z is a header; "#" begins a comment.
+    A first line that begins with x y depth or x y z is a header, and so is one with all of the
+    names; "#" begins a comment.
 
     Raises:
         InputError: A line is not made of as many numbers as the first.
     """
     numbered = list(numbered_lines(data))
     header = [w.strip('"').lower() for w in _WORD.findall(numbered[0][1])] if numbered else []
-    header = header if header[:3] in _HEADERS else []
+    is_header = header[:3] in _HEADERS or (len(names) > 0 and set(names) <= set(header))
+    header = header if is_header else []
     rows = list[list[float]]()
     for number, text in numbered[bool(header) :]:
         words = _WORD.findall(text)
