@@ -24,8 +24,6 @@ _COMPARED = 8  # neighbours that a point is compared with,
 _AGREEING = 2  # of which so many must agree with it
 _MIN_DISAGREEMENT = 0.005  # of log depth; less is none
 
-_OFF_TOGETHER = 0.35
-"""Difference of log depth from a strong network beyond which points stand out: 1.4 times."""
 _ALIKE = 0.15
 """Difference of these differences up to which neighbours agree with each other."""
 _AGREE_AROUND = 3
@@ -59,7 +57,7 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     return far & (far.sum() < len(points) / 2)
 
 
-def off_together(points: SparsePoints, error: Tensor) -> Tensor:
+def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
     """Returns (N,) bool: points that agree with their neighbours, and none with a prediction.
 
     As those seen in a mirror or through a pane. No geometry of the points tells these from a
@@ -69,15 +67,16 @@ def off_together(points: SparsePoints, error: Tensor) -> Tensor:
     Args:
         points: The points.
         error: (N,) log measured − log predicted depth.
+        least: Error from which on a point stands out.
     """
     none = torch.zeros(len(points), dtype=torch.bool)
-    if len(points) <= _AROUND or not bool((error.abs() > _OFF_TOGETHER).any()):
+    if len(points) <= _AROUND or not bool((error.abs() > least).any()):
         return none
     near = neighbours_of(points, _AROUND)
     alike = (error[near] - error[:, None]).abs() < _ALIKE
     groups = list[Tensor]()
     for side in (error, -error):
-        off = side > _OFF_TOGETHER
+        off = side > least
         groups.append(off & ((off[near] & alike).sum(dim=1) >= _AGREE_AROUND))
     return max(groups, key=lambda group: int(group.sum()))
 
