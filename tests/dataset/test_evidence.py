@@ -90,6 +90,47 @@ def test_a_stated_scale_is_obeyed_in_every_file_of_floats(
         assert any(f"÷ {scale:g}" in note for note in frame.notes)
 
 
+@pytest.mark.parametrize("name", FLOATS)
+@pytest.mark.parametrize(("kind", "factor"), [("inverse", 1.0), ("disparity:386.1", 386.1)])
+def test_a_stated_kind_is_obeyed_in_every_file_of_floats(
+    name: str, kind: str, factor: float, tmp_path: Path
+) -> None:
+    right = some(TRUTH).astype(np.float32)
+    stored = np.divide(factor, right, out=np.zeros_like(right), where=right > 0)
+    frame = read(save(tmp_path / name, stored), sparse_kind=kind)
+    x, y = frame.points.xy.numpy().astype(int).T
+    np.testing.assert_allclose(frame.points.depth, right[y, x], rtol=1e-4)
+    assert len(frame.points) == np.count_nonzero(right)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"sparse_kind": "inverse"},
+        {"sparse_range": True},
+        {"unit_scale": 2.0},
+    ],
+)
+def test_what_is_stated_of_a_scan_and_is_of_no_scan_is_refused(stated: dict[str, Any]) -> None:
+    scan = ScanOptions(calib=STREET / "calib.txt")
+    with pytest.raises(UsageError):
+        read(STREET / "000000.bin", STREET / "rgb.png", scan=scan, **stated)
+
+
+@pytest.mark.parametrize("camera", [0, 1, 2, 3])
+def test_a_stated_camera_is_obeyed_or_refused(camera: int) -> None:
+    scan = ScanOptions(calib=STREET / "calib.txt", camera=camera)
+    rows = dict(line.split(":") for line in (STREET / "calib.txt").read_text().split("\n") if line)
+    if f"P{camera}" not in rows:
+        with pytest.raises(UsageError, match=f"camera {camera}"):
+            read(STREET / "000000.bin", STREET / "rgb.png", scan=scan)
+        return
+    frame = read(STREET / "000000.bin", STREET / "rgb.png", scan=scan)
+    right = np.array(rows[f"P{camera}"].split(), float).reshape(3, 4)[:, :3]
+    assert frame.camera is not None
+    np.testing.assert_allclose(frame.camera.intrinsics, right)
+
+
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply", ".txt"])
 @pytest.mark.parametrize("scale", [3.28084, 100.0])
 def test_a_stated_scale_is_obeyed_in_every_scan(suffix: str, scale: float, tmp_path: Path) -> None:
