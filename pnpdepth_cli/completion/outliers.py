@@ -24,6 +24,11 @@ _COMPARED = 8  # neighbours that a point is compared with,
 _AGREEING = 2  # of which so many must agree with it
 _MIN_DISAGREEMENT = 0.005  # of log depth; less is none
 
+_ALIKE = 0.15
+"""Difference of these differences up to which neighbours agree with each other."""
+_AGREE_AROUND = 3
+"""Of `_AROUND` neighbours, so many must agree with a point that is off with others."""
+
 _PASSES = 3  # without the worst outliers, others stand out
 _MIN_POINTS = 5  # fewer do not predict each other
 _MAX_EXACT = 256  # points up to which all predict each other, instead of neighbourhoods
@@ -50,6 +55,30 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     error = points.depth.log() - at_points.clamp_min(1e-6).log()
     far = (at_points > 0) & (error.abs() > FAR)
     return far & (far.sum() < len(points) / 2)
+
+
+def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
+    """Returns (N,) bool: points that agree with their neighbours, and none with a prediction.
+
+    As those seen in a mirror or through a pane. No geometry of the points tells these from a
+    corridor behind a door; a prediction that is right everywhere else does. The larger group of
+    those that are farther, and of those that are nearer.
+
+    Args:
+        points: The points.
+        error: (N,) log measured − log predicted depth.
+        least: Error from which on a point stands out.
+    """
+    none = torch.zeros(len(points), dtype=torch.bool)
+    if len(points) <= _AROUND or not bool((error.abs() > least).any()):
+        return none
+    near = neighbours_of(points, _AROUND)
+    alike = (error[near] - error[:, None]).abs() < _ALIKE
+    groups = list[Tensor]()
+    for side in (error, -error):
+        off = side > least
+        groups.append(off & ((off[near] & alike).sum(dim=1) >= _AGREE_AROUND))
+    return max(groups, key=lambda group: int(group.sum()))
 
 
 def without_outliers(residuals: Residuals) -> Residuals:

@@ -10,15 +10,15 @@ separate, and a value may continue over several lines:
     lens: radial-tangential                    # or fisheye: OpenCV's k1 k2 k3 k4
     size: [1242, 375]                          # optional: width and height
 
-K has 9 numbers, 16 of a 4×4 matrix (ScanNet), or fx fy cx cy. Bare numbers are K alone, or
-fx fy cx cy width height. Record3D's metadata.json has K by columns. YAML is OpenCV's FileStorage,
-ROS camera_info, or Kalibr's camchain; a matrix T_camera_lidar there is the pose of the scanner. A
-folder is KITTI's raw data or KITTI-360.
+K has 9 numbers, 12 or 16 of a matrix [K 0] (ScanNet), or fx fy cx cy, which may also have these
+names. Bare numbers are K alone, or fx fy cx cy width height. Record3D's metadata.json and Open3D's
+intrinsic.json, as its recorder of RealSense cameras writes it, have K by columns. YAML is
+OpenCV's FileStorage, ROS camera_info, or Kalibr's camchain; a matrix T_camera_lidar there is the
+pose of the scanner. A folder is KITTI's raw data or KITTI-360.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -35,6 +35,8 @@ from pnpdepth_cli.io.poses import check_pose, numbers_in, pose_of_matrix
 _360_FILES = ("perspective.txt", "calib_cam_to_velo.txt")
 _RAW_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 _PLAIN = ("K", "R", "t", "distortion", "lens", "size")
+_SINGLE = ("fx", "fy", "cx", "cy")
+_OF_OPEN3D = ("intrinsic_matrix", "width", "height")
 _YAML_MARKS = ("camera_matrix:", "distortion_model:", "camera_model:", "distortion_coeffs:")
 _MATRICES = ("camera_matrix", "cameraMatrix", "intrinsics", "k", "K")
 _OF_LENS = ("distortion_coefficients", "distCoeffs", "distortion_coeffs", "distortion", "D", "d")
@@ -46,7 +48,7 @@ _LENSES = dict.fromkeys(
 
 _COEFFICIENTS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (0, 4)}
 _FALSE = ("0", "false", "False")
-_FIELD = re.compile(r"^[ \t]*([A-Za-z_]\w*)(?:[ \t]*:|[ \t]+(?=[-+.\d]))", re.MULTILINE)
+_FIELD = re.compile(r"^[ \t]*([A-Za-z_]\w*)(?:[ \t]*[:=]|[ \t]+(?=[-+.\d]))", re.MULTILINE)
 """A name at the beginning of a line; KITTI's tracking set has names without a colon."""
 _COMMENT = re.compile(r"#.*|^---[ \t]*$", re.MULTILINE)
 
@@ -145,16 +147,25 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
             source = "Record3D's metadata"
             size = [fields.values["w"], fields.values["h"]]
             fields = _Fields(path, {"K": fields.matrix("K").T, "size": size})
+        elif set(_OF_OPEN3D) <= set(fields.values):  # with K by columns, and much of the sensor
+            source = "Open3D's camera"
+            size = [fields.values["width"], fields.values["height"]]
+            by_columns = fields.matrix("intrinsic_matrix")
+            fields = _Fields(path, {"K": by_columns.T, "size": size})
     elif _FIELD.search(plain := _COMMENT.sub("", text)):
         fields = _named_values(path, text)
     else:
         numbers = numbers_in(plain) or []
         sized = {"K": numbers[:4], "size": numbers[4:]}
         fields = _Fields(path, sized if len(numbers) == 6 else {"K": plain})
+    if set(_SINGLE) <= set(fields.values):
+        others = {name: value for name, value in fields.values.items() if name not in _SINGLE}
+        k = [fields.numbers(name, count=1)[0] for name in _SINGLE]
+        fields = _Fields(path, {"K": k, **others})
     if any(re.fullmatch(r"P\d", str(name)) for name in fields.values):
         numbers = fields.numbers("Tr", "Tr_velo_cam", "Tr_velo_to_cam")
         return _kitti(fields, camera, "KITTI", pose_of_matrix(path, "Tr", numbers))
-    if unknown := sorted(set(fields.values) - set(_PLAIN)):
+    if unknown := sorted(set(fields.values) - {*_PLAIN, "width", "height"}):
         raise InputError(
             f"{path}: the name {unknown[0]!r} is none of {', '.join(_PLAIN)}; correct it, or take"
             " it out"
@@ -277,16 +288,23 @@ def _single(fields: _Fields, camera: int | None, source: str) -> Calibration:
     path = fields.path
     if camera is not None:
         raise UsageError(f"{path} describes one camera; leave out --camera {camera}")
-    # The intrinsics: fx fy cx cy, 3×3, or 4×4 as ScanNet has them.
+    # The intrinsics: fx fy cx cy, 3×3, 3×4, or 4×4 as ScanNet has them.
     numbers = fields.numbers(*_MATRICES)
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         numbers = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-    if len(numbers) not in (9, 16):
+    if len(numbers) not in (9, 12, 16):
         raise InputError(
-            f"{path}: K has {len(numbers)} numbers; give 4 (fx fy cx cy), 9 or 16 of a matrix"
+            f"{path}: K has {len(numbers)} numbers; give 4 (fx fy cx cy), or 9, 12 or 16 of a"
+            " matrix"
         )
-    matrix = np.reshape(numbers, (math.isqrt(len(numbers)), -1))[:3, :3]
+    rows = np.reshape(numbers, (-1, 3 if len(numbers) == 9 else 4))
+    if rows[:3, 3:].any():
+        raise InputError(
+            f"{path}: the last column of K is not 0, so it is the projection of a moved camera;"
+            " give its 3×3 intrinsics alone"
+        )
+    matrix = rows[:3, :3]
     matrix = _check_intrinsics(path, matrix)
     lens, distortion = _lens(fields)
     if distortion:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from pnpdepth_cli.choices import FORMATS
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
 from pnpdepth_cli.io import formats
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_rows
+from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_json, read_rows
 from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, images
 from pnpdepth_cli.points import SparsePoints
 
@@ -68,6 +70,7 @@ SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
 Points = SparsePoints[NDArray[np.float32]]
 
 _TEXT_SUFFIXES = (".csv", ".txt")
+_OPEN3D_FILE = "intrinsic.json"
 _WIDE = 2.4  # widths over heights, of images that are cut for driving
 _MANY_CODES = 1000  # of a map; fewer tell nothing of their order
 _ROUGHER = 3.0  # times; of maps of four sets, exchanged bytes are 40 times rougher
@@ -109,9 +112,35 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
             raise formats.no_depth(path, f"an 8-bit {kind}")
         raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)
+    if stored.values.dtype.kind in "iu" and stored.reading.scale is None:
+        beside = _scale_beside(path)
+        if beside is not None:
+            source = f"{stored.reading.source}, depth_scale of {_OPEN3D_FILE}"
+            stored = replace(stored, reading=Reading(source, beside))
     if stored.values.dtype.kind == "b" and not is_mask:
         raise InputError(f"{path} holds bool values; depth is float or integer")
     return stored
+
+
+def _scale_beside(path: Path) -> float | None:
+    """The scale of a depth image that Open3D's recorder of RealSense cameras states beside it.
+
+    It writes `depth/NUMBER.png`, `color/NUMBER.jpg` and `intrinsic.json`, with `depth_scale` codes
+    per metre, and a matrix of the camera.
+
+    Raises:
+        InputError: The file states no scale that depth can have.
+    """
+    sidecar = path.parent.parent / _OPEN3D_FILE
+    if path.parent.name != "depth" or not sidecar.is_file():
+        return None
+    content = read_json(sidecar)
+    if not {"intrinsic_matrix", "depth_scale"} <= set(content):
+        return None
+    scale = content["depth_scale"]
+    if not isinstance(scale, (int, float)) or not 0 < scale < math.inf:
+        raise InputError(f"{sidecar}: depth_scale {scale!r} is no number above 0; correct it")
+    return float(scale)
 
 
 def holds_integers(path: Path, *, of_scale: float | None = None) -> bool:

@@ -12,7 +12,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -310,10 +310,13 @@ def parse_yaml(path: Path, text: str) -> object:
         ) from error
 
 
-def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
+def read_rows(
+    path: Path, data: bytes, names: Sequence[str] = ()
+) -> tuple[NDArray[np.float64], list[str]]:
     """Returns the numbers (N, 3 or more) of lines of text, and the words of a header, if any.
 
-    A first line that begins with x y depth or x y z is a header; "#" begins a comment.
+    A first line that begins with x y depth or x y z is a header, and so is one with all of the
+    names; "#" begins a comment.
 
     Raises:
         InputError: A line is not made of as many numbers as the first.
@@ -324,7 +327,7 @@ def read_rows(path: Path, data: bytes) -> tuple[NDArray[np.float64], list[str]]:
     if numbered:
         _, first_line = numbered[0]
         words = [word.strip('"').lower() for word in _WORD.findall(first_line)]
-        if words[:3] in _HEADERS:
+        if words[:3] in _HEADERS or (len(names) > 0 and set(names) <= set(words)):
             header = words
             numbered = numbered[1:]
     # All other lines are numbers, as many as in the first of them.

@@ -23,7 +23,9 @@ from pnpdepth_cli.io import file_bytes
 _SEPARATORS = re.compile(r"[\[\](),;\s]+")
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST_M = 1e8  # of a place on the earth, such as in UTM
-_KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_KITTI_COLUMNS, _WHOLE_COLUMNS, _TUM_COLUMNS = 12, 16, 8
+_NAMED = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""Names of the columns of a TUM row in a table with more of them, as of Stray Scanner."""
 _OXTS_COLUMNS = 30
 _EARTH_RADIUS_M = 6378137.0  # of WGS 84 at the equator
 
@@ -167,8 +169,9 @@ def _pose_of_transform(path: Path, content: object) -> Extrinsics:
 def read_poses(path: Path) -> Floats:
     """Returns the poses (N, 3, 4) from each camera's coordinates to the world's, in file order.
 
-    Rows are 12 numbers, a 3×4 matrix (KITTI odometry), or 8 numbers, time, position and quaternion
-    x y z w (TUM RGB-D benchmark); `#` begins a comment.
+    Rows are 12 numbers, a 3×4 matrix (KITTI odometry), 16 of a 4×4 matrix, which may have four
+    lines, or 8 numbers, time, position and quaternion x y z w (TUM RGB-D benchmark), which may be
+    among others by the names in a header (Stray Scanner); `#` begins a comment.
 
     Raises:
         InputError: The file cannot be read, or a row has other numbers or no rotation.
@@ -284,9 +287,15 @@ def _last_numbers(names: Sequence[str]) -> Floats:
 
 def _rows(path: Path) -> tuple[Floats, Floats]:
     """The numbers (N, 12 or 8) of the rows and their poses (N, 3, 4); at least one."""
-    rows, _ = file_bytes.read_rows(path, file_bytes.read_bytes(path))
+    rows, header = file_bytes.read_rows(path, file_bytes.read_bytes(path), _NAMED)
+    if header and set(_NAMED) <= set(header):
+        rows = rows[:, [header.index(name) for name in _NAMED]]
+    rows = _without_last_rows(path, rows)
     if not len(rows) or rows.shape[1] not in (_KITTI_COLUMNS, _TUM_COLUMNS):
-        raise InputError(f"{path} has no poses; give rows of 12 numbers (KITTI) or 8 (TUM)")
+        raise InputError(
+            f"{path} has no rows of 12 or 16 numbers, a matrix (KITTI), or of 8, time, position and"
+            f" quaternion (TUM); there are {rows.shape[1]} in a row"
+        )
     if rows.shape[1] == _KITTI_COLUMNS:
         poses = rows.reshape(-1, 3, 4)
     else:
@@ -296,6 +305,25 @@ def _rows(path: Path) -> tuple[Floats, Floats]:
         if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
             raise InputError(f"{path}: row {number} holds no rotation; correct it")
     return rows, poses
+
+
+def _without_last_rows(path: Path, rows: Floats) -> Floats:
+    """Rows of 4×4 matrices, each in one line or in four, as rows of 3×4 ones; others as they are.
+
+    Raises:
+        InputError: The last row of a matrix is not 0 0 0 1.
+    """
+    if rows.shape[1] == 4 and len(rows) % 4 == 0:
+        rows = rows.reshape(-1, _WHOLE_COLUMNS)
+    if rows.shape[1] != _WHOLE_COLUMNS:
+        return rows
+    wrong = np.flatnonzero((np.abs(rows[:, _KITTI_COLUMNS:] - (0, 0, 0, 1)) > 1e-6).any(axis=1))
+    if len(wrong):
+        raise InputError(
+            f"{path}: the last row of matrix {wrong[0] + 1} is not 0 0 0 1; give the matrices by"
+            " rows, from the camera's coordinates to the world's"
+        )
+    return rows[:, :_KITTI_COLUMNS]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -221,9 +221,13 @@ def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
     try:
         header, body = _header(data, b"end_header")
         marks = [i for i, words in enumerate(header) if words[0] in ("element", "end_header")]
+        if len(marks) < 2 or len(header[marks[0]]) != 3:
+            raise ValueError("its header has no element of so many points")
+        if header[0] != ["ply"] or header[1][0] != "format":
+            raise ValueError("its header does not begin with ply and format")
         _, element, number = header[marks[0]]
         stored = header[1][1]
-        if (header[0], header[1][0], element) != (["ply"], "format", "vertex"):
+        if element != "vertex":
             raise ValueError("its first element is not vertex; save points first")
         # The properties of the first element, up to the next mark.
         of_vertex = header[marks[0] : marks[1]]

@@ -6,6 +6,8 @@ it but right is neither.
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +91,47 @@ def test_a_stated_scale_is_obeyed_in_every_file_of_floats(
         assert any(f"÷ {scale:g}" in note for note in frame.notes)
 
 
+@pytest.mark.parametrize("name", FLOATS)
+@pytest.mark.parametrize(("kind", "factor"), [("inverse", 1.0), ("disparity:386.1", 386.1)])
+def test_a_stated_kind_is_obeyed_in_every_file_of_floats(
+    name: str, kind: str, factor: float, tmp_path: Path
+) -> None:
+    right = some(TRUTH).astype(np.float32)
+    stored = np.divide(factor, right, out=np.zeros_like(right), where=right > 0)
+    frame = read(save(tmp_path / name, stored), sparse_kind=kind)
+    x, y = frame.points.xy.numpy().astype(int).T
+    np.testing.assert_allclose(frame.points.depth, right[y, x], rtol=1e-4)
+    assert len(frame.points) == np.count_nonzero(right)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"sparse_kind": "inverse"},
+        {"sparse_range": True},
+        {"unit_scale": 2.0},
+    ],
+)
+def test_what_is_stated_of_a_scan_and_is_of_no_scan_is_refused(stated: dict[str, Any]) -> None:
+    scan = ScanOptions(calib=STREET / "calib.txt")
+    with pytest.raises(UsageError):
+        read(STREET / "000000.bin", STREET / "rgb.png", scan=scan, **stated)
+
+
+@pytest.mark.parametrize("camera", [0, 1, 2, 3])
+def test_a_stated_camera_is_obeyed_or_refused(camera: int) -> None:
+    scan = ScanOptions(calib=STREET / "calib.txt", camera=camera)
+    rows = dict(line.split(":") for line in (STREET / "calib.txt").read_text().split("\n") if line)
+    if f"P{camera}" not in rows:
+        with pytest.raises(UsageError, match=f"camera {camera}"):
+            read(STREET / "000000.bin", STREET / "rgb.png", scan=scan)
+        return
+    frame = read(STREET / "000000.bin", STREET / "rgb.png", scan=scan)
+    right = np.array(rows[f"P{camera}"].split(), float).reshape(3, 4)[:, :3]
+    assert frame.camera is not None
+    np.testing.assert_allclose(frame.camera.intrinsics, right)
+
+
 @pytest.mark.parametrize("suffix", [".bin", ".npy", ".pcd", ".ply", ".txt"])
 @pytest.mark.parametrize("scale", [3.28084, 100.0])
 def test_a_stated_scale_is_obeyed_in_every_scan(suffix: str, scale: float, tmp_path: Path) -> None:
@@ -170,9 +213,8 @@ def test_a_map_within_0_and_1_is_no_metres_unless_said(
     np.testing.assert_allclose(read(path, depth_scale=1.0).points.depth.max(), stored.max())
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.25])
+@pytest.mark.parametrize(("factor", "known"), [(0.5, 0.2), (0.5, 0.8), (0.25, 0.2)])
 @pytest.mark.parametrize("interpolation", [cv2.INTER_LINEAR, cv2.INTER_AREA])
-@pytest.mark.parametrize("known", [0.2, 0.8])
 def test_a_map_of_half_the_size_whose_pixels_are_means_with_unknown_ones_is_told(
     factor: float, interpolation: int, known: float, tmp_path: Path
 ) -> None:
@@ -398,12 +440,102 @@ def test_a_depth_map_of_colmap_is_named_as_such(tmp_path: Path) -> None:
         "# camera: 1\n525 0 319.5\n0 525 239.5\n0 0 1\n",
         "K 525 0 319.5 0 525 239.5 0 0 1\nsize 640 480  # pixels\n",
         "525 525 319.5 239.5\n",
+        "# K of 3×4\n525 0 319.5 0\n0 525 239.5 0\n0 0 1 0\n",
+        "K = [525, 0, 319.5; 0, 525, 239.5; 0, 0, 1]\n",
+        "fx 525\nfy 525\ncx 319.5\ncy 239.5\n",
+        "fx = 525\nfy = 525\ncx = 319.5\ncy = 239.5\nwidth = 640\nheight = 480\n",
+        '{"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5}',
     ],
 )
 def test_a_calibration_may_have_comments_and_no_colons(text: str, tmp_path: Path) -> None:
     (tmp_path / "calib.txt").write_text(text)
     camera = read_calibration(tmp_path / "calib.txt").camera
     np.testing.assert_array_equal(camera.intrinsics, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
+
+
+def test_a_projection_of_a_moved_camera_is_no_k(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text("K: 525 0 319.5 44 0 525 239.5 0 0 0 1 0\n")
+    with pytest.raises(InputError, match="last column"):
+        read_calibration(tmp_path / "calib.txt")
+
+
+@pytest.mark.parametrize("scale", [1000.0, 10_000.0, 4000.0])
+def test_the_recorder_of_open3d_says_camera_and_scale(scale: float, tmp_path: Path) -> None:
+    sidecar = tmp_path / "intrinsic.json"
+    content = {
+        "width": 640,
+        "height": 480,
+        "intrinsic_matrix": [525, 0, 0, 0, 520, 0, 319.5, 239.5, 1],
+        "depth_scale": scale,
+        "depth_format": "Z16",
+        "color_format": "RGB8",
+    }
+    sidecar.write_text(json.dumps(content))
+    camera = read_calibration(sidecar).camera
+    np.testing.assert_array_equal(camera.intrinsics, [[525, 0, 319.5], [0, 520, 239.5], [0, 0, 1]])
+    assert camera.size == (480, 640)
+    (tmp_path / "depth").mkdir()
+    codes = np.rint(some(np.minimum(TRUTH, 6)) * scale)  # of 16 bits
+    path = save(tmp_path / "depth" / "00000.png", codes.astype(np.uint16))
+    found = read_depth(path)
+    np.testing.assert_allclose(found.values, codes / scale, rtol=1e-6)
+    assert not found.reading.assumed
+    # What the user states comes first, and a file elsewhere has no sidecar.
+    assert read_depth(path, scale=256.0).values.max() == pytest.approx(codes.max() / 256)
+    assert read_depth(save(tmp_path / "a.png", codes.astype(np.uint16))).reading.assumed
+    sidecar.write_text(json.dumps({**content, "depth_scale": 0}))
+    with pytest.raises(InputError, match="depth_scale"):
+        read_depth(path)
+
+
+def tiff_of_floats(values: Depth) -> bytes:
+    """An uncompressed TIFF (H, W) or (H, W, C) of floats of any size, by TIFF 6.0."""
+    height, width, channels = (*values.shape, 1)[:3]
+    bits, short, long = 8 * values.itemsize, 3, 4
+    fields = {
+        256: (long, width),
+        257: (long, height),
+        258: (short, bits),
+        259: (short, 1),
+        262: (short, 2 if channels > 1 else 1),
+        273: (long, None),
+        277: (short, channels),
+        278: (long, height),
+        279: (long, values.nbytes),
+        339: (short, 3),
+    }
+    after = 10 + 12 * len(fields) + 4
+    extra, entries = b"", b""
+    for tag, (kind, value) in fields.items():
+        count = channels if tag in (258, 339) else 1
+        if count > 2:
+            extra += struct.pack(f"<{count}H", *[value] * count)
+            entries += struct.pack("<HHII", tag, kind, count, after + len(extra) - 2 * count)
+        elif kind == short:
+            entries += struct.pack("<HHI4s", tag, kind, count, struct.pack("<HH", value, 0))
+        else:
+            where = after + 2 * (2 * channels if channels > 2 else 0)
+            entries += struct.pack("<HHII", tag, kind, 1, where if value is None else value)
+    head = b"II*\0" + struct.pack("<IH", 8, len(fields))
+    return head + entries + struct.pack("<I", 0) + extra + values.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        (TRUTH.astype("<f8"), "64-bit floats"),
+        (np.repeat(TRUTH[:, :, None], 3, axis=2).astype("<f4"), "3 channels"),
+        (np.repeat(TRUTH[:, :, None], 4, axis=2).astype("<f8"), "4 channels"),
+    ],
+)
+def test_a_tiff_of_other_floats_says_what_it_holds(
+    values: Depth, named: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.tif").write_bytes(tiff_of_floats(values))
+    with pytest.raises(InputError, match=named):
+        read_depth(tmp_path / "a.tif")
+    (tmp_path / "b.tif").write_bytes(tiff_of_floats(TRUTH.astype("<f4")))
+    np.testing.assert_array_equal(read_depth(tmp_path / "b.tif").values, TRUTH.astype(np.float32))
 
 
 def test_rows_that_were_cut_off_above_are_no_false_alarm(tmp_path: Path) -> None:

@@ -121,3 +121,29 @@ def test_a_pose_between_two_is_interpolated_unless_they_are_far_apart(tmp_path: 
     assert np.array_equal(trajectory.at(10.0, 0.0), np.eye(4)[:3])
     outside = ((9.99, 1.0), (10.51, 1.0), (10.25, 0.49))
     assert [trajectory.at(*time_and_gap) for time_and_gap in outside] == [None] * 3
+
+
+def test_rows_of_4_by_4_matrices_are_poses_in_one_line_or_in_four(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    right = np.repeat(np.eye(4)[None], 3, axis=0)
+    right[:, 0, 3] = [1, 2, 3]
+    for rows in (right.reshape(3, 16), right.reshape(12, 4)):
+        np.savetxt(path, rows)
+        np.testing.assert_array_equal(read_poses(path), right[:, :3])
+        np.testing.assert_array_equal(poses_of_frames(path, ["a", "b", "c"])[0], right[:, :3])
+    # Matrices by columns have the translation in the last row.
+    np.savetxt(path, right.transpose(0, 2, 1).reshape(3, 16))
+    with pytest.raises(InputError, match="matrix 1"):
+        read_poses(path)
+
+
+def test_a_table_with_the_names_of_its_columns_is_poses(tmp_path: Path) -> None:
+    """As odometry.csv of Stray Scanner, whose frames have numbers, or with others in between."""
+    path = tmp_path / "odometry.csv"
+    rows = "".join(f"{100 + n / 60:.6f}, {n:06d}, {n}, 0, 0, 0, 0, 0, 1\n" for n in range(5))
+    path.write_text(f"timestamp, frame, x, y, z, qx, qy, qz, qw\n{rows}")
+    poses, _ = poses_of_frames(path, ["000001", "000003"])
+    np.testing.assert_array_equal(poses[:, 0, 3], [1, 3])
+    assert read_trajectory(path).times_s == pytest.approx(100 + np.arange(5) / 60, abs=1e-6)
+    path.write_text("qw,qx,qy,qz,X,Y,Z,Timestamp\n1,0,0,0,7,8,9,5\n")
+    np.testing.assert_array_equal(read_poses(path)[0, :, 3], [7, 8, 9])

@@ -120,6 +120,31 @@ def test_points_of_disparity_are_told_by_a_network_that_sees_depth(
         assert all(note.startswith("warning") for note in told)
 
 
+@pytest.mark.parametrize(("times", "kind"), [(2.0, "depth"), (1.6, "inverse"), (0.5, "depth")])
+@pytest.mark.parametrize("which", ["a square", "anywhere", "few"])
+def test_points_that_contradict_a_strong_network_together_are_told(
+    times: float, kind: OutputKind, which: str
+) -> None:
+    depth, points = frame_of_depth(500)
+    chosen = torch.zeros(len(points), dtype=torch.bool)
+    inside = ((points.xy - 20).abs() < 7).all(dim=1)  # a ninth of the image
+    chosen[inside] = True
+    if which == "anywhere":
+        chosen = chosen[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))]
+    elif which == "few":
+        chosen &= ((points.xy - 20).abs() < 3).all(dim=1)
+    output = depth if kind == "depth" else 1 / depth
+    of_image = network(output_kind=kind, output_scale="affine")
+    for given, is_told in (
+        (points.depth, False),
+        (points.depth * (1 + (times - 1) * chosen), True),
+    ):
+        reader = AlignedDepth(of_image, replace(points, depth=given), "auto")
+        reader(output)
+        told = [note for note in reader.notes if "agree with each other" in note]
+        assert bool(told) == (is_told and which == "a square")
+
+
 def test_the_order_of_the_points_says_nothing_where_a_network_follows_them_or_sees_little() -> None:
     depth, points = frame_of_depth(200)
     for of_points, output in (

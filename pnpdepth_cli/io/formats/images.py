@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     import PIL.Image
 
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
+_BITS, _CHANNELS, _SAMPLE_FORMAT = 258, 277, 339
+"""Tags of a TIFF's pixels."""
+_FLOATS = 3  # of _SAMPLE_FORMAT
 _POINTERS = (34665, 34853, 40965)  # to further tags: Exif, GPS and interoperability
 IMAGE_ERRORS = (
     OSError,
@@ -119,6 +122,11 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
             check_pixel_count(path, *image.size, pixel_bytes=pixel_bytes, file_bytes=len(data))
             yield image
     except IMAGE_ERRORS as error:
+        if kind == "TIFF" and (pixels := _float_pixels(data)) is not None:
+            raise InputError(
+                f"{path} is a TIFF of {pixels}, which is not read; save one channel of 32-bit"
+                " floats"
+            ) from error
         # Pillow names the in-memory buffer, which means nothing to a reader.
         is_unknown = "BytesIO" in str(error)
         raise damaged(
@@ -126,6 +134,33 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
             kind,
             f"cannot be decoded ({'unknown content or type of pixels' if is_unknown else error})",
         ) from error
+
+
+def _float_pixels(data: bytes) -> str | None:
+    """The pixels of a TIFF of floats that Pillow does not read; None of others, and if damaged."""
+    try:
+        order = "<" if data[:2] == b"II" else ">"
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        entries = data[start + 2 : start + 2 + 12 * count]
+        found = {
+            tag: (number, value, field[8:])
+            for field in (entries[at : at + 12] for at in range(0, len(entries), 12))
+            for tag, _, number, value in [struct.unpack(f"{order}HHII", field)]
+        }
+        # Short numbers, of each channel: in the tag itself, or where it points to.
+        first = dict[int, int]()
+        for tag in (_BITS, _SAMPLE_FORMAT):
+            number, value, own = found[tag]
+            where = own if number <= 2 else data[value : value + 2]
+            (first[tag],) = struct.unpack_from(f"{order}H", where)
+        _, _, own = found[_CHANNELS]
+        (channels,) = struct.unpack_from(f"{order}H", own)
+    except (struct.error, KeyError):
+        return None
+    if first[_SAMPLE_FORMAT] != _FLOATS or (first[_BITS] == 32 and channels == 1):
+        return None
+    return f"{first[_BITS]}-bit floats of {channels} channel{'s' if channels != 1 else ''}"
 
 
 def raw_mode(image: PIL.Image.Image) -> str:
