@@ -20,7 +20,6 @@ from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.projection import project_velodyne
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 Image = NDArray[np.float32]
@@ -38,9 +37,7 @@ def street() -> Frame:
 
 
 def told(rgb: Image, scan: Scan, calibration: Calibration) -> list[str]:
-    assert calibration.scanner is not None
-    points = project_velodyne(scan, calibration.camera, calibration.scanner, rgb.shape[:2])
-    return fit_warning(points, scan, calibration, {}, rgb)
+    return fit_warning(scan, calibration, {}, rgb)
 
 
 def moved(
@@ -80,6 +77,18 @@ def test_a_scan_of_another_time_is_found(ahead_m: float, street: Frame) -> None:
 def test_other_axes_are_found(matrix: NDArray[np.float64], text: str, street: Frame) -> None:
     rgb, scan, right = street
     (warning,) = told(rgb, scan @ matrix, right)
+    assert text in warning
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "text"),
+    [(1, -1, "mirrored"), (-1, 1, "rows in reverse"), (-1, -1, "turned by 180°")],
+)
+def test_a_mirrored_or_turned_image_is_found(
+    rows: int, columns: int, text: str, street: Frame
+) -> None:
+    rgb, scan, right = street
+    (warning,) = told(np.ascontiguousarray(rgb[::rows, ::columns]), scan, right)
     assert text in warning
 
 
