@@ -66,7 +66,7 @@ _NEEDED = {
     "size": _Needed(score=4.5, more=1.5),
 }
 _NEEDED_OF_FEW = {  # by scans of less than many jumps
-    "turn": _Needed(score=6.0, more=4.0),
+    "turn": _Needed(score=7.0, more=4.5),
     "roll": _Needed(score=6.0, more=3.0),
     "late": _Needed(score=5.5, more=3.0),
     "mirror": _Needed(score=5.0, more=2.5),
@@ -296,12 +296,22 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     left = width - 1 - xy[:, 0]
     up = height - 1 - xy[:, 1]
     opposite = weights * (1, 1, -1)
-    for text, pixels, mirrored in (
+    changed = [
         ("with the image mirrored", np.column_stack([left, xy[:, 1]]), opposite),
         ("with the image's rows in reverse", np.column_stack([xy[:, 0], up]), opposite),
         ("with the image turned by 180°", np.column_stack([left, up]), weights),
-    ):
-        yield _Fit("mirror", judge.of_pixels(pixels, mirrored), text)
+    ]
+    if height == width:  # of other images the size tells
+        exchanged = weights[:, [1, 0, 2]]
+        across = exchanged * (1, 1, -1)
+        changed += [
+            ("with the image's rows and columns exchanged", xy[:, ::-1], exchanged),
+            ("with the image turned by 90°", np.column_stack([xy[:, 1], left]), across),
+            ("with the image turned by -90°", np.column_stack([up, xy[:, 0]]), across),
+            ("with the image mirrored and turned by 90°", np.column_stack([up, left]), exchanged),
+        ]
+    for text, pixels, of_pixels in changed:
+        yield _Fit("mirror", judge.of_pixels(pixels, of_pixels), text)
 
 
 def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
@@ -324,9 +334,9 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
 
 
 def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
-    """Calibrations of other axes of the scan, and the others."""
+    """Calibrations of other axes of the scan, of the inverse pose, and the others."""
     assert own.scanner is not None
-    readings = dict[str, Calibration]()
+    readings = {"with the extrinsics inverted": replace(own, scanner=own.scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (

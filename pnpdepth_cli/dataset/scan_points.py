@@ -102,8 +102,10 @@ def read_scan_points(
             f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
             f" that {named} rectifies with are applied"
         )
+    inverted = list[str]()
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
-        warnings += check_direction(xyz, camera, scanner, size)
+        inverted = check_direction(xyz, camera, scanner, size)
+        warnings += inverted
     # They are projected, and what seems wrong is warned of.
     try:
         points = project_velodyne(
@@ -121,7 +123,7 @@ def read_scan_points(
             raise
         raise NoPointsError(f"{error}; {text}, {count:,} points would be in the image") from error
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
-    if search and image is not None and not calibration.rectified:
+    if search and image is not None and not calibration.rectified and not inverted:
         others = _other_cameras(options, image)
         rgb = read_rgb(image).values
         if of_scanner:

@@ -80,6 +80,33 @@ def test_other_axes_are_found(matrix: NDArray[np.float64], text: str, street: Fr
     assert text in warning
 
 
+def test_inverted_extrinsics_are_found(street: Frame) -> None:
+    rgb, scan, right = street
+    assert right.scanner is not None
+    turn = Rotation.from_euler("y", 10, degrees=True).as_matrix()  # of a scanner in camera axes
+    pose = Extrinsics(turn, right.scanner.translation)
+    of_camera_axes = pose.inverse().apply(right.scanner.apply(scan))
+    assert told(rgb, of_camera_axes, replace(right, scanner=pose)) == []
+    (warning,) = told(rgb, of_camera_axes, replace(right, scanner=pose.inverse()))
+    assert "inverted" in warning
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_a_square_image_that_is_turned_is_found(
+    turns: int, is_mirrored: bool, street: Frame
+) -> None:
+    rgb, scan, right = street
+    left = 430
+    intrinsics = right.camera.intrinsics.copy()
+    intrinsics[0, 2] -= left
+    camera = replace(right.camera, intrinsics=intrinsics, size=(375, 375))
+    square = rgb[:, left : left + 375]
+    turned = np.rot90(square[:, ::-1] if is_mirrored else square, turns)
+    (warning,) = told(np.ascontiguousarray(turned), scan, replace(right, camera=camera))
+    assert "with the image" in warning
+
+
 @pytest.mark.parametrize(
     ("rows", "columns", "text"),
     [(1, -1, "mirrored"), (-1, 1, "rows in reverse"), (-1, -1, "turned by 180°")],
