@@ -133,6 +133,7 @@ def _cropped(frame: ScanFrame, top: float, left: float, rows: float, columns: fl
 
 def wrong_variants() -> Iterator[Variant]:
     """Yields ways in which scan and image do not belong together."""
+    # The calibration is turned.
     for angle in (1.5, 2.5, 3.5, 5.0, 7.0, 8.0):
         for turn in (
             (0.0, angle, 0.0),
@@ -145,6 +146,7 @@ def wrong_variants() -> Iterator[Variant]:
             yield Variant(
                 "roll", "turned", lambda frame, roll=roll: _moved(frame, (0, 0, roll), (0, 0, 0))
             )
+    # The scan is of another time, the image of another size, one of them mirrored.
     for ahead_m in (-3.0, -2.0, -1.5, -1.0, -0.7, 0.7, 1.0, 1.5, 2.0, 3.0):
         yield Variant(
             "late", "another time", lambda frame, m=ahead_m: _moved(frame, (0, 0, 0), (0, 0, m))
@@ -176,6 +178,7 @@ def wrong_variants() -> Iterator[Variant]:
 def right_variants() -> Iterator[Variant]:
     """Yields ways to change a frame that stays right."""
     rng = np.random.default_rng(0)
+    # Other images with their calibration.
     yield Variant("as it is", "", lambda frame: frame)
     for factor in (0.5, 0.75, 1.3):
         yield Variant("resized", "", lambda frame, f=factor: _resized(frame, f, is_calibrated=True))
@@ -187,6 +190,7 @@ def right_variants() -> Iterator[Variant]:
         (0.27, 0.51, 0.68, 0.47),
     ):
         yield Variant("cropped", "", lambda frame, part=part: _cropped(frame, *part))
+    # Other scans.
     for every in (2, 4):
         yield Variant(f"lines / {every}", "", lambda frame, every=every: _of_lines(frame, every))
     for share in (0.5, 0.2):
@@ -203,6 +207,7 @@ def right_variants() -> Iterator[Variant]:
         "",
         lambda frame: frame._replace(scan=frame.scan + rng.normal(0, 0.03, frame.scan.shape)),
     )
+    # Other light.
     for name, change in (
         ("dark", lambda rgb: 0.3 * rgb),
         ("contrast", lambda rgb: rgb**2),
@@ -216,6 +221,7 @@ def right_variants() -> Iterator[Variant]:
             "",
             lambda frame, change=change: frame._replace(rgb=change(frame.rgb).astype(np.float32)),
         )
+    # Calibrations are not exact.
     for turn_deg, shift_m in ((0.1, 0.02), (0.1, 0.02), (0.2, 0.05)):
         yield Variant(
             f"calibration ± {turn_deg}°",
@@ -252,6 +258,7 @@ def main() -> None:
     )
     parser.add_argument("--every", type=int, default=1, help="of the frames, one in so many")
     arguments = parser.parse_args()
+    # Each variant of each frame, and then a row for each kind.
     frames = list(frames_of(arguments.data, arguments.part))[:: arguments.every]
     seconds = list[float]()
     for title in arguments.inputs:

@@ -97,10 +97,12 @@ def fit_warning(
         others: Further calibrations, such as those of other cameras, by what they are.
         rgb: (H, W, 3) in 0…1.
     """
+    # Too few jumps of depth tell nothing.
     size = (rgb.shape[0], rgb.shape[1])
     jumps = _jumps(scan, own, size)
     if jumps is None or jumps.clear < _SOME_JUMPS:
         return []
+    # Readings that are clearly better than the scan as it is.
     judge = _Judge(rgb, own.camera, jumps)
     readings = list(_readings(judge, scan, own, others, size))
     needed = _NEEDED if jumps.clear >= _MANY_JUMPS else _NEEDED_OF_FEW
@@ -117,6 +119,7 @@ def fit_warning(
             f" {best.text}: {best.score:.1f} standard deviations above chance instead of"
             f" {judge.as_it_is:.1f}; check calibration and times"
         ]
+    # None is, and the scan as it is fits no better than by chance.
     if judge.as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
         return [
             "warning: the image's edges do not meet the scan's jumps of depth"
@@ -184,7 +187,8 @@ def _at_pose(jumps: Jumps, pose: Floats) -> Jumps:
 
 def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tuple[float, Floats]:
     """The highest score around `start` (K,), coordinate by coordinate, and where it is."""
-    best, at = score(start), start
+    best = score(start)
+    at = start
     for _ in range(3):
         before = best
         for axis in np.flatnonzero(steps):
@@ -192,9 +196,11 @@ def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tu
                 while True:
                     tried = at.copy()
                     tried[axis] += sign * steps[axis]
-                    if (value := score(tried)) <= best:
+                    value = score(tried)
+                    if value <= best:
                         break
-                    best, at = value, tried
+                    best = value
+                    at = tried
         if best == before:
             break
     return best, at
@@ -215,10 +221,10 @@ def _readings(
         return
     yield from _mirrored(judge, size)
     # The scan by other axes and cameras, whose points have other jumps.
-    for text, other in _other_readings(own, others).items():
-        jumps = _jumps(scan, other, size)
+    for text, reading in _other_readings(own, others).items():
+        jumps = _jumps(scan, reading, size)
         if jumps is not None:
-            yield _Fit("other", judge.of_pixels(*jumps.projected(other.camera)), text)
+            yield _Fit("other", judge.of_pixels(*jumps.projected(reading.camera)), text)
     # The calibration of an image that was resized.
     resized, factor = _resized(own, size)
     jumps = None if resized is None else _jumps(scan, resized, size)
@@ -239,12 +245,15 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
     columns = np.arange(judge.shifted.shape[1]) - judge.shifted.shape[1] // 2
     down_deg = np.degrees(np.arctan(rows / judge.edges.scale / focal_y))[:, None]
     right_deg = np.degrees(np.arctan(columns / judge.edges.scale / focal_x))[None, :]
+    # The best shifts that are no small ones, and none of them beside another.
     left = np.where(np.hypot(down_deg, right_deg) < _LEAST_TURN_DEG, -np.inf, judge.shifted)
     for _ in range(_PEAKS):
         row, column = np.unravel_index(left.argmax(), left.shape)
-        about_x, about_y = -float(down_deg[row, 0]), float(right_deg[0, column])
+        about_x = -float(down_deg[row, 0])
+        about_y = float(right_deg[0, column])
         near = np.hypot(down_deg + about_x, right_deg - about_y) < _LEAST_TURN_DEG
         left = np.where(near, -np.inf, left)
+        # From there, turns about all three axes.
         rolls = [np.array([about_x, about_y, roll, 0]) for roll in _ROLLS_DEG]
         pose = max(rolls, key=judge.of_pose_coarsely)
         _, pose = _climb(judge.of_pose_coarsely, pose, np.array([0.4, 0.4, 0.4, 0]))
@@ -295,7 +304,7 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     xy, weights = judge.jumps.projected(judge.camera)
     left = width - 1 - xy[:, 0]
     up = height - 1 - xy[:, 1]
-    opposite = weights * (1, 1, -1)
+    opposite = weights * np.array([1, 1, -1])
     changed = [
         ("with the image mirrored", np.column_stack([left, xy[:, 1]]), opposite),
         ("with the image's rows in reverse", np.column_stack([xy[:, 0], up]), opposite),
@@ -303,7 +312,7 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     ]
     if height == width:  # of other images the size tells
         exchanged = weights[:, [1, 0, 2]]
-        across = exchanged * (1, 1, -1)
+        across = exchanged * np.array([1, 1, -1])
         changed += [
             ("with the image's rows and columns exchanged", xy[:, ::-1], exchanged),
             ("with the image turned by 90°", np.column_stack([xy[:, 1], left]), across),
@@ -323,7 +332,8 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
     centre = own.camera.intrinsics[:2, 2] + 0.5
     if centre.min() <= 0:
         return None, 1.0
-    across, down = size[1] / (2 * centre[0]), size[0] / (2 * centre[1])
+    across = size[1] / (2 * centre[0])
+    down = size[0] / (2 * centre[1])
     factor = math.sqrt(across * down)
     if abs(math.log(across / down)) > _SAME_RATIO or abs(math.log(factor)) < _RESIZED:
         return None, 1.0
@@ -355,9 +365,9 @@ def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict
 def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) -> dict[str, int]:
     """Returns how many points of a scan (N, 3) are in the image (H, W), by other axes of it."""
     found = dict[str, int]()
-    for text, each in _other_readings(own, {}).items():
-        assert each.scanner is not None
-        found[text] = len(points_in_image(each.scanner.apply(scan), each.camera, size)[0])
+    for text, reading in _other_readings(own, {}).items():
+        assert reading.scanner is not None
+        found[text] = len(points_in_image(reading.scanner.apply(scan), reading.camera, size)[0])
     return found
 
 
