@@ -27,10 +27,9 @@ from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import check_no_colmap_map, read_scan
 from pnpdepth_cli.points import Size, in_frame
-from pnpdepth_cli.sensors.edge_fit import edge_map, jump_weights
+from pnpdepth_cli.sensors.edge_fit import edge_map, jumps_of
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import (
-    Points,
     describe_dropped,
     points_in_image,
     project_velodyne,
@@ -103,8 +102,10 @@ def read_scan_points(
             f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
             f" that {named} rectifies with are applied"
         )
+    inverted = list[str]()
     if options.extrinsics is not None or not camera.source.startswith("KITTI"):  # one direction
-        warnings += check_direction(xyz, camera, scanner, size)
+        inverted = check_direction(xyz, camera, scanner, size)
+        warnings += inverted
     # They are projected, and what seems wrong is warned of.
     try:
         points = project_velodyne(
@@ -122,12 +123,18 @@ def read_scan_points(
             raise
         raise NoPointsError(f"{error}; {text}, {count:,} points would be in the image") from error
     warnings += _outside_warning(scanner.apply(xyz), camera, size)
-    if search and image is not None and not calibration.rectified:
-        visible = points  # an occluded point is no evidence about the edges of the image
-        if options.keep_occluded:
-            visible = project_velodyne(xyz, camera, scanner, size, has_scanner=of_scanner)
+    if search and image is not None and not calibration.rectified and not inverted:
         others = _other_cameras(options, image)
-        warnings += fit_warning(visible, xyz, calibration, others, read_rgb(image).values)
+        rgb = read_rgb(image).values
+        if of_scanner:
+            warnings += fit_warning(xyz, calibration, others, rgb)
+        else:  # from elsewhere, hidden points of a cloud would be jumps
+            visible = points
+            if options.keep_occluded:
+                visible = project_velodyne(xyz, camera, scanner, size, has_scanner=False)
+            seen = unproject(camera, visible.xy, visible.depth)
+            of_camera = replace(calibration, scanner=SAME_PLACE)
+            warnings += fit_warning(seen, of_camera, {}, rgb)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
@@ -210,10 +217,9 @@ def choose_camera(
     scores = list[dict[str, float]]()
     for rgb, xyz in frames if own.scanner and len(candidates) > 1 else ():
         assert own.scanner is not None
-        with suppress(NoPointsError):
-            points = project_velodyne(xyz, own.camera, own.scanner, rgb.shape[:2])
-            if (each := _scores(points, rgb, own, candidates)) is not None:
-                scores.append(each)
+        of_frame = _scores(xyz, rgb, own, candidates)
+        if of_frame is not None:
+            scores.append(of_frame)
     if scores:
         mean = {name: float(np.mean([each[name] for each in scores])) for name in candidates}
         best = max(mean, key=lambda name: mean[name])
@@ -226,30 +232,34 @@ def choose_camera(
 
 
 def _scores(
-    points: Points, rgb: NDArray[np.float32], own: Calibration, others: Mapping[str, Calibration]
+    scan: NDArray[np.floating],
+    rgb: NDArray[np.float32],
+    own: Calibration,
+    candidates: Mapping[str, Calibration],
 ) -> dict[str, float] | None:
-    """The score of each calibration; 0 of one that puts few of the points into the image.
+    """The score of each calibration; 0 of one that puts few of the jumps into the image.
 
     None where the points tell nothing.
     """
-    weight = jump_weights(points)
-    if weight is None:
-        return None
-    # Points that are seen by their own calibration, with its jumps of depth, are projected anew.
+    # The jumps of depth are those that the own camera sees.
     assert own.scanner is not None
+    size = (rgb.shape[0], rgb.shape[1])
+    jumps = jumps_of(scan, own.camera, own.scanner, size)
+    if jumps is None:
+        return None
     edges = edge_map(rgb)
-    shifted = edges.shifted(points.xy.astype(np.float64), weight, (_CHANCE_PX, _CHANCE_PX))
-    chance, spread = float(shifted.mean()), float(shifted.std()) + 1e-9
-    xyz = own.scanner.inverse().apply(unproject(own.camera, points.xy, points.depth))
-    result = dict.fromkeys(others, 0.0)
-    for name, each in others.items():
-        assert each.scanner is not None
-        moved = each.scanner.apply(xyz)
-        ahead = moved[:, 2] > 0
-        xy = pixels_of(each.camera, moved[ahead])
-        if np.count_nonzero(in_frame(xy, points.size)) >= _FEW_INSIDE * len(points):
-            result[name] = (edges.score(xy, weight[ahead]) - chance) / spread
-    return result
+    shifted = edges.shifted(*jumps.projected(own.camera), (_CHANCE_PX, _CHANCE_PX))
+    chance = float(shifted.mean())
+    spread = float(shifted.std()) + 1e-9
+    # The others project them anew.
+    scores = dict.fromkeys(candidates, 0.0)
+    for name, candidate in candidates.items():
+        assert candidate.scanner is not None
+        motion = candidate.scanner @ own.scanner.inverse()
+        xy, weights = jumps.moved(motion).projected(candidate.camera)
+        if np.count_nonzero(in_frame(xy, size)) >= _FEW_INSIDE * len(jumps.xyz):
+            scores[name] = (edges.score(xy, weights) - chance) / spread
+    return scores
 
 
 def check_direction(

@@ -1,10 +1,10 @@
-"""How well points belong to an image: jumps of depth lie on its edges, and on them alone.
+"""How well points belong to an image: jumps of depth lie on its edges, along them, and there alone.
 
 The score of one way to put points into the image is a correlation: weights of the points, large at
-the near side of a jump of depth, with the strength of the image's edges. Its spread by chance is
-that of the same points at all shifts, since nearly all of these are wrong. So a score in standard
-deviations has one meaning for all images: it is 0 ± 1 for an image that the points do not belong
-to, and of eleven frames of KITTI it is 2.7 to 8.4 where they do.
+the near side of a jump of depth, with the strength of the image's edges in the jump's direction.
+Its spread by chance is that of the same points at all shifts, since nearly all of these are wrong.
+So a score in standard deviations has one meaning for all images: it is 0 ± 1 for an image that the
+points do not belong to, and of ten frames of KITTI it is 7 to 13 where they do.
 """
 
 from __future__ import annotations
@@ -16,64 +16,109 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pnpdepth_cli.camera import Floats
-from pnpdepth_cli.sensors.projection import Points
+from pnpdepth_cli.camera import Camera, Extrinsics, Floats
+from pnpdepth_cli.points import Size
+from pnpdepth_cli.sensors.lens import pixels_of
+from pnpdepth_cli.sensors.projection import points_in_image
 
-_LONGEST_PX = 640  # the image is reduced to this size
-_BLUR = 0.7  # pixels of the reduced image, as the next two
-_SURROUNDINGS = 8.0  # in which an edge is compared with others
+_LONGEST_PX = 1280  # the image is reduced to this size
+_BLUR = 1.0  # pixels of the reduced image, as the next three
+_SURROUNDINGS = 16.0  # in which an edge is compared with others
 _BAND = 12.0  # beyond which the strength of edges says nothing of a place
+_REACH = 1.0  # of an edge; jumps are no better known
 _DARK = 0.004  # gradient of noise, of the range of an image
 _NEIGHBOURS = 12  # nearest points, among which a jump of depth is looked for
-_JUMP = 1.3  # ratio of depths across a jump
+_JUMP = 1.3  # ratio of depths across a jump of weight 1
+_LEAST_WEIGHT = 0.15  # of a jump that counts; below are slopes, such as a road
+_TO_THE_FAR_SIDE = 0.3  # of the way, where the edge is: beams are wide, and the near side returns
+_LEAST_DEPTH_M = 0.1
 _LEAST_JUMPS = 30  # points; fewer tell too little
-_WITHIN = 1  # pixels of the reduced image, which a right calibration may be off
+
+
+class Jumps(NamedTuple):
+    """Where depth jumps from a beam of a scan to a neighbour's, in a camera's coordinates."""
+
+    xyz: Floats  # (N, 3) between the two, at the depth of the nearer
+    beyond: Floats  # (N, 3) a pixel farther towards the other
+    weights: Floats  # (N,), their squares add up to 1
+    clear: int  # number of those that are at least `_JUMP`
+
+    def largest(self, share: float) -> Jumps:
+        """Returns those of at least this share of the largest weight."""
+        which = self.weights >= share * self.weights.max()
+        return self._replace(
+            xyz=self.xyz[which], beyond=self.beyond[which], weights=self.weights[which]
+        )
+
+    def moved(self, motion: Extrinsics) -> Jumps:
+        """Returns the jumps in other coordinates."""
+        return self._replace(xyz=motion.apply(self.xyz), beyond=motion.apply(self.beyond))
+
+    def projected(self, camera: Camera) -> tuple[Floats, Floats]:
+        """Returns pixels (M, 2) of those before the camera, and weights (M, 3) for an `EdgeMap`.
+
+        The weights are products of a jump's direction in the image: x·x, y·y, x·y.
+        """
+        ahead = (self.xyz[:, 2] > _LEAST_DEPTH_M) & (self.beyond[:, 2] > _LEAST_DEPTH_M)
+        xy = pixels_of(camera, self.xyz[ahead])
+        steps = pixels_of(camera, self.beyond[ahead]) - xy
+        steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+        x, y = steps.T
+        products = np.column_stack([x * x, y * y, x * y])
+        return xy, products * self.weights[ahead, None]
 
 
 class EdgeMap(NamedTuple):
     """Edges of an image at a reduced size."""
 
-    strength: NDArray[np.float32]  # (h, w), mean 0 and standard deviation 1
+    strength: NDArray[np.float32]  # (h, w, 3), across x, across y, and their product; of mean 0
     scale: float  # of the reduced image
 
-    def score(self, xy: Floats, weight: Floats) -> float:
-        """Returns the correlation of weights (N,) at pixels (N, 2) with the edges there.
+    def score(self, xy: Floats, weights: Floats) -> float:
+        """Returns the correlation of weights (N, 3) at pixels (N, 2) with the edges there.
 
-        It is the best of shifts by a pixel. Outside the image the strength is 0.
+        Outside the image the strength is 0.
         """
-        height, width = self.strength.shape
-        padded = np.pad(self.strength, _WITHIN)
-        x, y = np.floor((np.asarray(xy, np.float64) + 0.5) * self.scale).astype(np.intp).T
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        x, y, weight = x[inside], y[inside], weight[inside]
-        shifts = range(2 * _WITHIN + 1)
-        return max(
-            float(weight @ padded[y + down, x + right]) for down in shifts for right in shifts
-        )
+        height, width = self.strength.shape[:2]
+        x, y = self._reduced(xy)
+        inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+        strength = self.strength.reshape(-1, 3).take(y[inside] * width + x[inside], axis=0)
+        return float(np.vdot(strength, weights.take(inside, axis=0)))
 
-    def shifted(self, xy: Floats, weight: Floats, reach_px: tuple[float, float]) -> Floats:
+    def shifted(self, xy: Floats, weights: Floats, reach_px: tuple[float, float]) -> Floats:
         """Returns the correlation at all shifts up to `reach_px` down and right, 0 in the middle.
 
         Args:
             xy: (N, 2) pixels of the image.
-            weight: (N,).
+            weights: (N, 3).
             reach_px: Pixels of the image.
         """
-        height, width = self.strength.shape
-        down, right = (max(1, round(each * self.scale)) for each in reach_px)
+        height, width = self.strength.shape[:2]
+        down = max(1, round(reach_px[0] * self.scale))
+        right = max(1, round(reach_px[1] * self.scale))
+        x, y = self._reduced(xy)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        place = (y * width + x)[inside]
+        total = np.zeros((2 * down + 1, 2 * right + 1))
+        for channel in range(3):
+            drawn = np.bincount(place, weights[inside, channel], height * width)
+            template = drawn.reshape(height, width).astype(np.float32)
+            strength = cv2.copyMakeBorder(
+                self.strength[:, :, channel],
+                top=down,
+                bottom=down,
+                left=right,
+                right=right,
+                borderType=cv2.BORDER_CONSTANT,
+                value=0,
+            )
+            total += cv2.matchTemplate(strength, template, cv2.TM_CCORR)
+        return total
+
+    def _reduced(self, xy: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns and rows of the reduced image, of pixels (N, 2)."""
         x, y = np.floor((np.asarray(xy, np.float64) + 0.5) * self.scale).astype(np.intp).T
-        rows, columns = height + 2 * down, width + 2 * right
-        x, y = x + right, y + down
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        drawn = np.bincount((y * columns + x)[inside], weight[inside], rows * columns)
-        template = drawn.reshape(rows, columns).astype(np.float32)
-        padded = cv2.copyMakeBorder(
-            self.strength,
-            *(2 * down, 2 * down, 2 * right, 2 * right),
-            cv2.BORDER_CONSTANT,
-            value=0,
-        )
-        return cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
+        return x, y
 
 
 def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
@@ -82,24 +127,75 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
     scale = min(1.0, _LONGEST_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.GaussianBlur(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
-    gradients = [cv2.Sobel(small, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1))]
-    strength = np.sqrt(np.square(gradients).sum(axis=(0, 3)))
+    across_x = cv2.Sobel(small, cv2.CV_32F, 1, 0, scale=0.125)
+    across_y = cv2.Sobel(small, cv2.CV_32F, 0, 1, scale=0.125)
+    # The strength of edges is relative to their surroundings.
+    products = np.dstack(
+        [
+            np.square(across_x).sum(axis=2),
+            np.square(across_y).sum(axis=2),
+            2 * (across_x * across_y).sum(axis=2),
+        ]
+    )
+    squared = products[:, :, 0] + products[:, :, 1] + 1e-12
+    strength = np.sqrt(squared)
     relative = np.sqrt(strength / (cv2.GaussianBlur(strength, (0, 0), _SURROUNDINGS) + _DARK))
-    edges = relative - cv2.GaussianBlur(relative, (0, 0), _BAND)
-    return EdgeMap(np.asarray(edges / (edges.std() + 1e-9), np.float32), scale)
+    # Each direction has its share: with the weights of `Jumps.projected`, it is the squared cosine
+    # of the angle between the two.
+    shares = products * (relative / squared)[:, :, None]
+    sharp = cv2.GaussianBlur(shares, (0, 0), _REACH)
+    return EdgeMap(np.asarray(sharp - cv2.GaussianBlur(shares, (0, 0), _BAND)), scale)
 
 
-def jump_weights(points: Points) -> Floats | None:
-    """Returns (N,) weights of points, large at the near side of a jump of depth, of mean 0.
+def jumps_of(
+    scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
+) -> Jumps | None:
+    """Returns where depth jumps in a scan (N, 3); None where jumps are too few to tell anything.
 
-    Their sum of squares is 1. None where jumps are too few to tell anything.
+    Neighbours are those that the scanner sees: from elsewhere, near and far beams mix, and where
+    the camera is taken to be must not change what a jump is.
+
+    Args:
+        scan: In the scanner's coordinates.
+        camera: Points outside its image (H, W) are left out.
+        scanner: Its pose.
+        size: (H, W).
     """
-    if len(points) <= _NEIGHBOURS:
+    # Pixels of a camera at the scanner's place.
+    seen, _ = points_in_image(scanner.apply(scan), camera, size)
+    seen = seen - scanner.translation
+    seen = seen[seen[:, 2] > _LEAST_DEPTH_M]
+    if len(seen) <= _NEIGHBOURS:
         return None
-    _, near = cKDTree(points.xy).query(points.xy, k=_NEIGHBOURS)
-    ratio = points.depth[near].max(axis=1) / points.depth
-    jump = np.square(np.clip(np.log(ratio) / np.log(_JUMP), 0, 1)).astype(np.float64)
-    if np.count_nonzero(ratio > _JUMP) < _LEAST_JUMPS:
+    focal_px = float(camera.intrinsics[0, 0])
+    depth = seen[:, 2]
+    xy = focal_px * seen[:, :2] / seen[:, 2:]
+    # A point's weight is that of the largest jump to a farther neighbour.
+    distances, neighbours = cKDTree(xy).query(xy, k=_NEIGHBOURS)
+    ratios = depth[neighbours] / depth[:, None]
+    weights = np.clip(np.log(ratios) / np.log(_JUMP), 0, 1)
+    largest = weights.max(axis=1)
+    clear = int(np.count_nonzero(largest >= 1))
+    if clear < _LEAST_JUMPS:
         return None
-    jump -= jump.mean()
-    return np.asarray(jump / np.linalg.norm(jump))
+    near = largest >= _LEAST_WEIGHT
+    distances, neighbours = distances[near], neighbours[near]
+    weights, largest = weights[near], largest[near]
+    # Its direction is the mean one to the neighbours that are as far; the edge is before them.
+    weights[weights < largest[:, None] / 2] = 0
+    steps = xy[neighbours] - xy[near][:, None]
+    directions = (steps * (weights / np.maximum(distances, 1e-6))[:, :, None]).sum(axis=1)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    nearest_far = np.where(weights > 0, distances, np.inf).argmin(axis=1)
+    step = steps[np.arange(len(steps)), nearest_far]
+    between = xy[near] + _TO_THE_FAR_SIDE * step
+    ends = [
+        np.column_stack([pixels / focal_px, np.ones(len(pixels))]) * depth[near, None]
+        for pixels in (between, between + directions)
+    ]
+    return Jumps(
+        xyz=ends[0] + scanner.translation,
+        beyond=ends[1] + scanner.translation,
+        weights=largest / np.linalg.norm(largest),
+        clear=clear,
+    )

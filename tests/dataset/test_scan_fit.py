@@ -20,7 +20,6 @@ from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.io.calibration import Calibration, read_calibration
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
-from pnpdepth_cli.sensors.projection import project_velodyne
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 Image = NDArray[np.float32]
@@ -38,9 +37,7 @@ def street() -> Frame:
 
 
 def told(rgb: Image, scan: Scan, calibration: Calibration) -> list[str]:
-    assert calibration.scanner is not None
-    points = project_velodyne(scan, calibration.camera, calibration.scanner, rgb.shape[:2])
-    return fit_warning(points, scan, calibration, {}, rgb)
+    return fit_warning(scan, calibration, {}, rgb)
 
 
 def moved(
@@ -80,6 +77,45 @@ def test_a_scan_of_another_time_is_found(ahead_m: float, street: Frame) -> None:
 def test_other_axes_are_found(matrix: NDArray[np.float64], text: str, street: Frame) -> None:
     rgb, scan, right = street
     (warning,) = told(rgb, scan @ matrix, right)
+    assert text in warning
+
+
+def test_inverted_extrinsics_are_found(street: Frame) -> None:
+    rgb, scan, right = street
+    assert right.scanner is not None
+    turn = Rotation.from_euler("y", 10, degrees=True).as_matrix()  # of a scanner in camera axes
+    pose = Extrinsics(turn, right.scanner.translation)
+    of_camera_axes = pose.inverse().apply(right.scanner.apply(scan))
+    assert told(rgb, of_camera_axes, replace(right, scanner=pose)) == []
+    (warning,) = told(rgb, of_camera_axes, replace(right, scanner=pose.inverse()))
+    assert "inverted" in warning
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_a_square_image_that_is_turned_is_found(
+    turns: int, is_mirrored: bool, street: Frame
+) -> None:
+    rgb, scan, right = street
+    left = 430
+    intrinsics = right.camera.intrinsics.copy()
+    intrinsics[0, 2] -= left
+    camera = replace(right.camera, intrinsics=intrinsics, size=(375, 375))
+    square = rgb[:, left : left + 375]
+    turned = np.rot90(square[:, ::-1] if is_mirrored else square, turns)
+    (warning,) = told(np.ascontiguousarray(turned), scan, replace(right, camera=camera))
+    assert "with the image" in warning
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "text"),
+    [(1, -1, "mirrored"), (-1, 1, "rows in reverse"), (-1, -1, "turned by 180°")],
+)
+def test_a_mirrored_or_turned_image_is_found(
+    rows: int, columns: int, text: str, street: Frame
+) -> None:
+    rgb, scan, right = street
+    (warning,) = told(np.ascontiguousarray(rgb[::rows, ::columns]), scan, right)
     assert text in warning
 
 
