@@ -39,7 +39,9 @@ def network(monkeypatch: pytest.MonkeyPatch) -> pnp.Network:
     return pnp.load_network("sparse2dense-tiny")
 
 
-def test_learnt_weights_go_at_close(network: pnp.Network, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learnt_weights_are_used_until_the_refiner_is_closed(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("scipy.stats.ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
     before = copy.deepcopy(network.module.state_dict())
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
@@ -144,7 +146,9 @@ def test_the_image_encoder_does_not_learn(monkeypatch: pytest.MonkeyPatch) -> No
     assert own.keys() - learnt.weights.keys() == {n for n in own if n.startswith("encoder.")}
 
 
-def test_infinite_loss_ends_learning(network: pnp.Network, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_infinite_loss_ends_learning_with_an_error(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(adapt, "LR", 1e30)
     with pytest.raises(pnp.DivergedError):
         adapt.learn(network, named(range(8)))

@@ -52,7 +52,9 @@ def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
     ids=["inf", "nan", "division by zero"],
 )
 @pytest.mark.parametrize("align", ["none", "scale"])
-def test_an_infinite_sky_has_no_part(sky: Callable[[Tensor, Tensor], Tensor], align: str) -> None:
+def test_an_infinite_sky_has_no_part_in_the_updates(
+    sky: Callable[[Tensor, Tensor], Tensor], align: str
+) -> None:
     class Sky(Brightness):
         def forward(self, rgb: Tensor) -> Tensor:
             return sky(super().forward(rgb), (torch.arange(rgb.shape[2]) < 15)[:, None])

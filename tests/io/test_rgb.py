@@ -20,7 +20,9 @@ COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.u
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("colours", [COLOURS, COLOURS_16])
-def test_bits_are_kept_and_alpha_dropped(tmp_path: Path, suffix: str, colours: np.ndarray) -> None:
+def test_all_bits_of_a_colour_are_kept_and_alpha_is_dropped(
+    tmp_path: Path, suffix: str, colours: np.ndarray
+) -> None:
     path = tmp_path / f"a{suffix}"
     expected = colours / np.float32(np.iinfo(colours.dtype).max)
     alpha = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)
