@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from pnpdepth_cli.dataset.agreement import check_order, compare_depths, unit_warning
+from pnpdepth_cli.dataset.agreement import Agreement, check_order, compare_depths, unit_warning
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading
 
@@ -102,3 +102,34 @@ def test_the_rank_correlation_is_spearmans_also_of_equal_depths() -> None:
     first = RNG.integers(1, 9, 500).astype(float)
     second = first + RNG.integers(0, 5, 500)
     assert compare_depths(first, second).rank == pytest.approx(spearmanr(first, second).statistic)
+
+
+@pytest.mark.parametrize(
+    "per_metre",
+    [
+        pytest.param(1000.0, id="millimetres"),
+        pytest.param(256.0, id="KITTI"),
+        pytest.param(5000.0, id="TUM"),
+        pytest.param(100.0, id="centimetres"),
+        pytest.param(10.0, id="decimetres"),
+        pytest.param(4000.0, id="quarters of a millimetre"),
+        pytest.param(6553.5, id="Replica"),
+        pytest.param(39.3701, id="inches"),
+        pytest.param(3.28084, id="feet"),
+    ],
+)
+def test_a_ratio_near_a_scale_in_use_names_that_scale(per_metre: float) -> None:
+    found = Agreement(pairs=1000, rank=1.0, ratio=1.02 * per_metre, spread=0.01)
+    text = str(unit_warning("depths", found, {"--scale": FLOAT, "--gt-scale": FLOAT}))
+    assert f"--scale {per_metre:.6g} (now 1)" in text
+
+
+def test_ten_pairs_show_a_unit_and_nine_do_not() -> None:
+    assert Agreement(pairs=10, rank=1.0, ratio=1000.0, spread=0.01).is_unit
+    assert not Agreement(pairs=9, rank=1.0, ratio=1000.0, spread=0.01).is_unit
+
+
+@pytest.mark.parametrize(("pairs", "is_certain"), [(10, False), (100, True)])
+def test_an_order_that_chance_may_explain_is_none(pairs: int, is_certain: bool) -> None:
+    assert Agreement(pairs=pairs, rank=0.9, ratio=1.0, spread=0.1).is_ordered == is_certain
+    assert Agreement(pairs=pairs, rank=-0.9, ratio=1.0, spread=0.1).is_reversed == is_certain
