@@ -127,3 +127,9 @@ def test_the_exif_orientation_is_told(orientation: int, tmp_path: Path) -> None:
     assert orientation_in(tmp_path / "a.jpg") == orientation
     Image.new("RGB", (8, 4)).save(tmp_path / "a.png")
     assert orientation_in(tmp_path / "a.png") == 1
+
+
+def test_the_orientation_of_an_exr_which_has_no_exif_is_upright(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"\x76\x2f\x31\x01")  # how an EXR begins
+    assert orientation_in(path) == 1
