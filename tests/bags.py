@@ -43,7 +43,8 @@ def write_bag(
     """
 
     def messages() -> Iterator[tuple[str, int, str, Fields]]:
-        start, step = 1_700_000_000 * 10**9, 30_000_000
+        start = 1_700_000_000 * 10**9
+        step = 30_000_000
         if unit is not None:
             yield unit[0], start, "std_msgs/msg/Float32", {"data": np.float32(unit[1])}
         yield "/tf_static", start, "tf2_msgs/msg/TFMessage", {"transforms": _transforms()}
@@ -76,7 +77,8 @@ def write_bag(
                 yield (POINTS, later_ns, *_cloud(stamp))
 
     ros1 = path.suffix == ".bag"
-    store, opened = message_types(ros1=ros1), _writer(path)
+    store = message_types(ros1=ros1)
+    opened = _writer(path)
     if compression is not None:
         opened.set_compression(compression)
     with opened as writer:
@@ -117,7 +119,7 @@ def _message(store: Any, kind: str, given: Mapping[str, Any]) -> Any:
         elif node is Nodetype.BASE:
             values[name] = value or ("" if of[0] == "string" else 0)
         elif of[0][0] is Nodetype.NAME:
-            values[name] = [_message(store, of[0][1], each) for each in value]
+            values[name] = [_message(store, of[0][1], nested) for nested in value]
         else:
             values[name] = np.zeros(of[1]) if value is None else value
     return store.types[kind](**values)
@@ -193,7 +195,8 @@ def depth_m() -> np.ndarray:
 
 def _depth(header: Fields, kind: str, unit_m: float = 0.001) -> tuple[str, Fields]:
     """The message of `depth_m`, whose codes have so many metres."""
-    depth, (encoding, _, compressed) = depth_m(), kind.partition("; ")
+    depth = depth_m()
+    (encoding, _, compressed) = kind.partition("; ")
     kinds = {"32FC1": "<f4", "64FC1": "<f8"}
     codes = (depth / unit_m).round().astype("<u2")
     if encoding in kinds:
@@ -216,12 +219,15 @@ def _cloud(header: Fields) -> tuple[str, Fields]:
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": 28})
     y, z = np.meshgrid(np.linspace(-2, 2, 15), np.linspace(-1.5, 1.5, 10))
     points = np.zeros(151, layout)
-    points["x"], points["y"][:150], points["z"][:150] = 5.0, y.ravel(), z.ravel()
+    points["x"] = 5.0
+    points["y"][:150] = y.ravel()
+    points["z"][:150] = z.ravel()
     points["x"][150] = np.nan
     fields = [
         {"name": name, "offset": offset, "datatype": kind, "count": 1}
         for name, offset, kind in zip(names, offsets, [4, 7, 7, 8], strict=True)
     ]
-    data, step = np.frombuffer(points.tobytes(), np.uint8), layout.itemsize
+    data = np.frombuffer(points.tobytes(), np.uint8)
+    step = layout.itemsize
     sizes = {"height": 1, "width": len(points), "point_step": step, "row_step": data.size}
     return "sensor_msgs/msg/PointCloud2", sizes | {"header": header, "fields": fields, "data": data}

@@ -30,7 +30,7 @@ def tree(root: Path, patterns: str) -> None:
     """Creates the files of patterns such as "rgb/{a,b}.png depth/a.png" below a folder."""
     for pattern in patterns.split():
         parts = re.split(r"\{([^}]*)\}", pattern)
-        choices = [part.split(",") if index % 2 else [part] for index, part in enumerate(parts)]
+        choices = [piece.split(",") if index % 2 else [piece] for index, piece in enumerate(parts)]
         touch(*(root / "".join(path) for path in itertools.product(*choices)))
 
 

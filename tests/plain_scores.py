@@ -8,8 +8,11 @@ import numpy as np
 def brute(predicted: np.ndarray, gt: np.ndarray) -> dict[str, float]:
     known = np.isfinite(gt) & (gt > 0)
     scored = known & np.isfinite(predicted) & (predicted > 0)
-    p, g = predicted[scored].astype(np.float64), gt[scored].astype(np.float64)
-    logs, inverse, ratio = np.log(p) - np.log(g), 1 / p - 1 / g, np.maximum(p / g, g / p)
+    p = predicted[scored].astype(np.float64)
+    g = gt[scored].astype(np.float64)
+    logs = np.log(p) - np.log(g)
+    inverse = 1 / p - 1 / g
+    ratio = np.maximum(p / g, g / p)
     return {
         "rmse": np.sqrt(np.mean((p - g) ** 2)),
         "mae": np.mean(abs(p - g)),

@@ -18,7 +18,15 @@ RELATIVE_ERRORS = {torch.float32: 1e-6, torch.float64: 2e-15}
 """The largest ones: 8 roundings, as of a sum of some hundred products in another order."""
 
 PRODUCTS = {
-    *("convolution", "convolution_backward", "mm", "addmm", "bmm", "baddbmm", "mv", "addmv", "dot"),
+    "convolution",
+    "convolution_backward",
+    "mm",
+    "addmm",
+    "bmm",
+    "baddbmm",
+    "mv",
+    "addmv",
+    "dot",
     "_scaled_dot_product_flash_attention_for_cpu",
     "_scaled_dot_product_flash_attention_for_cpu_backward",
 }

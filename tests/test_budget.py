@@ -9,17 +9,28 @@ from pnpdepth_cli.budget import check_claim, set_max_pixels
 from pnpdepth_cli.errors import InputError, ModelError
 
 
-def test_the_default_is_64_megapixels_or_less_and_files_grow_with_max_pixels() -> None:
+@pytest.mark.parametrize(("most", "of_a_file"), [(1 << 30, 1 << 32), (9, 1 << 20)])
+def test_a_file_may_be_larger_where_more_pixels_are_allowed(most: int, of_a_file: int) -> None:
     try:
-        for most, of_a_file in ((1 << 30, 1 << 32), (9, 1 << 20)):
-            set_max_pixels(most)
-            assert (budget.max_pixels(), budget.max_file_bytes()) == (most, of_a_file)
+        set_max_pixels(most)
+        assert (budget.max_pixels(), budget.max_file_bytes()) == (most, of_a_file)
     finally:
         set_max_pixels(None)
+
+
+def test_the_default_is_64_megapixels_or_less() -> None:
     assert 1 << 20 < budget.max_pixels() <= 64_000_000
+
+
+def test_by_default_a_file_has_one_gibibyte_at_most() -> None:
     assert budget.max_file_bytes() == 1 << 30
+
+
+def test_decoded_values_have_more_than_32_bytes_for_a_pixel() -> None:
     assert budget.max_decoded_bytes() > 32 * budget.max_pixels()
-    # A small file may hold an image of one colour, but not any number of values.
+
+
+def test_a_small_file_may_hold_an_image_of_one_colour_but_not_any_number_of_values() -> None:
     assert budget.max_values_from(1) == 1 << 25
     assert budget.max_values_from(1 << 20) == min(budget.max_pixels(), 1032 << 20)
 

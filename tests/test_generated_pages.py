@@ -46,9 +46,9 @@ def class_lines(node: ast.ClassDef) -> Iterator[str]:
     """A class with its fields."""
     yield f"class {node.name}"
     yield from description(ast.get_docstring(node))
-    for each, after in zip(node.body, [*node.body[1:], None], strict=True):
-        if isinstance(each, ast.AnnAssign):
-            yield from (f"    {line}" for line in field_lines(each, after))
+    for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign):
+            yield from (f"    {line}" for line in field_lines(statement, after))
 
 
 def fields() -> str:

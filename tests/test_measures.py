@@ -29,18 +29,21 @@ def depth_pro(predicted: np.ndarray, truth: np.ndarray) -> float:
             p, g = (np.rot90(image, turns) for image in (predicted, truth))
             known = (g[:, :-1] > 0) & (g[:, 1:] > 0)
             own, true = (
-                known & (each[:, :-1] > 0) & (each[:, 1:] > limit * each[:, :-1]) for each in (p, g)
+                known & (depths[:, :-1] > 0) & (depths[:, 1:] > limit * depths[:, :-1])
+                for depths in (p, g)
             )
             precision.append((own & true).sum() / max(own.sum(), 1))
             recall.append((own & true).sum() / max(true.sum(), 1))
-        p, r = np.mean(precision), np.mean(recall)
+        p = np.mean(precision)
+        r = np.mean(recall)
         scores.append(2 * p * r / (p + r) if p + r else 0.0)
     return float(np.average(scores, weights=LIMITS))
 
 
 def moge(predicted: np.ndarray, truth: np.ndarray, radius: int) -> float:
     """The boundary metric of MoGe: all pixels within the radius, counted together."""
-    counts, (height, width) = np.zeros((len(LIMITS), 3)), truth.shape
+    counts = np.zeros((len(LIMITS), 3))
+    (height, width) = truth.shape
     for y, x in product(range(-radius, radius + 1), repeat=2):
         if x * x + y * y > radius * radius:
             continue
@@ -49,8 +52,8 @@ def moge(predicted: np.ndarray, truth: np.ndarray, radius: int) -> float:
         known = (truth[inner] > 0) & (truth[moved] > 0)
         for row, limit in zip(counts, LIMITS, strict=True):
             own, true = (
-                known & (each[inner] > 0) & (each[moved] > limit * each[inner])
-                for each in (predicted, truth)
+                known & (depths[inner] > 0) & (depths[moved] > limit * depths[inner])
+                for depths in (predicted, truth)
             )
             row += (own & true).sum(), own.sum(), true.sum()
     hits, own, true = counts.T
@@ -104,12 +107,14 @@ def test_a_step_in_its_place_scores_one_and_a_shifted_or_a_missing_one_nothing()
 def test_errors_by_depth_are_those_of_the_pixels_of_each_part() -> None:
     for depth, truth in frames():
         measures = by_depth(MEASURES, 3.0, 12.0)
-        tensors = (torch.from_numpy(each.copy()) for each in (depth, truth))
+        tensors = (torch.from_numpy(array.copy()) for array in (depth, truth))
         found = list(score(*tensors, measures).values())
         parts = (truth < 3, (truth >= 3) & (truth < 12), truth >= 12)
-        expected = [brute(depth, np.where(part, truth, 0))[key] for part in parts for key in MAIN]
+        expected = [
+            brute(depth, np.where(region, truth, 0))[key] for region in parts for key in MAIN
+        ]
         assert found == pytest.approx(expected, abs=1e-9, nan_ok=True)
-    keys = [f"{key}_{part}" for part in ("near", "middle", "far") for key in MAIN]
+    keys = [f"{key}_{region}" for region in ("near", "middle", "far") for key in MAIN]
     assert [measure.key for measure in measures] == keys
 
 
@@ -121,18 +126,20 @@ def test_a_mean_is_over_the_frames_that_have_the_value() -> None:
 
 def sigma_measures(*images: np.ndarray) -> list[float]:
     """The fractions within one and two σ, and AUSE, of prediction, ground truth and σ."""
-    images = tuple(each.astype(np.float32) for each in images)
+    images = tuple(image.astype(np.float32) for image in images)
     return [measure.formula(*images) for measure in OF_SIGMA if measure.formula]
 
 
 def test_a_right_deviation_is_calibrated_and_the_sparsification_error_is_by_definition() -> None:
     rng = np.random.default_rng(0)
-    gt, sigma = rng.uniform(2, 6, (300, 300)), rng.uniform(0.02, 0.2, (300, 300))
+    gt = rng.uniform(2, 6, (300, 300))
+    sigma = rng.uniform(0.02, 0.2, (300, 300))
     depth = gt + sigma * rng.normal(size=gt.shape)
     right, half = (sigma_measures(depth, gt, sigma * factor) for factor in (1, 0.5))
     assert [*right[:2], half[0]] == pytest.approx([0.683, 0.954, 0.383], abs=0.01)
 
-    gt, error = np.full((1, 20), 10.0), np.arange(1.0, 21)[None]
+    gt = np.full((1, 20), 10.0)
+    error = np.arange(1.0, 21)[None]
     worst = sigma_measures(gt + error, gt, error[:, ::-1])[2]
     by_sigma = [error[0, n:].mean() for n in range(20)]
     by_error = [error[0, : 20 - n].mean() for n in range(20)]

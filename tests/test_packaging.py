@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -64,7 +65,7 @@ def test_the_public_ci_runs_every_part_of_the_script_on_the_lowest_and_the_highe
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     steps = [step["run"].split() for job in jobs.values() for step in job["steps"] if "run" in step]
     assert {program for program, *_ in steps} == {".ci/run"}
-    parts = {part for _, *parts in steps for part in parts if part.isalpha()}
+    parts = {name for _, *parts in steps for name in parts if name.isalpha()}
     parts |= {row["part"] for row in jobs["more"]["strategy"]["matrix"]["include"]}
     assert parts == {*re.findall(r"^part_(\w+)\(\)", script, re.MULTILINE)}
     classifiers = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["classifiers"]
@@ -72,12 +73,19 @@ def test_the_public_ci_runs_every_part_of_the_script_on_the_lowest_and_the_highe
     assert jobs["readme"]["strategy"]["matrix"]["python"] == [lowest, highest]
 
 
-@pytest.mark.slow
-def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: Path) -> None:
-    # The wheel, built from a copy of the sources.
+class Wheel(NamedTuple):
+    """A wheel that was built from a copy of the sources."""
+
+    file: Path
+    installed: Path
+    """The folder into which it was unpacked."""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Wheel:
     pytest.importorskip("build", reason="needs build")
-    source, installed, empty = (tmp_path / name for name in ("source", "installed", "empty"))
-    empty.mkdir()
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
     for name in ("pnpdepth_cli", "model_zoo_defs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -85,29 +93,50 @@ def test_the_wheel_is_small_and_refines_a_sample_from_an_empty_folder(tmp_path: 
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "dist"]
     done = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = (source / "dist").glob("*.whl")
-    assert wheel.stat().st_size < 12e6
-    names = zipfile.ZipFile(wheel).namelist()
-    assert not [name for name in names if "training" in name or name.startswith("tests")]
-    zipfile.ZipFile(wheel).extractall(installed)
+    (file,) = (source / "dist").glob("*.whl")
+    zipfile.ZipFile(file).extractall(folder / "installed")
+    return Wheel(file=file, installed=folder / "installed")
 
-    # It refines by its own files, and says which weights it has not.
+
+def refine_with(wheel: Wheel, empty: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """`refine` of a sample from an empty folder, which first prints where the package is."""
     sample = ROOT / "samples" / "indoor"
     code = (
         "import pnpdepth_cli; print(pnpdepth_cli.__file__)\n"
         "from pnpdepth_cli.cli.main import main; main()"
     )
-    command = [sys.executable, "-c", code, "refine", sample / "rgb.png"]
-    command += ["--sparse", sample / "sparse.png", "-o"]
-    for more, exit_code, message in (
-        (["out"], 0, ""),
-        (["other", "--model", "eigen-tiny"], 4, "eigen-tiny.safetensors"),
-    ):
-        done = subprocess.run(
-            [*command, *more], env={**os.environ, "PYTHONPATH": str(installed)}, cwd=empty,
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert (done.returncode, message in done.stderr) == (exit_code, True), done.stderr
-        assert Path(done.stdout.splitlines()[0]).is_relative_to(installed)
-    files = (empty / "out/rgb_depth.png", sample / "gt.png")
-    assert pnp.score(*(read_depth(path).values for path in files))["mae"] < 0.2
+    command = [sys.executable, "-c", code, "refine", str(sample / "rgb.png")]
+    command += ["--sparse", str(sample / "sparse.png"), *more]
+    environment = {**os.environ, "PYTHONPATH": str(wheel.installed)}
+    return subprocess.run(
+        command, env=environment, cwd=empty, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+def test_the_wheel_is_less_than_12_megabytes(wheel: Wheel) -> None:
+    assert wheel.file.stat().st_size < 12e6
+
+
+@pytest.mark.slow
+def test_the_wheel_has_neither_training_nor_tests(wheel: Wheel) -> None:
+    names = zipfile.ZipFile(wheel.file).namelist()
+    assert not [name for name in names if "training" in name or name.startswith("tests")]
+
+
+@pytest.mark.slow
+def test_the_wheel_refines_a_sample_from_an_empty_folder(wheel: Wheel, tmp_path: Path) -> None:
+    done = refine_with(wheel, tmp_path, "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(wheel.installed)
+    depth = read_depth(tmp_path / "out/rgb_depth.png").values
+    truth = read_depth(ROOT / "samples/indoor/gt.png").values
+    assert pnp.score(depth, truth)["mae"] < 0.2
+
+
+@pytest.mark.slow
+def test_the_wheel_names_the_file_of_weights_that_it_has_not(wheel: Wheel, tmp_path: Path) -> None:
+    done = refine_with(wheel, tmp_path, "-o", "other", "--model", "eigen-tiny")
+    assert done.returncode == 4, done.stderr
+    assert "eigen-tiny.safetensors" in done.stderr
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(wheel.installed)

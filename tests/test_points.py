@@ -74,7 +74,8 @@ def test_scattered_points_are_on_their_pixels_and_the_nearest_wins(
     here = SparsePoints(xy=xy, depth=torch.tensor([d for *_, d in pixels]), size=(height, width))
     expected = torch.zeros(height, width)
     for (x, y), depth in zip(here.xy.round().tolist(), here.depth.tolist(), strict=True):
-        row, column = min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)
+        row = min(max(int(y), 0), height - 1)
+        column = min(max(int(x), 0), width - 1)
         now = float(expected[row, column])
         expected[row, column] = depth if now == 0 else min(now, depth)
     assert torch.equal(here.scatter(), expected[None, None])

@@ -42,7 +42,8 @@ def scannet(root: Path) -> None:
 
 def kitti(root: Path) -> None:
     """A frame with points in 20 m on every 4th pixel of every 4th row, and one point in 5 m."""
-    truth, points = np.zeros(KITTI, np.uint16), np.zeros(KITTI, np.uint16)
+    truth = np.zeros(KITTI, np.uint16)
+    points = np.zeros(KITTI, np.uint16)
     truth[100:] = points[100::4, ::4] = 20 * 256
     points[201, 601] = 5 * 256
     image(root / f"image/{SELECTED.format('image')}.png", *KITTI)
@@ -89,12 +90,12 @@ def test_frames_points_and_scored_pixels_are_those_of_the_paper(name: str, tmp_p
     root = tmp_path / "data"
     maker(root)
     read = read_as_batch(root, name)
-    assert [len(each.points) for each in read.values()] == [points] * frames
-    for frame, each in read.items():
-        depth_file(tmp_path / "out" / f"{frame}_depth.npy", np.full(each.gt.shape, 2.0))
-        height, width = each.gt.shape
+    assert [len(frame_read.points) for frame_read in read.values()] == [points] * frames
+    for frame, frame_read in read.items():
+        depth_file(tmp_path / "out" / f"{frame}_depth.npy", np.full(frame_read.gt.shape, 2.0))
+        height, width = frame_read.gt.shape
         result = result_record(size=(width, height))
-        record = FrameRecord(inputs={"sparse": each.sources["sparse"]}, result=result)
+        record = FrameRecord(inputs={"sparse": frame_read.sources["sparse"]}, result=result)
         record.write(tmp_path / "out" / f"{frame}.json")
     found = evaluate(EvalRequest(prediction=tmp_path / "out", ground_truth=root, protocol=name))
     assert [scores_of(frame)["pixels"] for frame in found.frames] == [pixels] * frames
@@ -138,6 +139,8 @@ def test_points_behind_the_foreground_are_those_of_two_windows() -> None:
     )
     near = (abs(rows[:, None] - rows) <= 3) & (abs(columns[:, None] - columns) <= 3)
     lowest = np.array([values[window].min() for window in near])
-    expected = [own - lowest[window].min() > 1.5 for window, own in zip(near, values, strict=True)]
+    expected = [
+        depths - lowest[window].min() > 1.5 for window, depths in zip(near, values, strict=True)
+    ]
     assert behind_foreground(points, 7, 1.5).tolist() == expected
     assert 0 < sum(expected) < len(values)

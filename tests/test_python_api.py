@@ -197,7 +197,10 @@ def test_a_refiner_takes_maps_rows_and_points_alike(network: pnp.Network, frame:
     points = pnp.SparsePoints(xy=xyz[:, :2], depth=xyz[:, 2], size=sparse.shape)
     before = {name: value.clone() for name, value in network.module.state_dict().items()}
     with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
-        depths = [refiner.refine(rgb, given).depth for given in (sparse, sparse, rows, points)]
+        depths = [
+            refiner.refine(rgb, sparse_depth).depth
+            for sparse_depth in (sparse, sparse, rows, points)
+        ]
     assert all(np.array_equal(depths[0], depth) for depth in depths[1:])
     assert all(torch.equal(before[n], v) for n, v in network.module.state_dict().items())
     assert not any("forward" in module.__dict__ for module in network.module.modules())
@@ -207,7 +210,7 @@ def test_threads_share_one_refiner_but_two_no_network(network: pnp.Network, fram
     rgb, sparse = frame
     fewer = np.where(np.arange(sparse.shape[1]) % 2, sparse, 0)
     with pnp.Refiner(network, pnp.Settings(iterations=1)) as refiner:
-        alone = [refiner.refine(rgb, given).depth for given in (sparse, fewer)]
+        alone = [refiner.refine(rgb, sparse_depth).depth for sparse_depth in (sparse, fewer)]
         with ThreadPoolExecutor(2) as pool:
             given = [sparse, fewer] * 3
             together = list(pool.map(lambda each: refiner.refine(rgb, each).depth, given))
@@ -280,7 +283,8 @@ def test_a_depth_map_of_another_network_is_given_as_an_array(
 def test_integers_are_scaled_by_their_type_or_unit(network: pnp.Network, frame: Frame) -> None:
     rgb, sparse = frame
     settings = pnp.Settings(iterations=0, align="scale")
-    image, codes = np.round(rgb * 255).astype(np.uint8), np.round(sparse * 1000).astype(np.uint16)
+    image = np.round(rgb * 255).astype(np.uint8)
+    codes = np.round(sparse * 1000).astype(np.uint16)
     as_floats = (image / 255).astype(np.float32), (codes / 1000).astype(np.float32)
     expected = pnp.refine(network, *as_floats, settings).depth
     assert np.array_equal(pnp.refine(network, image, codes, settings, unit="mm").depth, expected)
@@ -330,7 +334,7 @@ def test_every_form_of_an_image_is_read_alike() -> None:
     rgb = grey.repeat(3, axis=2)
     forms = (rgb, rgb / np.float32(255), torch.from_numpy(rgb), grey[:, :, 0])
     expected, *others = (frame_of_arrays(form, [[1.0, 2, 3]]).rgb for form in forms)
-    assert all(torch.equal(given, expected) for given in others)
+    assert all(torch.equal(tensor, expected) for tensor in others)
 
 
 def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
@@ -345,15 +349,16 @@ def test_rows_that_are_no_points_of_the_image_are_counted() -> None:
 
 def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -> None:
     torch.manual_seed(0)
-    first, last = nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(4, 1, 3, padding=1)
+    first = nn.Conv2d(3, 4, 3, padding=1)
+    last = nn.Conv2d(4, 1, 3, padding=1)
     module = nn.Sequential(first, nn.Tanh(), last, nn.Softplus())
     settings = pnp.Settings(iterations=3, lr="3%")
     named = {"name": "bright", "input_kind": "rgb", "output_scale": "scale"}
     definition = pnp.ModelDefinition(
         **named, size=pnp.Multiple(1), build=lambda: module, layers=("0",)
     )
-    for known in (None, definition):
-        network = pnp.load_network(module, definition=known)
+    for known_definition in (None, definition):
+        network = pnp.load_network(module, definition=known_definition)
         assert network.module is module
         refined = pnp.refine(network, *frame, settings)
         assert refined.losses[-1] < refined.losses[0]

@@ -35,20 +35,36 @@ def test_nothing_to_score_is_not_a_number() -> None:
     assert score(torch.zeros(2), torch.ones(2)).coverage == 0
 
 
-def test_every_measure_is_a_score_with_a_unit() -> None:
+def test_scores_have_every_measure_in_its_order_then_pixels_and_coverage() -> None:
     scores = score(torch.ones(2), torch.ones(2))
-    assert [*scores.to_json()] == [*(m.key for m in MEASURES), "pixels", "coverage"]
+    assert [*scores.to_json()] == [*(measure.key for measure in MEASURES), "pixels", "coverage"]
+
+
+def test_a_measure_is_read_by_its_key_and_another_name_is_no_attribute() -> None:
+    scores = score(torch.ones(2), torch.ones(2))
     assert scores["delta3"] == 1
     with pytest.raises(AttributeError):
         _ = scores.delta4
+
+
+def test_scores_survive_a_pickle() -> None:
+    scores = score(torch.ones(2), torch.ones(2))
     assert pickle.loads(pickle.dumps(scores)) == scores
+
+
+def test_measures_of_depth_are_in_metres_and_those_of_inverse_depth_in_1_per_kilometre() -> None:
     units = {measure.key: measure.unit for measure in MEASURES}
     assert {key for key, unit in units.items() if unit == "m"} == {"rmse", "mae", "sq_rel"}
     assert {key for key, unit in units.items() if unit == "1/km"} == {"irmse", "imae"}
-    assert [m.key for m in MEASURES if m.better == "higher"] == ["delta1", "delta2", "delta3"]
+
+
+def test_of_all_measures_only_the_deltas_are_better_when_they_are_higher() -> None:
+    higher = [measure.key for measure in MEASURES if measure.better == "higher"]
+    assert higher == ["delta1", "delta2", "delta3"]
 
 
 def test_the_thresholds_of_delta_can_be_the_papers_kitti_ones() -> None:
-    predicted, gt = torch.tensor([1.009, 1.015, 1.025, 1.04]), torch.ones(4)
+    predicted = torch.tensor([1.009, 1.015, 1.025, 1.04])
+    gt = torch.ones(4)
     scores = score(predicted, gt, with_thresholds([1.01, 1.01**2, 1.01**3]))
     assert (scores["delta1"], scores["delta2"], scores["delta3"]) == (0.25, 0.5, 0.75)

@@ -20,14 +20,27 @@ from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 NAN, INF = math.nan, math.inf
 
 
-def test_the_first_settings_win_and_what_is_left_open_is_the_papers() -> None:
-    assert Settings(lr="1e-2") == Settings(lr=0.01)
-    assert Settings(lr=np.float32(0.5)) == Settings(lr=0.5)
+@pytest.mark.parametrize(("stated", "number"), [("1e-2", 0.01), (np.float32(0.5), 0.5)])
+def test_a_rate_is_the_same_as_text_or_as_a_number_of_numpy(stated: Any, number: float) -> None:
+    assert Settings(lr=stated) == Settings(lr=number)
+
+
+def test_what_is_left_open_is_the_papers() -> None:
     assert Settings().closed() == PAPER.closed() == ClosedSettings()
+
+
+def test_the_papers_settings_are_5_updates_by_the_sign_of_0_01_for_l1_unaligned() -> None:
     paper = (PAPER.iterations, PAPER.lr, PAPER.loss, PAPER.update, PAPER.align)
     assert paper == (5, 0.01, "l1", "sign", "none")
+
+
+def test_given_are_the_settings_that_were_stated_and_zero_is_stated() -> None:
     assert Settings(iterations=3, blur=0.0).given() == {"iterations": 3, "blur": 0.0}
-    user, network = Settings(lr="3%", blur=0.0), Settings(lr=0.5, blur=2.0, loss="l2")
+
+
+def test_of_two_settings_the_first_win() -> None:
+    user = Settings(lr="3%", blur=0.0)
+    network = Settings(lr=0.5, blur=2.0, loss="l2")
     assert user.over(network) == Settings(lr="3%", blur=0.0, loss="l2")
 
 
@@ -64,7 +77,11 @@ def test_a_setting_that_does_not_exist_is_refused_with_the_likely_one() -> None:
         *(("iterations", value) for value in ("5", -1, 2.0, True)),
         *(("lr", value) for value in ("x%", "", "%", "3%%", "0%", 0, -1, "nan", INF)),
         *(("blur", value) for value in (-1, NAN, INF)),
-        *(("method", "foo"), ("schedule", "foo"), ("align", ["auto"]), ("layer", 3), ("seed", -1)),
+        ("method", "foo"),
+        ("schedule", "foo"),
+        ("align", ["auto"]),
+        ("layer", 3),
+        ("seed", -1),
     ],
 )
 def test_a_value_that_refinement_cannot_use_is_refused_by_name(field: str, value: Any) -> None:

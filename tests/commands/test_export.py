@@ -277,3 +277,8 @@ def test_a_bag_has_the_lens_as_ros_names_it(
     assert of_record is not None
     expected = [*of_record.distortion, *[0.0] * count][:count]
     assert info.d.tolist() == expected
+
+
+def test_maps_of_a_model_whose_unit_is_the_metre_are_said_to_be_in_metres(root: Path) -> None:
+    what, _ = export_results(results(root, unit_scale=1.0), root, to="colmap")
+    assert what == "3 frames in m"

@@ -31,7 +31,8 @@ def naive_refine(
 ) -> tuple[Tensor, list[float]]:
     """(depth of z_K, L(z_0) … L(z_K))."""
     cut = CutPoint.find(network, layer)
-    loss_of, update = LOSSES[settings.loss], UPDATES[settings.update]()
+    loss_of = LOSSES[settings.loss]
+    update = UPDATES[settings.update]()
     z: Tensor | None = None
 
     def depth_with_z() -> Tensor:

@@ -27,5 +27,5 @@ def field(
     points = SparsePoints(xy=xy, depth=torch.ones(count), size=size)
     features = features_of(log, rgb)
     residual = torch.sin(xy[:, 0] / width * 3).double() * 0.3 + 0.2
-    at = torch.stack([points.sample(one) for one in features], dim=1)
+    at = torch.stack([points.sample(feature) for feature in features], dim=1)
     return Residuals(features=features, points=points, at=at, residual=residual)

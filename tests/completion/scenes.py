@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -18,12 +20,22 @@ def scene_depth() -> Tensor:
     return depth
 
 
-def scene() -> tuple[Tensor, Tensor, Tensor]:
-    """`scene_depth`, its image (3, H, W), and a prediction (H, W) with a drifting scale."""
+class Scene(NamedTuple):
+    ground_truth: Tensor
+    """Depth (H, W), `scene_depth`."""
+    rgb: Tensor
+    """Its image (3, H, W)."""
+    prediction: Tensor
+    """Depth (H, W) with a drifting scale."""
+
+
+def scene() -> Scene:
+    """A scene, its image, and a prediction that is wrong by a scale that drifts."""
     depth = scene_depth()
     y, x = torch.meshgrid(*(torch.arange(float(n)) for n in SIZE), indexing="ij")
     rgb = torch.stack([0.3 + 0.4 * (depth < 1.5), 0.5 + 0.2 * y / 48, 0.4 + 0 * x])
-    return depth, rgb, depth * (0.7 + 0.5 * x / 64) * torch.where(depth < 1.5, 1.3, 1.0)
+    prediction = depth * (0.7 + 0.5 * x / 64) * torch.where(depth < 1.5, 1.3, 1.0)
+    return Scene(ground_truth=depth, rgb=rgb, prediction=prediction)
 
 
 def random_points(depth: Tensor, count: int, seed: int = 0) -> SparsePoints:

@@ -88,7 +88,8 @@ def test_a_fit_is_the_minimum_of_cauchys_loss_of_log_depth(reading: str) -> None
 
 
 def test_the_points_of_one_plane_do_not_make_outliers_of_the_others() -> None:
-    plane, beyond = torch.full((7,), 2.0), torch.tensor([5.0, 6.0, 8.0])
+    plane = torch.full((7,), 2.0)
+    beyond = torch.tensor([5.0, 6.0, 8.0])
     d = torch.cat([plane + 0.01 * torch.arange(7), beyond])
     x = (1 / d) * (1 + 0.04 * normal(10, 5)) + 0.3
     fit = align(x, points_of(d), candidates("auto", "inverse", "affine"))
@@ -197,7 +198,8 @@ def test_depth_stays_within_five_times_the_range_and_has_a_gradient(reading: str
     d = scene(50)
     x = OUTPUTS[reading](d)
     fit = align(x, points_of(d), [Candidate(reading, "affine")])
-    nearest, farthest = float(d.min()) / 5.1, float(d.max()) * 5.1  # 5 times 1 + 1/50
+    nearest = float(d.min()) / 5.1
+    farthest = float(d.max()) * 5.1  # 5 times 1 + 1/50
     everywhere = torch.cat([torch.linspace(-100, 100, 2001), torch.tensor([0.0])])
     everywhere.requires_grad_()
     depth = fit.depth(everywhere)

@@ -26,14 +26,15 @@ MODELLED = {
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_baseline_is_near_the_ground_truth_and_does_not_change_its_arguments(name: str) -> None:
     depth = scene_depth()
-    points, prediction = random_points(depth, 200), MODELLED.get(name, lambda d: d / 3)(depth)
+    points = random_points(depth, 200)
+    prediction = MODELLED.get(name, lambda d: d / 3)(depth)
     given = (points.xy, points.depth, prediction)
-    before = [each.clone() for each in given]
+    before = [tensor.clone() for tensor in given]
     dense = BASELINES[name](points, prediction)
     assert (dense.shape, dense.dtype) == (depth.shape, torch.float32)
     assert mean_log_error(dense, depth) < 0.1
     assert name not in MODELLED or torch.allclose(dense, depth, rtol=1e-3)
-    assert all(torch.equal(one, other) for one, other in zip(before, given, strict=True))
+    assert all(torch.equal(tensor, changed) for tensor, changed in zip(before, given, strict=True))
 
 
 def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve_points() -> None:
@@ -43,8 +44,10 @@ def test_the_line_around_a_pixel_is_the_weighted_least_squares_fit_to_its_twelve
     points = replace(points, depth=torch.where(outlier, 5 * points.depth, points.depth))
     prediction = gt * torch.linspace(0.6, 1.5, gt.shape[1])
     x = align_prediction(prediction, points, kind="affine").double()
-    at_points, y = points.sample(x).numpy(), points.depth.double().numpy()
-    mean, std = at_points.mean(), at_points.std()
+    at_points = points.sample(x).numpy()
+    y = points.depth.double().numpy()
+    mean = at_points.mean()
+    std = at_points.std()
     inlier = inlier_weights(points, torch.from_numpy(np.log(y / at_points))).numpy()
     assert inlier.min() == 0 < inlier.max()
     dense = align_locally(points, prediction)

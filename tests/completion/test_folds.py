@@ -55,8 +55,8 @@ def test_of_clustered_points_whole_cells_are_held_out_as_far_off_as_pixels_are(s
     held = spatial_folds(points_at(torch.from_numpy(xy)), 5, seed=seed).numpy() == 0
     pixels = rng.uniform(*np.quantile(xy, (0.02, 0.98), axis=0), (9000, 2))
     of_pixels, apart = (
-        np.median(cKDTree(known).query(asked)[0])
-        for known, asked in ((xy, pixels), (xy[~held], xy[held]))
+        np.median(cKDTree(support).query(asked)[0])
+        for support, asked in ((xy, pixels), (xy[~held], xy[held]))
     )
     assert 0.85 * of_pixels < apart < 2.8 * of_pixels
     assert held.sum() == pytest.approx(180, abs=20)
@@ -96,15 +96,30 @@ def test_points_under_copies_of_holes_are_as_far_from_the_others_as_pixels_in_ho
     assert 0.1 * len(points) < int(held.sum()) <= len(points) // 5
 
 
-def test_only_a_map_with_holes_has_points_under_copies_of_them() -> None:
-    rng = np.random.default_rng(0)
+def test_a_map_with_holes_has_points_under_copies_of_them() -> None:
     assert under_holes(points_of(map_with_holes(4)), 5) is not None
+
+
+def test_a_full_map_has_no_holes_to_copy() -> None:
     assert under_holes(points_of(np.ones((90, 120), np.bool_)), 5) is None
-    for part in (0.02, 0.3, 0.6):
-        assert under_holes(points_of(rng.uniform(size=(90, 120)) < part), 5) is None
-    between = torch.from_numpy(rng.uniform(0, 89, (8000, 2)))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.6])
+def test_gaps_between_random_pixels_are_no_holes(share: float) -> None:
+    pixels = np.random.default_rng(0).uniform(size=(90, 120)) < share
+    assert under_holes(points_of(pixels), 5) is None
+
+
+def test_gaps_between_points_beside_pixels_are_no_holes() -> None:
+    between = torch.from_numpy(np.random.default_rng(0).uniform(0, 89, (8000, 2)))
     assert under_holes(points_at(between, (90, 90)), 5) is None
+
+
+def test_gaps_between_lines_of_a_scan_are_no_holes() -> None:
     assert under_holes(on_lines(5, 1), 5) is None
+
+
+def test_a_single_point_has_no_holes_beside_it() -> None:
     assert under_holes(points_at(torch.zeros(1, 2)), 5) is None
 
 
@@ -118,13 +133,16 @@ def test_copies_of_holes_follow_the_seed() -> None:
     assert not torch.equal(first, other)
 
 
-def test_of_a_large_hole_that_is_more_than_a_fold_nothing_is_hidden_but_small_ones_beside_it() -> (
-    None
-):
+def test_a_copy_of_a_large_hole_hides_no_more_than_a_fold() -> None:
     known = np.ones((100, 100), np.bool_)
     known[20:80, 20:80] = False
     alone = under_holes(points_of(known), 5)
     assert alone is None or int((alone > 0).sum()) <= 6400 // 5
+
+
+def test_beside_a_large_hole_copies_of_small_ones_hide_points() -> None:
+    known = np.ones((100, 100), np.bool_)
+    known[20:80, 20:80] = False
     known[2:6, 2:6] = False
     beside = under_holes(points_of(known), 5)
     assert beside is not None

@@ -67,11 +67,11 @@ def test_at_a_position_the_mean_is_that_from_its_48_nearest_points(count: int) -
     residuals = replace(field(count, size=(60, 80)), depth_length=2.5, colour_length=8.0)
     positions = torch.rand(20, 2, generator=torch.Generator().manual_seed(4)) * 59
     queries = SparsePoints(xy=positions, depth=torch.ones(20), size=(60, 80))
-    features = torch.stack([queries.sample(one) for one in residuals.features], dim=1)
+    features = torch.stack([queries.sample(feature) for feature in residuals.features], dim=1)
     expected = []
-    for xy, one in zip(positions.numpy(), features.double().numpy(), strict=True):
+    for xy, query in zip(positions.numpy(), features.double().numpy(), strict=True):
         near = np.hypot(*(residuals.points.xy.numpy() - xy).T).argsort()[:48]
-        expected += [reference(residuals, near, one[None], residuals.noise)[0].item()]
+        expected += [reference(residuals, near, query[None], residuals.noise)[0].item()]
     assert np.allclose(predict(residuals, queries), expected, atol=2e-4)
 
 
@@ -82,13 +82,15 @@ def test_errors_and_variances_of_left_out_points_are_those_of_leaving_them_out(c
     weight[5] = 0
     near = neighbourhoods(residuals, 128)
     error, variance = leave_one_out(residuals, near, weight)
-    at, xy = residuals.at.double().numpy(), residuals.points.xy.numpy()
+    at = residuals.at.double().numpy()
+    xy = residuals.points.xy.numpy()
     noise = residuals.noise / weight.clamp_min(1e-6).numpy() ** 2
     for row, numbers in enumerate(near.numpy()):
         apart = np.hypot(*(xy - xy[numbers[0]]).T)
         assert count == 12 or np.allclose(apart[numbers], np.sort(apart)[:48])
         for column in range(error.shape[1]):
-            here, others = numbers[column], np.delete(numbers, column)
+            here = numbers[column]
+            others = np.delete(numbers, column)
             mean, spread = reference(residuals, others, at[here][None], noise[others])
             expected = float(residuals.residual[here]) - mean, spread + residuals.noise
             assert np.allclose(expected[0], error[row, column], atol=1e-4)
@@ -100,7 +102,8 @@ def test_the_fit_has_the_smallest_error_of_all_lengths_and_then_of_all_noises(co
     chosen = set()
     for seed in range(12):
         residuals = field(60, colour=colour, seed=seed)
-        depth_length, at = (1.0, 2.5, 8.0, 25.0)[seed % 4], residuals.at.double().numpy()
+        depth_length = (1.0, 2.5, 8.0, 25.0)[seed % 4]
+        at = residuals.at.double().numpy()
         drawn = replace(residuals, depth_length=depth_length, colour_length=2.5, noise=1e-4)
         root = np.linalg.cholesky(covariance(drawn, at, at) + drawn.noise * np.eye(60))
         residual = root @ np.random.default_rng(seed).normal(size=60)

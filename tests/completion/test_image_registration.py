@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -80,19 +82,35 @@ def test_points_that_were_found_in_the_image_show_nothing() -> None:
     assert evidence(rgb, SparsePoints(xy=torch.from_numpy(found), depth=depth, size=SIZE)) is None
 
 
-def test_scan_lines_few_points_and_points_without_an_edge_show_nothing() -> None:
+@pytest.mark.parametrize(
+    "choose",
+    [
+        pytest.param(lambda x, y: y % 8 == 0, id="scan lines"),
+        pytest.param(lambda x, y: torch.arange(len(x)) < 9, id="few points"),
+        pytest.param(lambda x, y: x < 100, id="points of one side"),
+    ],
+)
+def test_scan_lines_and_few_points_and_points_of_one_side_show_nothing(
+    choose: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+) -> None:
+    rgb, points = frame(0, UNREGISTERED, count=4000)
+    assert evidence(rgb, points.select(choose(*points.xy.unbind(1)))) is None
+
+
+@pytest.mark.parametrize("without", ["rows of points", "jumps of depth", "edges of the image"])
+def test_points_on_one_line_and_a_flat_depth_and_a_grey_image_register_nothing(
+    without: str,
+) -> None:
     rgb, points = frame(0, UNREGISTERED, count=4000)
     x, y = points.xy.unbind(1)
-    for chosen in (y % 8 == 0, torch.arange(4000) < 9, x < 100):
-        assert evidence(rgb, points.select(chosen)) is None
-    on_a_line = replace(points, xy=torch.stack([x, torch.full_like(y, 100.0)], dim=1))
-    for image, given in (
-        (rgb, on_a_line),
-        (rgb, replace(points, depth=torch.full_like(x, 2.0))),
-        (np.full_like(rgb, 0.5), points),
-    ):
-        known = evidence(image, given)
-        assert known is None or estimate_registration([known]) is None
+    if without == "rows of points":
+        points = replace(points, xy=torch.stack([x, torch.full_like(y, 100.0)], dim=1))
+    elif without == "jumps of depth":
+        points = replace(points, depth=torch.full_like(x, 2.0))
+    else:
+        rgb = np.full_like(rgb, 0.5)
+    shown = evidence(rgb, points)
+    assert shown is None or estimate_registration([shown]) is None
 
 
 def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:
@@ -103,46 +121,91 @@ def test_the_colour_of_a_pixel_is_where_the_registration_says() -> None:
     assert moved[30, 40, 1] == pytest.approx(20 + 0.5 * (30 - 20) - 2)
 
 
-@pytest.mark.parametrize("count", [200, 1500])
-def test_the_evidence_is_how_edges_and_changes_of_depth_stand_out_from_the_rest(count: int) -> None:
+def points_beside_pixels(count: int) -> tuple[np.ndarray, SparsePoints]:
+    """An image, and points that lie beside the centres of its pixels."""
     rgb, points = frame(1, count=count)
     moved = np.random.default_rng(3).uniform(-0.3, 0.3, (count, 2)).astype(np.float32)
-    points = replace(points, xy=points.xy + torch.from_numpy(moved))
-    known = evidence(rgb, points)
-    # Edges of the lightness and colour, over those within 8 pixels, less those within 6.
+    return rgb, replace(points, xy=points.xy + torch.from_numpy(moved))
+
+
+class Pairs(NamedTuple):
+    """Pairs of neighbouring points without the 5 % that are farthest apart."""
+
+    ends: np.ndarray
+    """Positions (N, 2, 2) of both points."""
+    length: np.ndarray
+    """Pixels (N,) between them."""
+    change: np.ndarray
+    """How much (N,) the logarithm of their depths differs."""
+
+
+def pairs_of_neighbours(points: SparsePoints) -> Pairs:
+    at = points.xy.double().numpy() + 0.5
+    depth = points.depth.double().numpy()
+    first, near = Delaunay(at).vertex_neighbor_vertices
+    pairs = np.column_stack([np.repeat(np.arange(len(points)), np.diff(first)), near])
+    pairs = np.array(sorted(map(tuple, pairs[pairs[:, 0] < pairs[:, 1]])))
+    length = np.hypot(*(at[pairs[:, 0]] - at[pairs[:, 1]]).T)
+    is_near = length <= np.quantile(length, 0.95)
+    pairs = pairs[is_near]
+    change = np.abs(np.log(depth[pairs[:, 0]] / depth[pairs[:, 1]]))
+    return Pairs(ends=at[pairs], length=length[is_near], change=change)
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_edges_are_those_over_the_edges_within_8_pixels_less_those_within_6(count: int) -> None:
+    rgb, points = points_beside_pixels(count)
     lab = cielab(torch.from_numpy(rgb).permute(2, 0, 1)).double().numpy() / 100
-    smooth = [ndimage.gaussian_filter(one, 1.0, mode="mirror") for one in lab]
-    slopes = [ndimage.sobel(one, axis, mode="reflect") / 8 for one in smooth for axis in (0, 1)]
+    smooth = [ndimage.gaussian_filter(channel, 1.0, mode="mirror") for channel in lab]
+    slopes = [
+        ndimage.sobel(channel, axis, mode="reflect") / 8 for channel in smooth for axis in (0, 1)
+    ]
     strength = np.sqrt(np.square(slopes).sum(axis=0))
     relative = strength / (ndimage.gaussian_filter(strength, 8.0, mode="mirror") + 0.01)
     edges = relative - ndimage.gaussian_filter(relative, 6.0, mode="mirror")
-    assert np.allclose(known.edges, edges / edges.std(), atol=2e-3)
-    # Pairs of neighbouring points without the 5 % that are farthest apart.
-    at, depth = points.xy.double().numpy() + 0.5, points.depth.double().numpy()
-    first, near = Delaunay(at).vertex_neighbor_vertices
-    pairs = np.column_stack([np.repeat(np.arange(count), np.diff(first)), near])
-    pairs = np.array(sorted(map(tuple, pairs[pairs[:, 0] < pairs[:, 1]])))
-    length = np.hypot(*(at[pairs[:, 0]] - at[pairs[:, 1]]).T)
-    pairs, length = (each[length <= np.quantile(length, 0.95)] for each in (pairs, length))
-    change = np.abs(np.log(depth[pairs[:, 0]] / depth[pairs[:, 1]]))
+    assert np.allclose(evidence(rgb, points).edges, edges / edges.std(), atol=2e-3)
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_twelve_samples_lie_evenly_between_the_points_of_a_pair(count: int) -> None:
+    rgb, points = points_beside_pixels(count)
+    ends = pairs_of_neighbours(points).ends
+    between = evidence(rgb, points).between.reshape(len(ends), 12, 2)
+    assert np.allclose(between.mean(axis=1), ends.mean(axis=1))
+    assert np.allclose(np.ptp(between, axis=1), np.ptp(ends, axis=1) * 11 / 12)
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_a_pair_weighs_what_its_change_of_depth_is_beyond_that_of_its_length(count: int) -> None:
+    rgb, points = points_beside_pixels(count)
+    _, length, change = pairs_of_neighbours(points)
     of_length = np.polyfit(np.log(length + 0.1), np.log(change + 0.03), 1)
     rest = np.log(change + 0.03) - np.polyval(of_length, np.log(length + 0.1))
     weight = (rest / rest.std()).clip(-2.5, 2.5)
     weight -= weight.mean()
-    between = known.between.reshape(len(pairs), 12, 2)
-    assert np.allclose(between.mean(axis=1), at[pairs].mean(axis=1))
-    assert np.allclose(np.ptp(between, axis=1), np.ptp(at[pairs], axis=1) * 11 / 12)
     weight *= 0.1 * min(1, 37 / np.linalg.norm(weight))
-    assert np.allclose(known.weight, np.repeat(weight, 12) / 12)
+    assert np.allclose(evidence(rgb, points).weight, np.repeat(weight, 12) / 12)
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_jumps_are_counted_and_those_among_the_shorter_half_of_all_lengths(count: int) -> None:
+    rgb, points = points_beside_pixels(count)
+    _, length, change = pairs_of_neighbours(points)
     ordered = np.sort(length)
     half = ordered[ordered.cumsum() >= ordered.sum() / 2][0]
     jump = change > 0.15
-    assert (known.jumps, known.short_jumps) == (jump.sum(), (jump & (length < half)).sum())
-    # A frame of twice the size is reduced to the same.
+    shown = evidence(rgb, points)
+    assert (shown.jumps, shown.short_jumps) == (jump.sum(), (jump & (length < half)).sum())
+
+
+@pytest.mark.parametrize("count", [200, 1500])
+def test_a_frame_of_twice_the_size_is_reduced_to_the_same(count: int) -> None:
+    rgb, points = points_beside_pixels(count)
     twice = SparsePoints(xy=2 * points.xy + 0.5, depth=points.depth, size=(480, 640))
     larger = evidence(rgb.repeat(2, axis=0).repeat(2, axis=1), twice)
-    assert np.allclose(larger.between, known.between, atol=1e-3)
-    assert np.allclose(larger.edges, known.edges, atol=1e-3)
+    shown = evidence(rgb, points)
+    assert np.allclose(larger.between, shown.between, atol=1e-3)
+    assert np.allclose(larger.edges, shown.edges, atol=1e-3)
 
 
 def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_posterior() -> None:
@@ -152,7 +215,8 @@ def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_
     height, width = known.edges.shape
     x, y = np.floor((known.between - (160, 120)) * 1.1 + (160, 120)).astype(int).T
     for down, right in ((0, 0), (-12, 16), (5, -7)):
-        column, row = x + right, y + down
+        column = x + right
+        row = y + down
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         edges = known.edges[row[inside], column[inside]]
         expected = float(known.weight[inside] @ edges)
@@ -166,7 +230,7 @@ def test_the_likelihood_is_the_edges_under_the_moved_samples_and_the_answer_its_
     ) / (2 * 0.025**2)
     posterior = np.exp(total + prior - (total + prior).max())
     posterior /= posterior.sum()
-    mean = [(posterior * each).sum() for each in (zooms[:, None, None], right, down)]
+    mean = [(posterior * value).sum() for value in (zooms[:, None, None], right, down)]
     found = estimate_registration([known])
     assert found.zoom == round(mean[0], 4)
     assert (found.right, found.down) == (round(mean[1], 2), round(mean[2], 2))
@@ -176,7 +240,8 @@ def turned(points: SparsePoints, across: bool, down: bool) -> SparsePoints:
     """The points mirrored left to right, upside down, or both."""
     height, width = points.size
     x, y = points.xy.unbind(dim=1)
-    x, y = width - 1 - x if across else x, height - 1 - y if down else y
+    x = width - 1 - x if across else x
+    y = height - 1 - y if down else y
     return replace(points, xy=torch.stack([x, y], dim=1))
 
 

@@ -37,7 +37,7 @@ FILLS: dict[str, Callable[[SparsePoints], Tensor]] = {
 
 
 def points_at(xy: object, depth: object, size: tuple[int, int]) -> SparsePoints:
-    xy, depth = (torch.as_tensor(each, dtype=torch.float32) for each in (xy, depth))
+    xy, depth = (torch.as_tensor(values, dtype=torch.float32) for values in (xy, depth))
     return SparsePoints(xy=xy, depth=depth, size=size)
 
 
@@ -63,7 +63,8 @@ def test_every_depth_is_among_those_of_the_points(name: str, count: int, on_grid
 @pytest.mark.parametrize("name", FILLS)
 def test_of_points_at_one_position_the_nearest_counts_and_any_beyond_the_border(name: str) -> None:
     points = scattered(30, on_grid=True)
-    xy, depth = points.xy.repeat(2, 1), torch.cat([points.depth + 5, points.depth])
+    xy = points.xy.repeat(2, 1)
+    depth = torch.cat([points.depth + 5, points.depth])
     assert torch.equal(FILLS[name](points_at(xy, depth, points.size)), FILLS[name](points))
     dense = FILLS[name](points_at([(-2.0, 3.0), (12.5, 3.0)], [2.0, 8.0], (6, 10)))
     assert dense[3, 0] < 3
@@ -78,7 +79,8 @@ def test_linear_is_scipys_in_its_space_inside_the_hull_and_nearest_outside(space
     value = {"depth": points.depth, "inverse": 1 / points.depth, "log": points.depth.log()}[space]
     within = LinearNDInterpolator(points.xy.double().numpy(), value.double().numpy())
     theirs = from_space(torch.from_numpy(within(pixels_of(points.size).numpy())), space)
-    dense, theirs = linear(points, space=space), theirs.reshape(points.size)
+    dense = linear(points, space=space)
+    theirs = theirs.reshape(points.size)
     inside = ~theirs.isnan()
     assert 0.5 < float(inside.double().mean()) < 1
     assert torch.allclose(dense[inside].double(), theirs[inside], rtol=1e-5)
@@ -102,8 +104,10 @@ def test_depth_is_linear_in_a_triangle_that_delaunay_allows_and_nearest_outside(
 ) -> None:
     depth = [1 + 9 * random.random() for _ in xy]
     points = points_at(xy, depth, (6, 7))
-    dense, closest = linear(points).flatten(), nearest(points).flatten()
-    at, of_points = np.array(xy), points.depth.double().numpy()
+    dense = linear(points).flatten()
+    closest = nearest(points).flatten()
+    at = np.array(xy)
+    of_points = points.depth.double().numpy()
     triangles = all_delaunay(at)
     for pixel, found, alone in zip(pixels_of(points.size).numpy(), dense, closest, strict=True):
         possible = list[float]()
@@ -160,7 +164,8 @@ def test_at_a_pixel_depth_is_that_of_the_dense_map_however_few_are_asked_for(
     points: SparsePoints, space: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     triangulation = Triangulation(points)
-    dense, pixels = triangulation.dense(space).flatten(), pixels_of(points.size).float()
+    dense = triangulation.dense(space).flatten()
+    pixels = pixels_of(points.size).float()
     assert torch.allclose(triangulation.at(pixels, space), dense, rtol=1e-6)
     monkeypatch.setattr(interpolation, "_FEW", 0)
     some = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(1))[:40]

@@ -27,7 +27,8 @@ def test_outliers_are_left_out_and_inliers_kept() -> None:
 
 def inliers_in_numpy(residuals: Residuals) -> np.ndarray:
     """The inliers among up to 256 points, from their description; one of few that are exact."""
-    xy, count = residuals.points.xy.double().numpy(), len(residuals.points)
+    xy = residuals.points.xy.double().numpy()
+    count = len(residuals.points)
     everyone = torch.arange(count)[None]
     weight = inlier_weights(residuals.points, residuals.residual).numpy()
     for cutoff in (4, 4, 5, 6, 8):
@@ -43,8 +44,8 @@ def inliers_in_numpy(residuals: Residuals) -> np.ndarray:
     inlier = ~suspected | together
     weight = np.where(inlier, np.maximum(weight, 0.05), weight)
     alone, beside = (
-        np.abs(leave_one_out(residuals, everyone, each)[0].numpy()[0]) @ weight
-        for each in (None, torch.from_numpy(weight))
+        np.abs(leave_one_out(residuals, everyone, weights)[0].numpy()[0]) @ weight
+        for weights in (None, torch.from_numpy(weight))
     )
     return inlier if beside < 0.5 * alone and inlier.any() else np.ones(count, bool)
 
@@ -52,7 +53,8 @@ def inliers_in_numpy(residuals: Residuals) -> np.ndarray:
 def test_inliers_are_those_of_the_description() -> None:
     shares = []
     for seed in (*range(12), 62, 74):  # in the last two, each cut-off decides
-        rng, residuals = np.random.default_rng(seed), field(90, size=(60, 80), seed=seed)
+        rng = np.random.default_rng(seed)
+        residuals = field(90, size=(60, 80), seed=seed)
         xy = residuals.points.xy.numpy() + rng.uniform(-0.4, 0.4, (90, 2)).astype(np.float32)
         corridor = np.hypot(*(xy - rng.uniform(10, 50, 2)).T) < rng.uniform(5, 14)
         lone = rng.uniform(size=90) < rng.choice([0.0, 0.05, 0.2])
@@ -92,7 +94,8 @@ def test_points_far_from_a_prediction_are_those_beyond_the_limit_unless_they_are
 
 def test_a_weight_is_the_biweight_of_the_second_best_agreement_with_eight_neighbours() -> None:
     rng = np.random.default_rng(2)
-    xy, residual = rng.uniform(0, 60, (51, 2)), 0.02 * rng.standard_t(1.5, 51)
+    xy = rng.uniform(0, 60, (51, 2))
+    residual = 0.02 * rng.standard_t(1.5, 51)
     apart = np.hypot(*(xy[:, None] - xy).transpose(2, 0, 1))
     near = apart.argsort(axis=1)[:, 1:9]
     second = np.sort(np.abs(residual[near] - residual[:, None]), axis=1)[:, 1]

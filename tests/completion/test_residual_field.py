@@ -17,7 +17,8 @@ from tests.completion.scenes import SIZE, mean_log_error, random_points, scene
 def test_a_drifting_prediction_is_put_right(kind: str, count: int, flat: str | None) -> None:
     gt, rgb, prediction = scene()
     if flat == "prediction":
-        prediction, rgb = torch.full(SIZE, 2.0), torch.full((3, *SIZE), 0.5)
+        prediction = torch.full(SIZE, 2.0)
+        rgb = torch.full((3, *SIZE), 0.5)
     points = random_points(gt, max(count, 100) if flat == "prediction" else count)
     depth = ResidualField(prediction, points, None if flat == "image" else rgb).depth(kind=kind)
     assert depth.dtype == torch.float32

@@ -47,5 +47,5 @@ def test_a_line_is_found_where_a_single_point_differs() -> None:
     assert fit_line(x, 3 * x, "depth", LIMITS) == pytest.approx((3, 0), abs=1e-3)
 
 
-def test_no_error_counts_more_than_1() -> None:
+def test_in_the_mean_no_error_of_log_depth_counts_more_than_1() -> None:
     assert mean_error(torch.tensor([0.5, -5.0])) == pytest.approx(0.75)

@@ -37,7 +37,8 @@ def test_every_pixel_of_the_hull_is_in_a_triangle_whose_circle_is_empty(
     xy = np.array(points)
     found = delaunay(xy)
     assert all(is_delaunay(xy, tuple(triangle)) for triangle in found)
-    number, possible = cover(xy[found], PIXELS), all_delaunay(xy)
+    number = cover(xy[found], PIXELS)
+    possible = all_delaunay(xy)
     for pixel, of_pixel in zip(PIXEL_XY, number, strict=True):
         if of_pixel >= 0:
             assert holds(xy, tuple(found[of_pixel]), pixel)
@@ -76,8 +77,9 @@ def test_the_triangles_at_a_few_positions_are_those_of_all_points(on_grid: bool,
     xy = np.unique((rng.random((4000, 2)) * (90, 70)).round(0 if on_grid else 6), axis=0)
     positions = rng.random((25, 2)) * (110, 90) - 10
     where, number = Positions.of(positions)
-    few, found = delaunay_at(xy, positions), delaunay(xy)
-    of_few, of_all = (cover(xy[each], where)[number] for each in (few, found))
+    few = delaunay_at(xy, positions)
+    found = delaunay(xy)
+    of_few, of_all = (cover(xy[corners], where)[number] for corners in (few, found))
     assert 5 < (of_few >= 0).sum() < 25
     assert np.array_equal(of_few >= 0, of_all >= 0)
     inside = of_all >= 0
@@ -95,7 +97,8 @@ def test_where_its_trials_end_all_points_are_triangulated(monkeypatch: pytest.Mo
 def test_positions_anywhere_and_repeated_are_in_the_triangles_that_hold_them(
     points: list[tuple[float, float]], anywhere: list[tuple[float, float]]
 ) -> None:
-    xy, asked = np.array(points), np.array(anywhere * 2).reshape(-1, 2)
+    xy = np.array(points)
+    asked = np.array(anywhere * 2).reshape(-1, 2)
     where, number = Positions.of(asked)
     found = delaunay(xy)
     for position, of_position in zip(asked, cover(xy[found], where)[number], strict=True):

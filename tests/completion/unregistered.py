@@ -27,17 +27,21 @@ def frame(
     depth = np.full((height, width), 6.0, np.float32)
     rgb = np.full((height, width, 3), 0.5, np.float32)
     for distance in sorted(rng.uniform(1.0, 5.0, 40), reverse=True):
-        top, left = int(rng.integers(height - 40)), int(rng.integers(width - 40))
-        bottom, right = top + int(rng.integers(30, 120)), left + int(rng.integers(30, 120))
+        top = int(rng.integers(height - 40))
+        left = int(rng.integers(width - 40))
+        bottom = top + int(rng.integers(30, 120))
+        right = left + int(rng.integers(30, 120))
         depth[top:bottom, left:right] = distance
         rgb[top:bottom, left:right] = rng.uniform(0, 1, 3)
     rgb += rng.normal(0, 0.02, rgb.shape).astype(np.float32)
     inner = tuple(slice(side // 2, side // 2 + side) for side in SIZE)
     if registration is not None:  # as the other camera sees the scene: moved by the inverse
         zoom = 1 / registration.zoom
-        right, down = -registration.right * zoom, -registration.down * zoom
+        right = -registration.right * zoom
+        down = -registration.down * zoom
         rgb = ImageRegistration(zoom=zoom, right=right, down=down).apply_to(rgb)
-    rgb, depth = np.clip(rgb[inner], 0, 1), depth[inner]
+    rgb = np.clip(rgb[inner], 0, 1)
+    depth = depth[inner]
     jump = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0.1
     beside = cv2.dilate(jump.astype(np.uint8), np.ones(2 * (2 * gap_px + 1,))) > 0
     far = np.flatnonzero(~beside) if gap_px else depth.size

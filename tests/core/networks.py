@@ -20,8 +20,8 @@ class Net(nn.Module):
     def __init__(self, run: Callable[..., Any], **parts: nn.Module) -> None:
         super().__init__()
         self.run = run
-        for name, part in parts.items():
-            self.add_module(name, part)
+        for name, module in parts.items():
+            self.add_module(name, module)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         return self.run(self, *args, **kwargs)
@@ -143,7 +143,9 @@ def repeated() -> nn.Module:
         x = x + net.norm(net.same(x)) + net.tied(x)
         return net.head(x).abs() + 1
 
-    enter, same, tied = conv(3, 4), conv(4, 4), conv(4, 4)
+    enter = conv(3, 4)
+    same = conv(4, 4)
+    tied = conv(4, 4)
     tied.weight = same.weight
     parts = {"norm": nn.BatchNorm2d(4), "head": conv(4, 1), "tied": tied}
     return Net(run, enter=enter, same=same, alias=enter, **parts)
@@ -185,7 +187,8 @@ class Counting(nn.Module):
 
     def __init__(self, inner: nn.Module):
         super().__init__()
-        self.inner, self.calls = inner, 0
+        self.inner = inner
+        self.calls = 0
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         self.calls += 1
@@ -241,7 +244,9 @@ class Updating(nn.Module):
         super().__init__()
         self.register_buffer("passes", torch.zeros(()))
         self.register_buffer("average", torch.zeros(1, 4, 1, 1))
-        self.enter, self.cut, self.head = conv(3, 4), conv(4, 4), conv(4, 1)
+        self.enter = conv(3, 4)
+        self.cut = conv(4, 4)
+        self.head = conv(4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         self.passes += 1

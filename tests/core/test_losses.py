@@ -10,7 +10,8 @@ from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.core.losses import MIN_DEPTH, checked_loss
 from pnpdepth_cli.errors import ModelError
 
-PREDICTED, TRUE = torch.tensor([1.0, 2.0, 4.0, 10.0]), torch.tensor([1.0, 2.5, 2.0, 5.0])
+PREDICTED = torch.tensor([1.0, 2.0, 4.0, 10.0])
+TRUE = torch.tensor([1.0, 2.5, 2.0, 5.0])
 # errors 0, ½, 2, 5; c of berhu = 1, so ½ is linear there and 2 and 5 are quadratic
 C = 1.4826 * log(2.5 / 2)
 BY_HAND = {

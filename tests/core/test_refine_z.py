@@ -53,13 +53,13 @@ def refined(
         return refine(split, (image(),), points, settings, depth_of=depth_of)
 
 
-@pytest.mark.parametrize(
-    ("name", "layer", "update"),
-    [
-        *((name, layer, "adam") for name, layers in CUTS.items() for layer in layers),
-        *(("unet", "bottleneck", update) for update in UPDATES if update != "adam"),
-    ],
-)
+EVERY_CUT_AND_UPDATE = [
+    *((name, layer, "adam") for name, layers in CUTS.items() for layer in layers),
+    *(("unet", "bottleneck", update) for update in UPDATES if update != "adam"),
+]
+
+
+@pytest.mark.parametrize(("name", "layer", "update"), EVERY_CUT_AND_UPDATE)
 def test_updates_are_those_of_running_the_whole_network(name: str, layer: str, update: str) -> None:
     network = build(name)
     settings = ClosedSettings(iterations=5, lr=0.02, update=update)
@@ -68,12 +68,26 @@ def test_updates_are_those_of_running_the_whole_network(name: str, layer: str, u
     assert torch.equal(result.after, depth)
     assert list(result.losses) == losses
     assert not torch.equal(result.after, result.before)
-    whole = plain(network, image())
-    assert torch.equal(result.before, whole)
+
+
+@pytest.mark.parametrize(("name", "layer", "update"), EVERY_CUT_AND_UPDATE)
+def test_the_depth_before_updates_is_the_plain_networks(name: str, layer: str, update: str) -> None:
+    network = build(name)
+    result = refined(network, layer, ClosedSettings(iterations=5, lr=0.02, update=update))
+    assert torch.equal(result.before, plain(network, image()))
+
+
+@pytest.mark.parametrize(("name", "layer", "update"), EVERY_CUT_AND_UPDATE)
+def test_without_updates_the_depth_is_the_plain_networks_with_the_first_loss(
+    name: str, layer: str, update: str
+) -> None:
+    network = build(name)
+    settings = ClosedSettings(iterations=5, lr=0.02, update=update)
+    first_loss = refined(network, layer, settings).losses[:1]
     none = refined(network, layer, replace(settings, iterations=0))
-    assert torch.equal(none.after, whole)
+    assert torch.equal(none.after, plain(network, image()))
     assert none.before is none.after
-    assert none.losses == result.losses[:1]
+    assert none.losses == first_loss
 
 
 @pytest.mark.parametrize("update", UPDATES)
@@ -84,7 +98,8 @@ def test_pixels_that_no_point_reaches_keep_their_bits(update: str) -> None:
     result = refined(network, "0", ClosedSettings(update=update, lr=0.1), points=one)
     changed = (result.after != result.before)[0, 0]
     assert bool(changed[4, 3])
-    rows, columns = changed.any(1).nonzero().flatten(), changed.any(0).nonzero().flatten()
+    rows = changed.any(1).nonzero().flatten()
+    columns = changed.any(0).nonzero().flatten()
     assert (int(rows.min()), int(rows.max())) == (0, 8)  # two 3×3 convolutions, there and back
     assert (int(columns.min()), int(columns.max())) == (0, 7)
     assert not changed[9:].any()

@@ -32,7 +32,9 @@ def gradient_of(z: Tensor) -> Tensor:
 def test_an_update_is_that_of_torch_optim(
     update: Callable[[], Update], make: Callable[[list[Tensor]], torch.optim.Optimizer]
 ) -> None:
-    own, z, theirs = update(), torch.linspace(-2, 3, 7), torch.linspace(-2, 3, 7)
+    own = update()
+    z = torch.linspace(-2, 3, 7)
+    theirs = torch.linspace(-2, 3, 7)
     optimiser = make([theirs])
     for _ in range(20):
         z = z - 0.1 * own(gradient_of(z))
@@ -69,7 +71,8 @@ POINTS = SparsePoints(xy=torch.zeros(4, 2), depth=torch.ones(4), size=(40, 80))
 
 
 def test_no_blur_and_a_z_that_is_no_map_leave_the_gradient_itself() -> None:
-    gradient, tokens = torch.randn(1, 3, 5, 7), torch.randn(1, 35, 3)
+    gradient = torch.randn(1, 3, 5, 7)
+    tokens = torch.randn(1, 35, 3)
     assert blur(gradient, POINTS, 0.0) is gradient
     assert blur(tokens, POINTS, 2.0) is tokens
 
@@ -84,6 +87,7 @@ def test_the_reach_is_a_gaussian_of_so_many_spacings_of_the_points() -> None:
         weight = np.exp(-0.5 * (np.subtract.outer(range(cells), range(cells)) / sigma) ** 2)
         return weight[:, of] / weight.sum(axis=1)
 
-    down, across = 0.25 * math.sqrt(800) / 4, 0.25 * math.sqrt(800) / 2
+    down = 0.25 * math.sqrt(800) / 4
+    across = 0.25 * math.sqrt(800) / 2
     expected = np.outer(weights(10, 5, down), weights(40, 20, across))
     np.testing.assert_allclose(blur(gradient, POINTS, 0.25)[0, 0], expected, rtol=1e-4, atol=1e-9)

@@ -88,18 +88,31 @@ def test_a_record_is_read_as_it_was_written_and_keeps_no_empty_entry(record: Fra
     assert FrameRecord.from_json(entry | {"of a later version": 1}, Path("a.json")) == record
 
 
-def test_numbers_of_none_are_unknown_and_those_of_the_camera_are_kept_or_refused() -> None:
+def test_an_error_that_is_no_finite_number_is_written_as_unknown() -> None:
     errors = {"used": {"after": {"mae": float("nan"), "rmse": float("inf")}}}
     (stages,) = read_again(FrameRecord(errors=errors)).errors.values()
     assert stages == {"after": {"mae": None, "rmse": None}}
+
+
+def test_the_camera_of_a_record_is_read_as_it_was_written() -> None:
+    camera, pose = read_again(RECORD).refined().camera.read()
+    assert CameraRecord.of(camera, pose) == RECORD.refined().camera
+    assert (camera.intrinsics == CAMERA.intrinsics).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("intrinsics", [[0.0] * 3] * 3),
+        ("intrinsics", [[1.0, 2.0]]),
+        ("pose", [[1.0, 2.0]]),
+        ("lens", "pinhole"),
+    ],
+)
+def test_a_record_of_no_camera_is_refused(field: str, value: object) -> None:
     camera = read_again(RECORD).refined().camera
-    again, pose = camera.read()
-    assert CameraRecord.of(again, pose) == camera
-    assert (again.intrinsics == CAMERA.intrinsics).all()
-    wrong = {"intrinsics": [[0.0] * 3] * 3, "pose": [[1.0, 2.0]], "lens": "pinhole"}
-    for name, value in (*wrong.items(), ("intrinsics", [[1.0, 2.0]])):
-        with pytest.raises(ValueError, match=r"camera|reshape"):
-            replace(camera, **{name: value}).read()
+    with pytest.raises(ValueError, match=r"camera|reshape"):
+        replace(camera, **{field: value}).read()
 
 
 @pytest.mark.parametrize(

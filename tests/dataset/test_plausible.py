@@ -175,7 +175,9 @@ LIST = RNG.uniform(0, 1, (100, 2)) * (639, 479)
         (LIST[:5] + 1000, NoPointsError, "a.csv"),
     ],
 )
-def test_what_are_no_pixels_is_refused(xy: np.ndarray, error: type[Exception], said: str) -> None:
+def test_a_list_whose_coordinates_are_no_pixels_is_refused(
+    xy: np.ndarray, error: type[Exception], said: str
+) -> None:
     with pytest.raises(error, match=said):
         check_pixels(Path("a.csv"), xy, (480, 640))
 

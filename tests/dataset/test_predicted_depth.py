@@ -109,12 +109,12 @@ def test_a_map_is_read_as_the_numbers_in_its_file(name: str, values: Any, tmp_pa
         lambda m: m[None, ..., None],
     ],
 )
-def test_axes_of_one_are_left_out(add: Callable[[Array], Array], tmp_path: Path) -> None:
+def test_axes_of_length_one_are_left_out(add: Callable[[Array], Array], tmp_path: Path) -> None:
     path = save(tmp_path / "a.npy", add(DISPARITY))
     np.testing.assert_array_equal(read(path).values, unknown_where(DISPARITY, FAR))
 
 
-def test_numbers_below_0_are_kept(tmp_path: Path) -> None:
+def test_numbers_below_0_of_a_prediction_are_kept(tmp_path: Path) -> None:
     values = np.log(RNG.uniform(0.1, 5, SIZE)).astype(np.float32)
     depth = read(save(tmp_path / "a.npy", values))
     np.testing.assert_array_equal(depth.values, values)
@@ -529,7 +529,7 @@ def test_what_is_no_depth_map_is_refused_in_one_line(what: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.png", "a.tiff"])
-def test_a_file_of_one_map_has_no_part(name: str, tmp_path: Path) -> None:
+def test_a_file_of_one_map_has_no_part_that_a_name_could_choose(name: str, tmp_path: Path) -> None:
     path = save(tmp_path / name, CODES)
     with pytest.raises(InputError, match="depth"):
         read(Path(f"{path}:depth"))

@@ -54,7 +54,9 @@ def test_a_far_plane_is_unknown_but_no_surface_is(depth: np.ndarray, unknown: in
         (np.full(1, 2.0), [1e30], 0),
     ],
 )
-def test_depths_are_unknown_from_a_limit(rest: np.ndarray, far: list[float], unknown: int) -> None:
+def test_depths_beyond_the_limit_are_unknown_and_counted(
+    rest: np.ndarray, far: list[float], unknown: int
+) -> None:
     depth = np.append(rest, far)
     found, notes = far_values(depth)
     assert np.flatnonzero(found).tolist() == list(range(len(depth) - unknown, len(depth)))
@@ -80,7 +82,7 @@ def test_unknown_depth_as_a_small_constant_is_unknown(constant: float, share: fl
         np.where(np.arange(50) < 10, 0.1, 0.3) * np.ones((40, 1)),
     ],
 )
-def test_no_near_surface_is_unknown(depth: np.ndarray) -> None:
+def test_no_near_surface_is_taken_for_unknown(depth: np.ndarray) -> None:
     assert not far_values(depth.ravel().astype(np.float32))[0].any()
 
 

@@ -31,7 +31,8 @@ def depth_of_scene() -> Tensor:
 
 def frame_in_memory(count: int = 60, seed: int = 1) -> Frame:
     """The scene with so many points; the image is its depth in grey, with noise."""
-    rng, depth = np.random.default_rng(seed), depth_of_scene()
+    rng = np.random.default_rng(seed)
+    depth = depth_of_scene()
     pixels = rng.permutation(depth.numel())[:count]
     xy = torch.from_numpy(np.stack([pixels % SIZE[1], pixels // SIZE[1]], 1).astype(np.float32))
     points = SparsePoints(xy=xy, depth=depth.flatten()[torch.from_numpy(pixels)], size=SIZE)

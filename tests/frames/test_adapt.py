@@ -39,7 +39,9 @@ def network(monkeypatch: pytest.MonkeyPatch) -> pnp.Network:
     return pnp.load_network("sparse2dense-tiny")
 
 
-def test_learnt_weights_go_at_close(network: pnp.Network, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learnt_weights_are_used_until_the_refiner_is_closed(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("scipy.stats.ttest_1samp", lambda *a, **k: SimpleNamespace(pvalue=0.01))
     before = copy.deepcopy(network.module.state_dict())
     own = pnp.refine(network, *FRAMES[0], SETTINGS)
@@ -52,7 +54,7 @@ def test_learnt_weights_go_at_close(network: pnp.Network, monkeypatch: pytest.Mo
         by_hand = pnp.refine(network, *FRAMES[0], SETTINGS)
     assert np.array_equal(learnt.depth, by_hand.depth)
     points = FRAMES[0][1]
-    at_points = (points.sample(torch.from_numpy(each.depth)) for each in (own, learnt))
+    at_points = (points.sample(torch.from_numpy(result.depth)) for result in (own, learnt))
     before_learning, afterwards = ((at - points.depth).abs().mean() for at in at_points)
     assert afterwards < before_learning
     assert all(torch.equal(network.module.state_dict()[name], before[name]) for name in before)
@@ -118,18 +120,19 @@ def test_few_frames_and_dense_points_teach_too_little() -> None:
     dense = SIZE[0] * SIZE[1] // 100  # 10 pixels apart
     cases = [(7, 60), (8, 60), (8, dense), (8, dense + 1)]
     why = [adapt.too_little(count, frame_in_memory(points)) for count, points in cases]
-    assert [each is None for each in why] == [False, True, True, False]
+    assert [reason is None for reason in why] == [False, True, True, False]
 
 
 def test_the_loss_of_each_validation_frame_is_compared_and_has_to_fall_beyond_chance() -> None:
-    before, after = np.array([1.0, 2.0, 3.0, 2.0]), np.array([0.8, 1.7, 2.7, 1.5])
+    before = np.array([1.0, 2.0, 3.0, 2.0])
+    after = np.array([0.8, 1.7, 2.7, 1.5])
     fallen, risen = (
         adapt.Learnt(weights={}, before=first, after=second)
         for first, second in ((before, after), (after, before))
     )
     chance = adapt.Learnt(weights={}, before=before, after=after[::-1])
     assert ttest_rel(np.log(after), np.log(before), alternative="less").pvalue < adapt.SIGNIFICANT
-    assert [each.is_better for each in (fallen, risen, chance)] == [True, False, False]
+    assert [comparison.is_better for comparison in (fallen, risen, chance)] == [True, False, False]
     assert f"{6.7 / 8 - 1:+.1%}" in str(fallen)
 
 
@@ -143,7 +146,9 @@ def test_the_image_encoder_does_not_learn(monkeypatch: pytest.MonkeyPatch) -> No
     assert own.keys() - learnt.weights.keys() == {n for n in own if n.startswith("encoder.")}
 
 
-def test_infinite_loss_ends_learning(network: pnp.Network, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_infinite_loss_ends_learning_with_an_error(
+    network: pnp.Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(adapt, "LR", 1e30)
     with pytest.raises(pnp.DivergedError):
         adapt.learn(network, named(range(8)))

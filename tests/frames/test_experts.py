@@ -42,7 +42,8 @@ from tests.frames.scenes import (
 
 @pytest.mark.parametrize(("known", "noise"), [(4, 0.1), (5, 0.1), (40, 0.18), (40, 0.3), (40, 9)])
 def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise: float) -> None:
-    frame, rng = frame_in_memory(60), np.random.default_rng(known)
+    frame = frame_in_memory(60)
+    rng = np.random.default_rng(known)
     pixels = tuple(frame.points.xy.long().numpy().T[::-1, :known])
     y = frame.points.depth.double().log().numpy()[:known]
     x = 0.3 * y + noise * 0.3 * rng.normal(size=known)
@@ -64,7 +65,8 @@ def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise:
 
 def test_trust_in_a_network_that_takes_points_falls_with_its_error_at_validation_points() -> None:
     depth = torch.full((50,), 2.0)
-    split, alone = split_of(depth), network_expert("compact", depth + 0.1)
+    split = split_of(depth)
+    alone = network_expert("compact", depth + 0.1)
     found = [
         trust(member(Nearest), network_expert("own", depth + off), split, alone)
         for off in (0.05, 0.1, 0.15, 0.2, 0.4)
@@ -95,7 +97,8 @@ def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() 
     frame = frame_in_memory(count=MIRRORED_BELOW - 1)
     once, twice = seen_twice(frame)
     turned, _ = seen_twice(frame.mirrored())
-    left, right = once.whole.updated.numpy(), turned.whole.updated.numpy()[:, ::-1]
+    left = once.whole.updated.numpy()
+    right = turned.whole.updated.numpy()[:, ::-1]
     assert np.abs(left - right).max() > 1e-3
     np.testing.assert_allclose(twice.dense, np.sqrt(left * right), rtol=1e-4)
 
@@ -136,7 +139,7 @@ def test_a_network_is_strong_as_far_as_its_depth_predicts_points_from_each_other
     assert [strength_of(found[0]), strength_of(found[-1])] == [1, 0]
     few = replace(split, whole=replace(frame, points=frame.points.select(slice(MIN_POINTS - 1))))
     lines = replace(split, has_scan_lines=True)
-    assert [unexplained_by(depth_of_scene(), each, judged) for each in (few, lines)] == [1, 1]
+    assert [unexplained_by(depth_of_scene(), points, judged) for points in (few, lines)] == [1, 1]
 
 
 @pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])

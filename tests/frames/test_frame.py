@@ -11,7 +11,8 @@ from tests.frames.scenes import depth_of_scene, frame_in_memory
 
 def test_a_mirrored_frame_has_left_and_right_exchanged_and_mirrored_again_is_the_frame() -> None:
     frame = replace(frame_in_memory(), prior=depth_of_scene())
-    mirrored, width = frame.mirrored(), frame.size[1]
+    mirrored = frame.mirrored()
+    width = frame.size[1]
     x, y = frame.points.xy.unbind(1)
     assert torch.equal(mirrored.points.xy, torch.stack([width - 1 - x, y], 1))
     assert torch.equal(mirrored.rgb[..., 0], frame.rgb[..., -1])

@@ -25,7 +25,8 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
     split = replace(split_of(truth), weights=torch.from_numpy(shares))
     found = np.array(list(fit_weights(experts, split).values()))
     logs = np.stack([at.log().numpy() for at in noisy], axis=1)
-    prior, y = np.array([0.2, 0.3, 0.5]), truth.log().numpy()
+    prior = np.array([0.2, 0.3, 0.5])
+    y = truth.log().numpy()
     first = y - logs @ prior
     scale = 1.25 * np.average(np.abs(first), weights=shares)
 
@@ -41,7 +42,8 @@ def test_weights_are_those_that_predict_the_validation_points_best_beside_the_pr
 
 def test_an_expert_without_prior_weight_or_prediction_decides_nothing() -> None:
     depth = torch.full((50,), 2.0)
-    none, exact = network_expert("none", depth, weight=0.0), network_expert("exact", depth * 1.001)
+    none = network_expert("none", depth, weight=0.0)
+    exact = network_expert("exact", depth * 1.001)
     weights = fit_weights([none, exact, network_expert("poor", depth * 1.2)], split_of(depth))
     assert weights["none"] == 0
     blank = fit_weights(

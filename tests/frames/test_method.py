@@ -59,29 +59,46 @@ def test_a_setting_tunes_its_step_and_leaves_all_others(
     assert tuned.weights.keys() == plain.weights.keys()
     assert tuned.alignment is not None
     assert tuned.propagation == setting.get("propagate", "gp")
-    errors = [np.abs(each.depth - depth_of_scene().numpy()).mean() for each in (plain, tuned)]
-    assert errors[1] < 1.15 * errors[0] + 0.002
+    gt = depth_of_scene().numpy()
+    plain_error = np.abs(plain.depth - gt).mean()
+    assert np.abs(tuned.depth - gt).mean() < 1.15 * plain_error + 0.002
 
 
-def test_a_step_that_is_switched_off_is_the_only_one_left_out() -> None:
+def test_without_updates_all_other_steps_stay() -> None:
     plain = refined(Brightness)
-    of_z = refined(Brightness, iterations=0)
-    assert plain.stages.keys() - of_z.stages.keys() == {"updated"}
-    residual = refined(Brightness, propagate="none")
-    assert plain.stages.keys() - residual.stages.keys() == {"propagated"}
-    assert residual.propagation == "none"
-    assert residual.alignment is not None
-    aligned = refined(Brightness, align="none")
-    assert aligned.alignment is None
-    assert aligned.stages.keys() == plain.stages.keys()
+    without = refined(Brightness, iterations=0)
+    assert plain.stages.keys() - without.stages.keys() == {"updated"}
 
 
-def test_the_papers_method_is_tuned_too_and_gains_a_step_that_is_asked_for() -> None:
+def test_without_propagation_all_other_steps_stay() -> None:
+    plain = refined(Brightness)
+    without = refined(Brightness, propagate="none")
+    assert plain.stages.keys() - without.stages.keys() == {"propagated"}
+    assert without.propagation == "none"
+    assert without.alignment is not None
+
+
+def test_without_alignment_all_other_steps_stay() -> None:
+    plain = refined(Brightness)
+    without = refined(Brightness, align="none")
+    assert without.alignment is None
+    assert without.stages.keys() == plain.stages.keys()
+
+
+def test_the_papers_method_is_five_updates_of_one_network_and_nothing_else() -> None:
     paper = refined(Brightness, method="paper")
-    assert [len(paper.losses), paper.propagation, paper.alignment] == [6, "none", None]
+    assert len(paper.losses) == 6  # of z_0 and after each of 5 updates
+    assert paper.propagation == "none"
+    assert paper.alignment is None
     assert paper.validation is None
     assert paper.weights == {"brightness": 1.0}
+
+
+def test_the_papers_method_makes_as_many_updates_as_are_asked_for() -> None:
     assert len(refined(Brightness, method="paper", iterations=9).losses) == 10
+
+
+def test_the_papers_method_gains_a_step_that_is_asked_for() -> None:
     assert refined(Brightness, method="paper", align="affine").alignment is not None
     assert refined(Brightness, method="paper", propagate="gp").propagation == "gp"
 
@@ -140,18 +157,39 @@ def with_map(values: torch.Tensor, count: int = 60, **asked: Any) -> Refined:
         return method.refine(frame, with_stages=True)
 
 
-def test_a_depth_map_takes_the_place_of_a_networks_output() -> None:
-    disparity = 0.7 + 3 / depth_of_scene()
-    disparity[:9] = torch.nan
+@pytest.fixture
+def disparity() -> torch.Tensor:
+    """The scene as disparity of unknown scale and shift, unknown in its first 9 rows."""
+    values = 0.7 + 3 / depth_of_scene()
+    values[:9] = torch.nan
+    return values
+
+
+def test_a_depth_map_takes_the_place_of_a_networks_output(disparity: torch.Tensor) -> None:
     result = with_map(disparity)
-    assert result.alignment is not None
-    assert result.alignment.reading == "disparity"
     assert [*result.stages] == ["before", "propagated", "alone"]
     assert not result.before[:9].any()
+
+
+def test_a_map_of_disparity_is_recognised(disparity: torch.Tensor) -> None:
+    alignment = with_map(disparity).alignment
+    assert alignment is not None
+    assert alignment.reading == "disparity"
+
+
+def test_where_a_depth_map_is_unknown_the_result_is_known(disparity: torch.Tensor) -> None:
+    result = with_map(disparity)
     assert result.depth.all()
     assert np.abs(result.depth - depth_of_scene().numpy())[9:].mean() < 0.01
-    alone = with_map(disparity, method="alone")
-    assert alone.weights == {"depth map": 1.0}
+
+
+def test_a_depth_map_alone_has_all_of_the_weight(disparity: torch.Tensor) -> None:
+    assert with_map(disparity, method="alone").weights == {"depth map": 1.0}
+
+
+def test_a_setting_of_updates_is_not_used_with_a_depth_map_which_is_said(
+    disparity: torch.Tensor,
+) -> None:
     notes = [note for note in with_map(disparity, lr="3%").notes if "not used" in note]
     assert [note.split(":")[0] for note in notes] == ["`lr`"]
 

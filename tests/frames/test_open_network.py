@@ -16,11 +16,13 @@ from tests.frames.scenes import SIZE, Brightness, Nearest, depth_of_scene, frame
 
 
 def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stays() -> None:
-    network, runs = load_network("compact", None), list[int]()
+    network = load_network("compact", None)
+    runs = list[int]()
     before = state_of(network.module)
     first = next(network.module.encoder.children())
     handle = first.register_forward_hook(lambda *_: runs.append(1))
-    frame, settings = frame_in_memory(60), ClosedSettings(iterations=1, lr="5%")
+    frame = frame_in_memory(60)
+    settings = ClosedSettings(iterations=1, lr="5%")
     fewer = replace(frame, points=frame.points.select(torch.arange(60) < 55))
     with OpenNetwork(network, "decoder.s8", settings, coarse=True, always_updated=True) as one:
         one.refine(frame)
@@ -38,7 +40,8 @@ def test_the_image_encoder_runs_once_for_all_sets_of_points_and_the_network_stay
 
 @pytest.mark.parametrize("of_points", [True, False])
 def test_the_loss_is_that_of_finite_depth(of_points: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame, build = frame_in_memory(60), Nearest if of_points else Brightness
+    frame = frame_in_memory(60)
+    build = Nearest if of_points else Brightness
     sky = torch.where(torch.arange(SIZE[0])[:, None] < 30, torch.inf, 1.5 * depth_of_scene())
     monkeypatch.setattr(build, "forward", lambda *_: sky[None, None])
     rows = frame.points.xy[:, 1].numpy()

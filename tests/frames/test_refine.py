@@ -35,7 +35,8 @@ def refined(
 
 
 def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
-    frame, xy = frame_in_memory(), torch.tensor([[1.0, 20.0]])  # left of the square crop
+    frame = frame_in_memory()
+    xy = torch.tensor([[1.0, 20.0]])  # left of the square crop
     outside = SparsePoints(xy=xy, depth=torch.ones(1), size=frame.size)
     with pytest.raises(NoPointsError):
         refined(Brightness, replace(frame, points=outside), size=Fixed(32, 32, fit="crop"))
@@ -51,12 +52,15 @@ def test_a_frame_without_a_point_in_the_networks_view_is_an_error() -> None:
     ids=["inf", "nan", "division by zero"],
 )
 @pytest.mark.parametrize("align", ["none", "scale"])
-def test_an_infinite_sky_has_no_part(sky: Callable[[Tensor, Tensor], Tensor], align: str) -> None:
+def test_an_infinite_sky_has_no_part_in_the_updates(
+    sky: Callable[[Tensor, Tensor], Tensor], align: str
+) -> None:
     class Sky(Brightness):
         def forward(self, rgb: Tensor) -> Tensor:
             return sky(super().forward(rgb), (torch.arange(rgb.shape[2]) < 15)[:, None])
 
-    frame, settings = frame_in_memory(), replace(SETTINGS, align=align)
+    frame = frame_in_memory()
+    settings = replace(SETTINGS, align=align)
     below = frame.points.select(frame.points.xy[:, 1] >= 15)
     lost = len(frame.points) - len(below)
     right = refined(Brightness, replace(frame, points=below), settings)
@@ -93,7 +97,8 @@ def test_a_validated_frame_is_refined_again_without_its_validation_points() -> N
 
 @pytest.mark.parametrize("weighs_points", [True, False])
 def test_only_a_network_that_weighs_points_is_given_the_outliers_too(weighs_points: bool) -> None:
-    xy, depth = torch.tensor([[0.0, 0.0], [3.0, 1.0], [2.0, 2.0]]), torch.tensor([1.0, 2.0, 30.0])
+    xy = torch.tensor([[0.0, 0.0], [3.0, 1.0], [2.0, 2.0]])
+    depth = torch.tensor([1.0, 2.0, 30.0])
     points = SparsePoints(xy=xy, depth=depth, size=(4, 4))
     frame = Frame(rgb=None, points=points).without(torch.tensor([False, False, True]))
     assert frame.points.depth.tolist() == [1.0, 2.0]

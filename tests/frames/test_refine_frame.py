@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -70,33 +71,71 @@ def scan_frame() -> Frame:
     return replace(frame_in_memory(), points=points)
 
 
-@pytest.mark.parametrize(("of_scanner", "kind"), [(False, "gp"), (True, "local")])
-def test_a_network_alone_is_aligned_updated_and_propagated(of_scanner: bool, kind: str) -> None:
-    frame, gt = scan_frame() if of_scanner else frame_in_memory(60), depth_of_scene().numpy()
-    own = member(Brightness, settings=UPDATES, always_updated=True)
-    result = refined(frame, own, with_stages=True)
+FRAMES_AND_KINDS = pytest.mark.parametrize(
+    ("make_frame", "kind"),
+    [
+        pytest.param(lambda: frame_in_memory(60), "gp", id="random points"),
+        pytest.param(scan_frame, "local", id="a scanner's lines"),
+    ],
+)
+
+
+def refined_alone(frame: Frame) -> Refined:
+    """The frame by one network that is always updated."""
+    always_updated = member(Brightness, settings=UPDATES, always_updated=True)
+    return refined(frame, always_updated, with_stages=True)
+
+
+@FRAMES_AND_KINDS
+def test_a_network_alone_is_updated_and_propagated(
+    make_frame: Callable[[], Frame], kind: str
+) -> None:
+    frame = make_frame()
+    result = refined_alone(frame)
     assert list(result.stages) == ["before", "updated", "propagated"]
     updated = torch.from_numpy(result.stages["updated"])
     expected = ResidualField(updated, result.used, frame.rgb).depth(kind=kind)
     assert np.allclose(result.depth, expected.numpy(), rtol=1e-5)
-    assert np.array_equal(result.depth, result.stages["propagated"])
+
+
+@FRAMES_AND_KINDS
+def test_the_first_stage_is_the_depth_before_and_the_last_the_result(
+    make_frame: Callable[[], Frame], kind: str
+) -> None:
+    result = refined_alone(make_frame())
     assert np.array_equal(result.before, result.stages["before"])
-    assert result.weights == {"brightness": 1.0}
-    errors = [np.abs(depth - gt).mean() for depth in result.stages.values()]
-    assert errors[-1] < errors[0]
+    assert np.array_equal(result.depth, result.stages["propagated"])
+
+
+@FRAMES_AND_KINDS
+def test_a_network_alone_has_all_of_the_weight(make_frame: Callable[[], Frame], kind: str) -> None:
+    assert refined_alone(make_frame()).weights == {"brightness": 1.0}
+
+
+@FRAMES_AND_KINDS
+def test_the_result_of_a_network_alone_is_nearer_to_the_truth(
+    make_frame: Callable[[], Frame], kind: str
+) -> None:
+    result = refined_alone(make_frame())
+    gt = depth_of_scene().numpy()
+    assert np.abs(result.depth - gt).mean() < np.abs(result.before - gt).mean()
 
 
 def test_the_dense_depth_is_fused_by_the_weights_that_the_result_names() -> None:
-    frame, own = frame_in_memory(60), member(Brightness, settings=ALIGNED)
+    frame = frame_in_memory(60)
+    own = member(Brightness, settings=ALIGNED)
     result = refined(frame, own, compact())
     assert sum(result.weights.values()) == pytest.approx(1)
     assert list(result.weights) == ["brightness", "compact with brightness", "compact", "linear"]
     with opened(own, compact()) as networks:
         of_own = networks[0].refine(frame)
         prior = replace(frame, prior=of_own.aligned)
-        once = [networks[1].refine(each).updated for each in (prior, frame)]
+        once = [networks[1].refine(input_frame).updated for input_frame in (prior, frame)]
         networks[1].next_image()
-        turned = [networks[1].refine(each.mirrored()).updated.flip(-1) for each in (prior, frame)]
+        turned = [
+            networks[1].refine(input_frame.mirrored()).updated.flip(-1)
+            for input_frame in (prior, frame)
+        ]
     both = [(a * b).sqrt() for a, b in zip(once, turned, strict=True)]
     depths = [of_own.updated, *both, linear(frame.points)]
     fused = weighted_mean(list(zip(depths, result.weights.values(), strict=True)))
@@ -145,24 +184,53 @@ def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None
         assert torch.allclose(again.predicted[name][one], first.predicted[name][one], rtol=1e-3)
 
 
-def test_an_image_of_another_scene_is_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def judged_frame(monkeypatch: pytest.MonkeyPatch) -> Frame:
+    """A frame of enough points that its image is judged by them."""
     monkeypatch.setattr("pnpdepth_cli.completion.outliers.FAR", 1.0)
-    frame = frame_in_memory(400)
+    return frame_in_memory(400)
+
+
+def of_another_scene(frame: Frame) -> Frame:
+    """The frame with an image that has nothing to do with its depth."""
     stripes = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(3)).round()
-    right, wrong = refined(frame, compact()), refined(replace(frame, rgb=stripes), compact())
-    assert not any(note.startswith("warning: the image") for note in right.notes)
-    (note,) = [note for note in wrong.notes if note.startswith("warning: the image")]
+    return replace(frame, rgb=stripes)
+
+
+def image_warnings(result: Refined) -> list[str]:
+    return [note for note in result.notes if note.startswith("warning: the image")]
+
+
+def test_an_image_of_the_same_scene_is_not_warned_of(judged_frame: Frame) -> None:
+    assert image_warnings(refined(judged_frame, compact())) == []
+
+
+def test_an_image_of_another_scene_is_warned_of_with_the_points_that_show_it(
+    judged_frame: Frame,
+) -> None:
+    (note,) = image_warnings(refined(of_another_scene(judged_frame), compact()))
     assert "80 validation points" in note
-    assert "compact without the image" in wrong.weights
-    assert "alone" not in wrong.validation.predicted  # there is nothing but compact
-    stated = refined(replace(frame, rgb=stripes, one_view=True), compact())
+
+
+def test_beside_an_image_of_another_scene_the_network_is_tried_without_it(
+    judged_frame: Frame,
+) -> None:
+    result = refined(of_another_scene(judged_frame), compact())
+    assert "compact without the image" in result.weights
+    assert "alone" not in result.validation.predicted  # there is nothing but compact
+
+
+def test_an_image_that_the_user_states_to_be_of_the_same_view_is_believed(
+    judged_frame: Frame,
+) -> None:
+    stated = refined(replace(of_another_scene(judged_frame), one_view=True), compact())
     assert "compact without the image" not in stated.weights
-    assert not any(note.startswith("warning: the image") for note in stated.notes)
+    assert image_warnings(stated) == []
 
 
 def test_a_completion_network_of_the_scanner_has_most_of_the_result() -> None:
     frame = scan_frame()
-    poor, good = (refined(frame, member(each), compact()) for each in (Nearest, Exact))
+    poor, good = (refined(frame, member(network), compact()) for network in (Nearest, Exact))
     assert poor.weights["nearest"] == 0
     assert good.weights["exact"] == pytest.approx(OWN_SCANNER)
     assert sum(good.weights.values()) == pytest.approx(1)
@@ -176,7 +244,8 @@ def test_networks_that_take_no_prior_are_fused_from_equal_prior_weights() -> Non
 
 @pytest.mark.parametrize("weighs", [True, False])
 def test_a_wrong_track_is_left_out_where_a_network_gave_it_no_weight(weighs: bool) -> None:
-    frame, generator = frame_in_memory(100), torch.Generator().manual_seed(0)
+    frame = frame_in_memory(100)
+    generator = torch.Generator().manual_seed(0)
     noise = 0.26 * torch.rand(SIZE, generator=generator) - 0.13
     frame = replace(frame, rgb=(depth_of_scene() * noise.exp() - 1).expand(3, -1, -1))
     track = (frame.points.xy - 60).norm(dim=1) < 20  # points that agree with each other
@@ -257,7 +326,8 @@ def test_a_network_that_takes_the_image_alone_runs_no_more_often_than_its_update
 
 
 def test_outliers_are_set_aside_and_the_other_points_stay() -> None:
-    frame, bad = frame_in_memory(60), torch.arange(60) % 5 == 0
+    frame = frame_in_memory(60)
+    bad = torch.arange(60) % 5 == 0
     depth = torch.where(bad, 2.5, 1.0) * frame.points.depth
     with member(Brightness) as judge:
         clean = without_outliers(judge, frame).inliers

@@ -46,7 +46,7 @@ def test_the_ranges_are_those_of_their_names() -> None:
 def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> None:
     definition = replace(member(Brightness).network.definition, layers=tuple("abcde"))
     asked = (None, "0", "0.12", "0.13", "0.87", "1", "x.y")
-    assert [resolve_layer(definition, each) for each in asked] == [*"aaabd", "e", "x.y"]
+    assert [resolve_layer(definition, layer) for layer in asked] == [*"aaabd", "e", "x.y"]
     nothing = replace(definition, layers=())
     for unlisted, layer in ((nothing, None), (nothing, "0"), (definition, "1.01")):
         with pytest.raises(UsageError):

@@ -44,7 +44,8 @@ def random_map(seed: int, unknown: int = 0) -> np.ndarray:
 
 def shape_in_numpy(points: SparsePoints, network: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """The uncalibrated deviation of log depth (H, W), from its description."""
-    xy, log = points.xy.numpy().astype(float), np.log(points.depth.numpy().astype(float))
+    xy = points.xy.numpy().astype(float)
+    log = np.log(points.depth.numpy().astype(float))
     queries = np.stack(np.meshgrid(np.arange(40), np.arange(30)), axis=-1).reshape(-1, 2)
     near = np.linalg.norm(queries[:, None] - xy, axis=2).argsort(axis=1)
     flat = np.log(depth.ravel().astype(float))
@@ -59,13 +60,14 @@ def shape_in_numpy(points: SparsePoints, network: np.ndarray, depth: np.ndarray)
         step.ravel(),
     )
     powers = zip(differences, (0.58, 0.10, 0.42, 0.18), strict=True)
-    return np.prod([(each + 0.003) ** power for each, power in powers], axis=0).reshape(30, 40)
+    return np.prod([(scale + 0.003) ** power for scale, power in powers], axis=0).reshape(30, 40)
 
 
 def factor_in_numpy(residual: np.ndarray, sigma: np.ndarray, count: int) -> float:
     """The calibration of finite residuals, from its description."""
     typical = 1.75 * (np.clip(count, 20, 500) / 100) ** -0.18
-    ratio, total = np.sort(np.abs(residual) / sigma), len(residual)
+    ratio = np.sort(np.abs(residual) / sigma)
+    total = len(residual)
     one, two = (ratio[min(int(np.ceil(p * (total + 1))), total) - 1] for p in (0.68, 0.95))
     share = total / (total + 20)
     factor = (one**0.25 * (two / 2) ** 0.75) ** share * typical ** (1 - share)
@@ -74,15 +76,20 @@ def factor_in_numpy(residual: np.ndarray, sigma: np.ndarray, count: int) -> floa
 
 @pytest.mark.parametrize("count", [5, 60])
 def test_the_deviation_is_the_calibrated_product_of_four_differences(count: int) -> None:
-    kept, whole = random_points(count), random_points(count, seed=1)
-    network, depth, rng = random_map(2, unknown=7), random_map(3), np.random.default_rng(4)
+    kept = random_points(count)
+    whole = random_points(count, seed=1)
+    network = random_map(2, unknown=7)
+    depth = random_map(3)
+    rng = np.random.default_rng(4)
     xy = np.column_stack([rng.integers(0, 40, 30), rng.integers(0, 30, 30)])
     truth = replace(
         random_points(30, seed=5), xy=torch.from_numpy(xy).float(), depth=torch.rand(30) + 1
     )
-    predicted, weights = depth[xy[:, 1], xy[:, 0]].copy(), rng.uniform(0.06, 1, 30)
+    predicted = depth[xy[:, 1], xy[:, 0]].copy()
+    weights = rng.uniform(0.06, 1, 30)
     # unknown or an outlier: these do not calibrate
-    predicted[:3], weights[3:6] = 0, (0.03, 0.04, 0.05)
+    predicted[:3] = 0
+    weights[3:6] = (0.03, 0.04, 0.05)
     validation = Validation(
         points=truth, kept=kept, network=torch.from_numpy(network),
         weights=torch.from_numpy(weights), predicted={"after": torch.from_numpy(predicted)},
@@ -114,13 +121,15 @@ def test_the_calibration_is_of_the_ranks_of_residuals(scale: float, total: int, 
 
 
 def test_depth_is_valid_near_the_hull_of_the_points_up_to_its_limits() -> None:
-    points, depth = random_points(40), random_map(6)
+    points = random_points(40)
+    depth = random_map(6)
     most = 1.5 * float(points.depth.max())
     sigma = 0.24 * depth
     depth[15, 10:16] = most, most * 1.001, 0, 2, 2, 0.5
     sigma[15, 10:16] = 0.1, 0.1, 0, 0.5, 0.501, 0.1
     found = valid_depth(points, torch.from_numpy(depth), torch.from_numpy(sigma)).numpy()
-    xy, pixels = points.xy.numpy(), np.stack(np.meshgrid(np.arange(40), np.arange(30)), axis=-1)
+    xy = points.xy.numpy()
+    pixels = np.stack(np.meshgrid(np.arange(40), np.arange(30)), axis=-1)
     hull = cv2.convexHull(xy)[:, 0].astype(float)
     along = np.roll(hull, -1, axis=0) - hull
     along /= np.linalg.norm(along, axis=1, keepdims=True)

@@ -16,7 +16,8 @@ from tests.frames.scenes import depth_of_scene, frame_in_memory, split_of
 
 def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
     rng = np.random.default_rng(0)
-    (truth, at, other), shares = rng.uniform(1, 4, (3, 50)), rng.uniform(size=50)
+    (truth, at, other) = rng.uniform(1, 4, (3, 50))
+    shares = rng.uniform(size=50)
     split = replace(split_of(torch.from_numpy(truth)), weights=torch.from_numpy(shares))
     gains = np.abs(np.log(other / truth)) - np.abs(np.log(at / truth))
     mean = np.average(gains, weights=shares)
@@ -27,7 +28,8 @@ def test_a_gain_is_in_standard_errors_of_the_weighted_mean() -> None:
 
 def test_points_in_one_hole_are_one_observation_of_a_gain() -> None:
     rng = np.random.default_rng(0)
-    (truth, at, other), shares = rng.uniform(1, 4, (3, 30)), rng.uniform(size=30)
+    (truth, at, other) = rng.uniform(1, 4, (3, 30))
+    shares = rng.uniform(size=30)
     hole = np.repeat([7, 3, 5], 10)
     split = replace(
         split_of(torch.from_numpy(truth)),
@@ -42,7 +44,8 @@ def test_points_in_one_hole_are_one_observation_of_a_gain() -> None:
 
 @pytest.mark.parametrize("count", [60, 5500])
 def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> None:
-    frame, judged = frame_in_memory(count), depth_of_scene()
+    frame = frame_in_memory(count)
+    judged = depth_of_scene()
     judged[:, 100:] = 0
     split = split_frame(whole_frame(frame, None), judged, [], seed=0)
     kept, held, whole = (

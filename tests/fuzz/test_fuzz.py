@@ -148,7 +148,8 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
     result = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
         most = len(result) if rng.random() < 0.5 else min(len(result), 256)
-        at, length = int(rng.integers(most + 1)), int(rng.integers(1, 65))
+        at = int(rng.integers(most + 1))
+        length = int(rng.integers(1, 65))
         words = list(re.finditer(rb"[-+.\w]+", bytes(result[:20_000])))
         kind = int(rng.integers(6 if words else 5))
         if kind == 0:
@@ -196,7 +197,9 @@ def test_no_damaged_file_causes_a_traceback_a_hang_or_much_memory(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    commands, codes, problems = write_files(), Counter[object](), list[str]()
+    commands = write_files()
+    codes = Counter[object]()
+    problems = list[str]()
     for file, command in commands.items():  # imports and caches are nobody's cost
         assert exit_code(command) in (0, 7), (file, capfd.readouterr())
     watching = [True]
@@ -215,7 +218,8 @@ def test_no_damaged_file_causes_a_traceback_a_hang_or_much_memory(
             code = exit_code(command)
         faulthandler.cancel_dump_traceback_later()
         Path(file).write_bytes(whole)
-        err, where = capfd.readouterr().err, f"input {number} of seed {SEED}: {file}"
+        err = capfd.readouterr().err
+        where = f"input {number} of seed {SEED}: {file}"
         assert code in {0, 2, 3, 4, 5, 6, 7}, (where, err)
         assert "Traceback" not in err, (where, err)
         assert problems == [], where

@@ -22,7 +22,9 @@ from tests.io.full_disk import no_room_on_disk
 
 
 @pytest.mark.parametrize("error", [None, InputError("the frame was bad"), KeyboardInterrupt()])
-def test_a_file_is_replaced_whole_or_not(tmp_path: Path, error: BaseException | None) -> None:
+def test_a_file_is_replaced_whole_or_not_at_all(
+    tmp_path: Path, error: BaseException | None
+) -> None:
     target = tmp_path / f"{'n' * 251}.png"  # the longest name that a file can have
     target.write_bytes(b"old")
     with pytest.raises(type(error)) if error else nullcontext(), atomic_path(target) as temporary:
@@ -82,7 +84,7 @@ def test_a_folder_is_replaced_whole_or_not_and_leftovers_go(tmp_path: Path, fail
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine", "report"]
 
 
-def test_in_turn_one_waits_for_the_other(tmp_path: Path) -> None:
+def test_while_one_holds_a_folder_another_waits_for_its_turn(tmp_path: Path) -> None:
     def second() -> None:
         with in_turn(tmp_path):
             pass

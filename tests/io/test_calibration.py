@@ -184,7 +184,9 @@ NO_POSES = [
     + [(read_extrinsics, text) for text in NO_POSES],
 )
 @pytest.mark.filterwarnings("error")
-def test_what_is_wrong_is_named(tmp_path: Path, read: Callable[[Path], object], text: str) -> None:
+def test_a_wrong_calibration_or_pose_is_refused_with_the_name_of_its_file(
+    tmp_path: Path, read: Callable[[Path], object], text: str
+) -> None:
     with pytest.raises(InputError, match=r"^.*calib\.txt.*$"):
         read(write(tmp_path, text))
 

@@ -13,7 +13,7 @@ from pnpdepth_cli.io.colmap_dense import is_dense_map, read_dense_map
 ROWS = np.array([[1, 2, 3], [4, 0, 6]], np.float32)
 
 
-def test_x_is_the_fastest_axis() -> None:
+def test_a_dense_map_of_colmap_is_read_along_x_first() -> None:
     # COLMAP writes Mat::Set(row, col) at slice × width × height + row × width + col.
     data = b"3&2&1&" + ROWS.tobytes()
     assert is_dense_map(data)

@@ -100,7 +100,9 @@ def test_a_report_replaces_the_one_before_with_its_images_or_leaves_it(tmp_path:
 
 
 @pytest.mark.parametrize("folder", [".", "file", "file/deep", "full", "link"])
-def test_other_files_are_safe(folder: str, tmp_path: Path) -> None:
+def test_a_folder_that_holds_other_files_is_never_taken_for_a_report(
+    folder: str, tmp_path: Path
+) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "file").write_text("mine")
     (tmp_path / "full/notes.txt").write_text("mine")

@@ -20,7 +20,9 @@ COLOURS_16 = np.random.default_rng(2).integers(0, 65536, (7, 11, 3)).astype(np.u
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("colours", [COLOURS, COLOURS_16])
-def test_bits_are_kept_and_alpha_dropped(tmp_path: Path, suffix: str, colours: np.ndarray) -> None:
+def test_all_bits_of_a_colour_are_kept_and_alpha_is_dropped(
+    tmp_path: Path, suffix: str, colours: np.ndarray
+) -> None:
     path = tmp_path / f"a{suffix}"
     expected = colours / np.float32(np.iinfo(colours.dtype).max)
     alpha = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)
@@ -125,3 +127,9 @@ def test_the_exif_orientation_is_told(orientation: int, tmp_path: Path) -> None:
     assert orientation_in(tmp_path / "a.jpg") == orientation
     Image.new("RGB", (8, 4)).save(tmp_path / "a.png")
     assert orientation_in(tmp_path / "a.png") == 1
+
+
+def test_the_orientation_of_an_exr_which_has_no_exif_is_upright(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"\x76\x2f\x31\x01")  # how an EXR begins
+    assert orientation_in(path) == 1

@@ -67,6 +67,8 @@ def test_channels_are_first_or_last(shape: tuple[object, ...], size: Fixed | Mul
         *((definition, hook, "x") for hook in ("read_checkpoint", "arguments", "output", "verify")),
     ],
 )
-def test_a_bad_field_is_named(make: Callable[..., object], field: str, value: object) -> None:
+def test_a_bad_field_of_a_definition_is_named(
+    make: Callable[..., object], field: str, value: object
+) -> None:
     with pytest.raises(ModelError, match=rf"\A.* {field}=.*\Z"):
         make(**{field: value})

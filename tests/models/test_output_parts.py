@@ -28,7 +28,9 @@ MAPS = torch.arange(3.0 * HEIGHT * WIDTH).reshape(1, 3, HEIGHT, WIDTH)
         ("net.onnx:out", "net.onnx:out", ()),
     ],
 )
-def test_the_parts_are_behind_the_colon(spec: str, base: str, parts: tuple[str, ...]) -> None:
+def test_the_parts_of_an_output_are_named_behind_a_colon(
+    spec: str, base: str, parts: tuple[str, ...]
+) -> None:
     assert split_parts(spec) == (base, parts)
 
 

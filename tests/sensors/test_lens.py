@@ -25,7 +25,9 @@ EXAMPLES: dict[str, tuple[float, ...]] = {
         lambda c: st.sampled_from([c[:4], c[:5], c[:8], c[:12], c])
     ),
 )
-def test_lenses_are_opencvs(seed: int, coefficients: tuple[float, ...]) -> None:
+def test_points_are_seen_where_opencv_sees_them_through_each_lens(
+    seed: int, coefficients: tuple[float, ...]
+) -> None:
     xy = np.random.default_rng(seed).uniform(-0.6, 0.6, (60, 2))
     points = 3 * np.column_stack([xy, np.ones(60)])
     camera = Camera(intrinsics=K, distortion=coefficients)

@@ -67,7 +67,9 @@ def test_a_lens_model_does_not_fold_points_from_outside_into_the_image() -> None
 
 @pytest.mark.parametrize("focal_px", [240.0, 300.0])
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.3, -0.1, -0.2)])
-def test_nearer_points_hide_others(origin: tuple[float, float, float], focal_px: float) -> None:
+def test_points_are_hidden_by_nearer_ones_beside_them(
+    origin: tuple[float, float, float], focal_px: float
+) -> None:
     rng = np.random.default_rng(0)
     pixels = rng.permutation(24 * 32)[:200]
     xy = np.column_stack([pixels % 32, pixels // 32]) + rng.uniform(-0.49, 0.49, (200, 2))

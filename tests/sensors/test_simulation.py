@@ -38,22 +38,44 @@ def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_sam
     assert 100 * len(points) / depth.size == pytest.approx(percent, rel=0.1)
 
 
-def test_a_lidar_of_ones_own_measures_known_depth_along_evenly_spaced_beams() -> None:
+def test_the_beams_of_a_lidar_of_ones_own_are_evenly_spaced_from_top_to_bottom() -> None:
     assert lidar_of(None, 5, (15, -25)).elevations_deg == (15, 5, -5, -15, -25)
     assert lidar_of(None, 1, (3, 3)).elevations_deg == (3,)
+
+
+def test_each_beam_of_a_lidar_of_ones_own_has_1800_directions_a_turn() -> None:
     assert len(lidar_of(None, 5, (15, -25)).directions(np.random.default_rng(0))) == 5 * 1800
-    for beams, top, bottom in ((5, -25, 15), (5, 3, 3), (5, np.nan, 0), (2, 91, 0)):
-        with pytest.raises(UsageError):
-            lidar_of(None, beams, (top, bottom))
-    camera = Camera(intrinsics=np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]))
+
+
+@pytest.mark.parametrize(
+    ("beams", "top", "bottom"), [(5, -25, 15), (5, 3, 3), (5, np.nan, 0), (2, 91, 0)]
+)
+def test_beams_that_no_lidar_can_have_are_refused(beams: int, top: float, bottom: float) -> None:
+    with pytest.raises(UsageError):
+        lidar_of(None, beams, (top, bottom))
+
+
+CAMERA = Camera(intrinsics=np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]))
+
+
+def half_known_depth() -> np.ndarray:
+    """A map (240, 320) whose left half is unknown."""
     depth = np.random.default_rng(0).uniform(2, 50, (240, 320)).astype(np.float32)
     depth[:, :160] = 0
-    got = simulate_lidar(depth, camera, lidar_of(None, 15, (14, -14)), seed=0)  # without noise
+    return depth
+
+
+def test_a_lidar_of_ones_own_measures_the_depth_of_the_pixel_it_hits_where_it_is_known() -> None:
+    depth = half_known_depth()
+    got = simulate_lidar(depth, CAMERA, lidar_of(None, 15, (14, -14)), seed=0)  # without noise
     column, row = np.floor(got.xy + 0.5).astype(int).T
     np.testing.assert_allclose(got.depth, depth[row, column], rtol=1e-6)
     assert len(got.depth) > 1000
+
+
+def test_a_lidar_that_hits_no_known_depth_is_an_error_that_names_its_beams() -> None:
     with pytest.raises(NoPointsError, match="15 beams"):
-        simulate_lidar(0 * depth, camera, lidar_of(None, 15, (14, -14)), seed=0)
+        simulate_lidar(0 * half_known_depth(), CAMERA, lidar_of(None, 15, (14, -14)), seed=0)
 
 
 DEPTH = np.random.default_rng(7).uniform(1, 9, (60, 80)).astype(np.float32)

@@ -31,11 +31,13 @@ NO_CUT = {
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_rear_of_the_front_is_the_network_bit_for_bit_at_every_layer(name: str) -> None:
-    network, x = build(name), image()
+    network = build(name)
+    x = image()
     frames = [x, x.flip(3) * 0.7, x]
     wholes = [plain(network, frame) for frame in frames]
     layers = [layer for layer, _ in network.named_modules(remove_duplicate=False) if layer]
-    can, cannot = 0, set()
+    can = 0
+    cannot = set()
     while layers:
         layer = layers.pop(0)
         try:
@@ -104,8 +106,11 @@ def test_a_frame_that_needs_another_recording_is_learned_anew(
 
 
 def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
-    network, x, other = build("repeated"), image(), image() * 0.5
-    whole, other_whole = plain(network, x), plain(network, other)
+    network = build("repeated")
+    x = image()
+    other = image() * 0.5
+    whole = plain(network, x)
+    other_whole = plain(network, other)
     with Split(network, "head") as split, torch.no_grad():
         z = split.front(x)
         assert torch.equal(network(other), other_whole)
@@ -115,7 +120,8 @@ def test_the_network_may_be_called_for_itself_while_it_is_cut() -> None:
 
 
 def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> None:
-    network, x = build("two branches"), image()
+    network = build("two branches")
+    x = image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
         assert (network.front.calls, network.guide.calls) == (1, 0)
@@ -127,8 +133,9 @@ def test_the_front_runs_once_and_what_does_not_depend_on_z_twice_at_most() -> No
     assert network.head.calls == 5
 
 
-def test_nothing_of_a_image_stays_in_memory_after_the_split_closes() -> None:
-    network, x = build("unet"), image()
+def test_nothing_of_an_image_stays_in_memory_after_the_split_closes() -> None:
+    network = build("unet")
+    x = image()
     seen: list[weakref.ref[Tensor]] = []
     hook = network.bottleneck.register_forward_hook(
         lambda module, inputs, output: seen.extend((weakref.ref(inputs[0]), weakref.ref(output)))
@@ -168,7 +175,8 @@ def test_what_is_no_cut_is_refused_on_one_line(make: Callable[[], nn.Module], la
 
 
 def test_the_rear_needs_a_front_that_succeeded_and_may_be_tried_again() -> None:
-    network, x = build("unet"), image()
+    network = build("unet")
+    x = image()
     with Split(network, "bottleneck") as split, torch.no_grad():
         for _ in range(2):
             with pytest.raises(RuntimeError, match="front"):
@@ -205,7 +213,8 @@ LAYERS = {
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_the_network_is_as_before_when_the_split_closes(name: str) -> None:
-    network, x = prepared(name), image()
+    network = prepared(name)
+    x = image()
     before = state_of(network)
     with Split(network, LAYERS[name]) as split:
         z = split.front(x)
@@ -258,7 +267,8 @@ class HooksItself(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = nn.Sequential(conv(3, 4), conv(4, 4))
-        self.neck, self.head = conv(4, 4), conv(8, 1)
+        self.neck = conv(4, 4)
+        self.head = conv(8, 1)
         self.features: list[torch.Tensor] = []
         self.has_hooks = False
 

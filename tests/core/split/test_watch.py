@@ -54,11 +54,12 @@ INDEPENDENT: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 @pytest.mark.parametrize("operation", [*DEPENDENT, *INDEPENDENT])
 def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: str) -> None:
     torch.manual_seed(0)
-    network, x = behind((DEPENDENT | INDEPENDENT)[operation]), image()
+    network = behind((DEPENDENT | INDEPENDENT)[operation])
+    x = image()
     with Split(network, "cut") as split, torch.no_grad():
         z = split.front(x)
-        for each in (z, z + 1):
-            split.rear(each)
+        for changed in (z, z + 1):
+            split.rear(changed)
         replayed = split.rear(-z)
     assert network.branch.calls == (3 if operation in DEPENDENT else 1)
     with Split(network, "cut") as split, torch.no_grad():
@@ -77,16 +78,17 @@ def test_a_branch_runs_again_where_it_depends_on_z_by_any_operation(operation: s
 )
 def test_python_may_take_another_branch_at_another_z(escape: Callable[[Tensor], bool]) -> None:
     torch.manual_seed(0)
-    network, x = branching(escape), image()
+    network = branching(escape)
+    x = image()
     for sign in (1, -1):
         with Split(network, "cut") as split, torch.no_grad():
             z = split.front(x)
             z = sign * z.abs()
-            outputs = [split.rear(each) for each in (z, -z, z, -z)]
-        for output, each in zip(outputs, (z, -z), strict=False):
+            outputs = [split.rear(changed) for changed in (z, -z, z, -z)]
+        for output, changed in zip(outputs, (z, -z), strict=False):
             with Split(network, "cut") as fresh, torch.no_grad():
                 fresh.front(x)
-                assert torch.equal(fresh.rear(each), output)
+                assert torch.equal(fresh.rear(changed), output)
         assert torch.equal(outputs[0], outputs[2])
         assert torch.equal(outputs[1], outputs[3])
         assert not torch.equal(outputs[0], outputs[1])
