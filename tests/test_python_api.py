@@ -235,7 +235,8 @@ def test_a_closed_refiner_refines_nothing_and_its_network_is_free(
 def test_the_depth_after_each_step_is_returned_if_it_is_asked_for(frame: Frame) -> None:
     network = pnp.load_network("fcrn-tiny")
     assert pnp.refine(network, *frame).stages == {}
-    stages = pnp.refine(network, *frame, stages=True).stages
+    settings = pnp.Settings(iterations=2)
+    stages = pnp.refine(network, *frame, settings, stages=True).stages
     assert [*stages] == ["before", "updated", "propagated", "alone"]
 
 
