@@ -45,7 +45,13 @@ MAY_IMPORT = {
     "dataset": {*GROUND_FLOOR, "completion", "frames", "sensors", "io"},
     "commands": {
         *GROUND_FLOOR,
-        *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
+        "core",
+        "completion",
+        "models",
+        "frames",
+        "sensors",
+        "io",
+        "dataset",
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
     "refiner": {*GROUND_FLOOR, "completion", "models", "frames", "dataset"},
@@ -170,7 +176,8 @@ def test_a_benchmark_is_importable(file: Path) -> None:
 
 
 def test_few_functions_wrap_equation_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stacks, backward = [], torch.Tensor.backward
+    stacks = []
+    backward = torch.Tensor.backward
 
     def watched(tensor: torch.Tensor) -> None:
         stacks.append(traceback.extract_stack())

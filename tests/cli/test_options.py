@@ -40,7 +40,8 @@ def test_every_option_has_one_group_of_the_longer_help_and_few_are_common(name: 
     # The help is printed before anything is checked.
     arguments = [name, "missing.png", "--help-all"]
     result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")
-    grouped, names = COMMANDS[name], {*own_options(COMMANDS[name])}
+    grouped = COMMANDS[name]
+    names = {*own_options(COMMANDS[name])}
     assert isinstance(grouped, GroupedCommand)
     members = [option for options in grouped.groups.values() for option in options]
     assert len(members) == len(set(members))

@@ -70,7 +70,8 @@ def test_unsupported_depth_is_said_and_zero_if_asked(capsys: pytest.CaptureFixtu
     whole = read_depth(Path("keep/rgb_depth.png")).values
     assert (depth == np.where(valid, whole, 0)).all()
     # The errors of all stages are those of the pixels whose depth is kept.
-    errors, known = zero["errors"]["ground_truth"], (truth > 0) & valid
+    errors = zero["errors"]["ground_truth"]
+    known = (truth > 0) & valid
     assert errors["after"]["mae"] == pytest.approx(np.abs(depth - truth)[known].mean(), abs=0.01)
     assert errors["after"]["coverage"] == pytest.approx(known.sum() / (truth > 0).sum())
     assert errors["linear"]["mae"] < kept["errors"]["ground_truth"]["linear"]["mae"]

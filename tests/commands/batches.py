@@ -72,7 +72,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
             left = np.where(right < 0, -1 / right, np.inf)
         depth = np.minimum(np.minimum(floor, left), 5 - STEP_M * number)
         known = np.random.default_rng(number).permutation(depth.size)[:points]
-        sparse, name = np.zeros(depth.shape, np.float32), f"drive_{number:03}"
+        sparse = np.zeros(depth.shape, np.float32)
+        name = f"drive_{number:03}"
         sparse.flat[known] = depth.flat[known]
         write_depth(root / f"sparse/{name}.png", sparse, scale=1000)
         cv2.imwrite(str(root / f"rgb/{name}.png"), np.roll(image, number, axis=1))

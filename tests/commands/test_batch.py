@@ -63,7 +63,8 @@ def test_a_second_run_does_nothing_and_a_batch_equals_single_refinements(root: P
     os.utime(root / "rgb/a.png", (1, 1))  # that a file was touched or moved does not matter
     os.utime(root / "out/b_depth.png", (1, 1))
     moved = root.rename(root.with_name("moved"))
-    together, listener = results(moved / "out"), Recorder()
+    together = results(moved / "out")
+    listener = Recorder()
     before = {path: path.stat().st_mtime_ns for path in (moved / "out").glob("[a-d]*")}
     assert done(moved, listener, refine=refine) == []
     assert listener.messages[-1] == "4 frames, all of them done already"
@@ -261,11 +262,13 @@ def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root:
 def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
     for number in range(7):
         shutil.copy(root / "rgb/a.png", root / f"rgb/x{number}.png")
-    listener, refine = Recorder(), {"holdout": 0.2, "baselines": True}
+    listener = Recorder()
+    refine = {"holdout": 0.2, "baselines": True}
     batch(root, listener, limit=2, refine=refine)
     result = batch(root, refine=refine)
     content = summary(root)
-    rows, table = content.pop("frames"), rows_of(root)
+    rows = content.pop("frames")
+    table = rows_of(root)
     assert content == plain(asdict(result))
     assert [row["name"] for row in rows] == [line["name"] for line in table] == list(NAMES)
     assert content["errors"].keys() == {"ground_truth", "held_out", "validation", "used"}

@@ -40,7 +40,8 @@ def frame(folder: Path, name: str, depth: float = 2.0, **entries: Any) -> Path:
 def camera(right: float | None) -> CameraRecord:
     """A camera that is so far to the right in the world; None: its pose is unknown."""
     pose = None if right is None else [[1.0, 0, 0, right], [0, 1, 0, 0], [0, 0, 1, 0]]
-    lens, intrinsics = "radial-tangential", [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
+    lens = "radial-tangential"
+    intrinsics = [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
     return CameraRecord(intrinsics=intrinsics, lens=lens, source="of the test", pose=pose)
 
 
@@ -120,7 +121,8 @@ def test_frames_are_one_cloud_in_which_views_agree_and_voxels_merge(tmp_path: Pa
 def test_what_cannot_be_done_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
     out, cloud = tmp_path / "out", tmp_path / "o.ply"
     frame(out, "a", camera=camera(5))
-    b, c = frame(out, "b", camera=camera(None)), frame(tmp_path, "c")
+    b = frame(out, "b", camera=camera(None))
+    c = frame(tmp_path, "c")
     big, resized = tmp_path / "big.png", tmp_path / "c_depth.exr"
     cv2.imwrite(str(big), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
     write_depth(resized, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))

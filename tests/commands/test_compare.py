@@ -69,7 +69,8 @@ def test_a_lower_error_is_a_gain_with_interval_from_6_frames(tmp_path: Path, fra
 
 def test_p_values_are_adjusted_for_the_number_of_measures_and_runs(tmp_path: Path) -> None:
     errors = np.random.default_rng(0).uniform(0.5, 1, 12)
-    one, two = run(tmp_path / "one", errors), run(tmp_path / "two", errors / 2)
+    one = run(tmp_path / "one", errors)
+    two = run(tmp_path / "two", errors / 2)
     for runs, columns, tests in (
         ([one, two], ["mae"], 1),
         ([one, two, two], ["rmse", "mae"], 4),

@@ -237,7 +237,8 @@ def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Pa
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     points = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
     frame(tmp_path, np.where(points > 0, gt, gt + 1), gt)
-    path, record = str(depth_file(tmp_path / "points.npy", points)), tmp_path / "out" / "a.json"
+    path = str(depth_file(tmp_path / "points.npy", points))
+    record = tmp_path / "out" / "a.json"
     pattern = SamplePattern(kind="uniform", count=30, seed=7)
     drawn = FileRecord(path=path, kind="sampled", sampled=pattern)
     for source, size, given in (

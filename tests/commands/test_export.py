@@ -113,7 +113,8 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_at_every_pixel(root: Path) -> 
 
 @pytest.mark.parametrize("unit_scale", [None, 0.25])
 def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: float | None) -> None:
-    scene, far = root / "scene", DEPTH.copy()
+    scene = root / "scene"
+    far = DEPTH.copy()
     far[:2] = np.array([[65.532], [65.534]]) / (unit_scale or 1)  # 16 bits of millimetres hold it
     what, notes = export_results(results(root, far, unit_scale), scene, to="nerfstudio")
     assert what == f"3 frames in {'m' if unit_scale else 'model units'}"
@@ -143,7 +144,8 @@ def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: floa
 def test_codes_of_nerfstudio_are_larger_where_the_scene_is(
     root: Path, farthest: float, factor: float
 ) -> None:
-    scene, far = root / "scene", DEPTH.copy()
+    scene = root / "scene"
+    far = DEPTH.copy()
     far[0] = farthest
     _, notes = export_results(results(root, far), scene, to="nerfstudio")
     assert f"--depth-unit-scale-factor {factor:g}`" in notes[0]
@@ -164,7 +166,8 @@ def test_3dgs_leaves_out_what_is_unknown_where_asked(root: Path) -> None:
 
 def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    scene, splats = root / "scene", "gaussian-splatting"
+    scene = root / "scene"
+    splats = "gaussian-splatting"
     what, _ = export_results(results(root, unit_scale=0.25), scene, to=splats)
     assert what == "3 frames in model units"
     own, new = (pycolmap.Reconstruction(root / path) for path in ("sparse", "scene/sparse/0"))
@@ -225,7 +228,8 @@ def test_what_cannot_be_exported_is_one_line(root: Path, entry: str, value: obje
 
 
 def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -> None:
-    folder, dense = results(root), root / "dense"
+    folder = results(root)
+    dense = root / "dense"
     export_results(folder, dense, to="colmap")
     export_results(folder, dense, to="colmap", overwrite=True)
     cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))

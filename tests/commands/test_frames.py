@@ -149,7 +149,8 @@ def test_depth_images_are_sparse_depth(kind: str, error: float, tmp_path: Path) 
 
 
 def test_a_batch_writes_a_bag_out_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag, frame = write_bag(tmp_path / "drive.mcap", poses="/odom"), frame_on_disk(tmp_path)
+    bag = write_bag(tmp_path / "drive.mcap", poses="/odom")
+    frame = frame_on_disk(tmp_path)
     network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     command = ["batch", str(bag), "-o", str(tmp_path / "out"), *network, "--iterations", "1"]
     times = []
@@ -217,7 +218,8 @@ def test_what_a_bag_has_or_lacks_decides_the_calibration_and_is_said(
 
 
 def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path) -> None:
-    bag, folder = write_bag(tmp_path / "drive.mcap"), tmp_path / "frames"
+    bag = write_bag(tmp_path / "drive.mcap")
+    folder = tmp_path / "frames"
     folder.mkdir()
     written(bag, folder)
     with pytest.raises(OutputError, match="--overwrite"):
@@ -236,7 +238,8 @@ def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path)
 
 
 def test_the_users_own_files_beside_frames_stay_and_a_folder_is_named(tmp_path: Path) -> None:
-    folder, bag = tmp_path / "frames", write_bag(tmp_path / "drive.mcap", without="/tf_static")
+    folder = tmp_path / "frames"
+    bag = write_bag(tmp_path / "drive.mcap", without="/tf_static")
     written(bag, folder)
     name = next((folder / "rgb").iterdir()).stem
     own = [f"rgb/{name}.txt", "rgb/mine.png", f"sparse/{name}_mask.png", "poses.txt", "notes.md"]
@@ -294,10 +297,8 @@ def test_a_bag_goes_in_and_a_bag_comes_out(depth: str, tmp_path: Path) -> None:
         of_frame = {topic: messages[place][1] for topic, messages in by_topic.items()}
         assert {messages[place][0] for messages in by_topic.values()} == {time_ns}
         # Depth and its standard deviation, bit for bit.
-        written_depth, valid = (
-            read_depth(out / f"{name}_depth.exr").values,
-            out / f"{name}_valid.png",
-        )
+        written_depth = read_depth(out / f"{name}_depth.exr").values
+        valid = out / f"{name}_valid.png"
         valid_depth = np.where(read_rgb(valid).values[..., 0] > 0, written_depth, 0)
         found = floats_of(of_frame["/camera/depth/image"])
         np.testing.assert_array_equal(np.isnan(found), valid_depth == 0)

@@ -85,8 +85,11 @@ def test_a_bin_of_any_number_of_fields_has_the_same_points(
     tmp_path: Path, scan: Rows, count: int, cut: int, shuffled: bool
 ) -> None:
     scan = scan[cut:]  # so that other counts divide its size
-    rng, reflectance, number = np.random.default_rng(0), scan[:, 3], np.arange(len(scan))
-    zero, ring = 0 * number, number // 175 % 64
+    rng = np.random.default_rng(0)
+    reflectance = scan[:, 3]
+    number = np.arange(len(scan))
+    zero = 0 * number
+    ring = number // 175 % 64
     fields = {
         3: [],
         4: [reflectance],
@@ -214,7 +217,8 @@ def indoor(
     ("suffix", "of"), [(".png", 2), (".png", 255), (".npy", 2), (".npy", 255), (".exr", 1)]
 )
 def test_only_depth_of_enough_confidence_is_used(tmp_path: Path, suffix: str, of: int) -> None:
-    rng, truth = np.random.default_rng(0), codes_of(INDOOR / "gt.png") / 1000
+    rng = np.random.default_rng(0)
+    truth = codes_of(INDOOR / "gt.png") / 1000
     small = truth[1::4, 1::4].copy()  # of a phone, a quarter of the image's size
     confidence = rng.integers(0, 3, small.shape)
     small[confidence < 2] *= rng.uniform(0.5, 2, (confidence < 2).sum())

@@ -49,7 +49,8 @@ def prior_of(sparse: Tensor) -> Tensor:
 
 def test_depth_scales_with_its_inputs_and_an_unknown_prior_does_nothing(network: Compact) -> None:
     rgb, sparse = frame(300)
-    prior, unknown = prior_of(sparse), torch.zeros_like(sparse)
+    prior = prior_of(sparse)
+    unknown = torch.zeros_like(sparse)
     with torch.no_grad():
         pairs = (
             (network(rgb, 10 * sparse), 10 * network(rgb, sparse)),
@@ -67,7 +68,8 @@ def test_wherever_points_lie_rear_of_front_is_the_network_and_errors_reach_every
 ) -> None:
     assert definition.static_graph
     row, same = torch.zeros(2, 1, 1, HEIGHT, WIDTH)
-    row[..., 40, :], same[..., ::7, ::7] = torch.linspace(1, 5, WIDTH), 2.0
+    row[..., 40, :] = torch.linspace(1, 5, WIDTH)
+    same[..., ::7, ::7] = 2.0
     rgb, some = frame(200)
     with Split(network, layer, static_graph=True) as split:
         for sparse in (*(frame(count)[1] for count in (60, 0, 1, 20_000)), row, same, some):
@@ -150,7 +152,8 @@ def test_the_shipped_inlier_weights_detect_outliers_of_a_dense_map_beside_a_jump
 def test_a_dense_map_has_the_same_weights_and_trust_in_a_prior_in_a_batch(network: Compact) -> None:
     dense, _ = dense_frame(outliers=0.1)
     sparse = dense * (torch.rand(dense.shape, generator=torch.Generator().manual_seed(0)) < 0.01)
-    both, rgb = torch.cat([sparse, dense]), torch.zeros(2, 3, 240, 320)
+    both = torch.cat([sparse, dense])
+    rgb = torch.zeros(2, 3, 240, 320)
     points = Points(both)
     cloud = Cloud.of(points, rgb)
     points.weigh(network.inlier_weights(points, cloud))

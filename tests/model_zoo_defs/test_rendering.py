@@ -22,7 +22,8 @@ HEIGHT, WIDTH = 48, 64
 
 
 def test_the_depth_of_a_slanted_floor_solves_its_plane_equation() -> None:
-    palette, group = Palette(np.random.default_rng(0)), Group()
+    palette = Palette(np.random.default_rng(0))
+    group = Group()
     floor = [(-90, -90, 0), (90, -90, 0), (90, 90, 0), (-90, 90, 0)]
     group.add(shapes.quads([floor]), palette.new("plain"))
     mesh, materials = group.merged()

@@ -115,12 +115,14 @@ def test_poses_are_estimated_or_checked_by_images(turned: float | None, tmp_path
         shutil.copytree(DRIVE / part, tmp_path / part)
     (tmp_path / "net").mkdir()
     frame_on_disk(tmp_path / "net")
-    poses, listener = tmp_path / "steps.txt", Recorder()
+    poses = tmp_path / "steps.txt"
+    listener = Recorder()
     turn = Rotation.from_rotvec([0, turned or 0, 0]).as_matrix()
     step = np.column_stack([turn, [0, 0, 0.3 if turned else 0.6]])
     np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
     accumulating(tmp_path, listener=listener, limit=1, poses=None if turned is None else poses)
-    record, messages = record_of(tmp_path, "drive_000"), " ".join(listener.messages)
+    record = record_of(tmp_path, "drive_000")
+    messages = " ".join(listener.messages)
     (neighbour,) = record["result"]["neighbours"]
     assert neighbour.get("contradicts_images", False) == bool(turned)
     assert ("contradict the images" in messages) == bool(turned)
@@ -132,7 +134,8 @@ def test_poses_are_estimated_or_checked_by_images(turned: float | None, tmp_path
 
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=2), Recorder()
+    root = drive_on_disk(tmp_path, frames=2)
+    listener = Recorder()
     poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, poses=None)
     shutil.rmtree(root / "calib")
@@ -143,7 +146,8 @@ def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: P
 
 
 def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=3), Recorder()
+    root = drive_on_disk(tmp_path, frames=3)
+    listener = Recorder()
     away = np.column_stack([Rotation.from_rotvec([0, np.radians(150), 0]).as_matrix(), [0, 0, 0]])
     ahead = np.column_stack([np.eye(3), [0, 0, 300.0]])
     np.savetxt(root / "away.txt", np.reshape([away, np.eye(3, 4), ahead], (3, 12)))
@@ -179,7 +183,8 @@ def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> Non
         write_depth_cloud(CloudRequest(depth=depth, output=single))
         xyz = read_scan(single)[0]
         ends.append((len(xyz), xyz))
-    whole, start = read_scan(output)[0], 0
+    whole = read_scan(output)[0]
+    start = 0
     for number, (count, xyz) in enumerate(ends):
         shift = np.median(whole[start : start + count] - xyz, axis=0)
         np.testing.assert_allclose(shift, [0, 0, 0.6 * number], atol=0.06)
@@ -187,7 +192,8 @@ def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> Non
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:
-    root, other = drive_on_disk(tmp_path / "drive", frames=2), tmp_path / "other.txt"
+    root = drive_on_disk(tmp_path / "drive", frames=2)
+    other = tmp_path / "other.txt"
     other.write_text((root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n"))
     # Poses of the folder; then of a file, with which the frames that moved are done again.
     farthest, both = [], ["drive_000", "drive_001"]

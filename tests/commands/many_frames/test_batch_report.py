@@ -38,7 +38,8 @@ def test_the_page_links_panels_of_the_records_and_shows_errors(root: Path, repor
         ("image", "preview", "Image"),
         ("map", "improvement", "Change of error"),
     ):
-        result, shown = root / f"out/c_{kind}.png", frame["views"][view]
+        result = root / f"out/c_{kind}.png"
+        shown = frame["views"][view]
         assert (report / shown["src"]).samefile(result)
         assert shown["box"] == figures[kind]["panels"][title]
         assert shown["size"] == figures[kind]["size"] == [*Image.open(result).size]
@@ -57,7 +58,8 @@ def test_a_report_has_what_all_runs_gave_and_draws_what_changed(root: Path, repo
     batch(root, html=report, shard=(1, 2))  # a and c
     shutil.rmtree(report)
     assert done(root, html=report) == ["b", "d"]
-    before, key = everything(report), {n: f["key"] for n, f in frames_of(report).items()}
+    before = everything(report)
+    key = {n: f["key"] for n, f in frames_of(report).items()}
 
     # a frame that is redone has new images, one that is gone has none, and a lost one stays lost
     cv2.imwrite(str(root / "rgb/a.png"), cv2.imread(str(root / "rgb/a.png"))[:, ::-1])
@@ -76,7 +78,8 @@ def test_a_report_has_what_all_runs_gave_and_draws_what_changed(root: Path, repo
 def test_without_ground_truth_changes_are_at_held_out_points(root: Path, report: Path) -> None:
     shutil.rmtree(root / "gt")
     batch(root, html=report)
-    data, frame = page_data(report), frames_of(report)["a"]
+    data = page_data(report)
+    frame = frames_of(report)["a"]
     assert not [column for column in data["columns"] if "change" in column["title"]]
     assert data["columns"][data["sort_by"]]["key"] == "rmse_after"
     (table,) = data["tables"]
@@ -89,7 +92,8 @@ def test_without_ground_truth_changes_are_at_held_out_points(root: Path, report:
 
     changes = {"holdout": 0.3, "propagate": "gp", "overwrite": True}
     batch(root, output=root / "other", html=report, refine=changes)
-    data, frame = page_data(report), frames_of(report)["a"]
+    data = page_data(report)
+    frame = frames_of(report)["a"]
     facts = {"iterations": "5", "layer": "middle", "align": "none", "holdout": "0.3"}
     assert facts.items() <= dict(data["facts"]).items()
     assert frame["values"]["rmse_change"] is not None

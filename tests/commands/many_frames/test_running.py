@@ -76,7 +76,8 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
 def test_a_frame_that_kills_its_worker_is_named_others_done(cluster: Any, tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", NAMES[:6])
     add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
-    model, start = root / "net" / "my_net.py", "    def forward(self, rgb):\n"
+    model = root / "net" / "my_net.py"
+    start = "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
     listener = Recorder()
     batch(root, listener, ray=cluster.address)
@@ -159,11 +160,13 @@ def test_many_kills_do_not_change_a_byte(tmp_path: Path, monkeypatch: pytest.Mon
     shutil.rmtree(out)
     started = time.monotonic()
     begin().join()
-    longest, moments = time.monotonic() - started, random.Random(0)
+    longest = time.monotonic() - started
+    moments = random.Random(0)
     shutil.rmtree(out)
     killed = interrupted = 0
     while killed < 12:
-        before, process = recorded(out), begin()
+        before = recorded(out)
+        process = begin()
         time.sleep(moments.uniform(0, longest))
         process.kill()
         process.join()

@@ -45,7 +45,8 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
 @pytest.mark.parametrize("frames", [5, 8, 20])
 @pytest.mark.parametrize("spread", [0.05, 0.5])
 def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: float) -> None:
-    rng, trials = np.random.default_rng(0), 1500
+    rng = np.random.default_rng(0)
+    trials = 1500
     draws = rng.lognormal(-(spread**2) / 2, spread, (frames, trials))  # of mean 1
     low, high = np.array([interval(draw) for draw in draws.T]).T
     error = np.sqrt(0.95 * 0.05 / trials)
@@ -56,7 +57,8 @@ def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: 
 def test_the_gain_is_in_per_cent_of_the_first_and_narrow_for_equal_gains(sign: int) -> None:
     before = np.random.default_rng(0).lognormal(0, 1, 9)
     noise = np.random.default_rng(1).uniform(0.3, 0.7, 9)
-    change, clusters = partial(statistics.gain, sign=sign), clusters_of(np.arange(9))
+    change = partial(statistics.gain, sign=sign)
+    clusters = clusters_of(np.arange(9))
     half = statistics.interval(change, [before, before / 2], clusters)
     assert half == pytest.approx((-50 * sign, -50 * sign), abs=1e-6)
     low, high = statistics.interval(change, [before, before * noise], clusters)
