@@ -11,12 +11,10 @@ import pytest
 from safetensors.torch import save_file
 
 from pnpdepth_cli.models.registry import find_definition
-from tests.test_readme import YOUR_NETWORK, titled_blocks
-from tests.test_readme import run as run_python
+from tests.pages import ROOT, YOUR_NETWORK, run_python, titled_blocks
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
 SHOWN = titled_blocks(ROOT / "docs" / "extending.md")
 
 

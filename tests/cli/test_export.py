@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.cli.main import run
-from tests.commands.test_export import project, results
+from tests.commands.projects import project, results
 
 
 def test_export_counts_frames_and_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.compare import (
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import write_json
-from tests.commands.test_eval import frame, scored
+from tests.commands.predictions import frame, scored
 
 
 def saved(folder: Path, *frames: dict[str, Scores], groups: str = "", **summary: object) -> str:

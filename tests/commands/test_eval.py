@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -20,35 +19,13 @@ from pnpdepth_cli.commands.requests.eval_request import EvalRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern
-from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from tests.builders import result_record
+from tests.commands.predictions import code_image, depth_file, frame, scored
 from tests.data_sets import SELECTED, image, touch
 from tests.plain_scores import brute
-
-
-def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_depth(path, np.array(rows, np.float32), scale=scale)
-    return path
-
-
-def frame(root: Path, prediction: Any, gt: Any, name: str = "a") -> Path:
-    """A prediction in out/ and its ground truth in gt/."""
-    depth_file(root / "gt" / f"{name}.npy", gt)
-    return depth_file(root / "out" / f"{name}_depth.npy", prediction)
-
-
-def code_image(path: Path, codes: Any) -> None:
-    """A PNG that does not say its scale."""
-    path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), np.array(codes, np.uint16))
-
-
-def scored(root: Path, **options: Any) -> Evaluation:
-    return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
 
 
 def says(evaluation: Evaluation, text: str) -> bool:
