@@ -62,8 +62,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
     """
     (root / "net").mkdir(parents=True)
     image = cv2.imread(str(frame_on_disk(root / "net").image))
-    for part in ("rgb", "sparse", "calib"):
-        (root / part).mkdir()
+    for folder in ("rgb", "sparse", "calib"):
+        (root / folder).mkdir()
     down, right = (np.mgrid[:46, :62] - np.array([22.5, 30.5])[:, None, None]) / 60
     rows = []
     for number in range(frames):
@@ -85,8 +85,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
 
 def add_frame(root: Path, name: str, image: Any = None) -> None:
     """One more frame, with the image of the network by default."""
-    for part, file in (("rgb", "img"), ("sparse", "s"), ("gt", "gt")):
-        target = root / part / f"{name}.png"
+    for folder, file in (("rgb", "img"), ("sparse", "s"), ("gt", "gt")):
+        target = root / folder / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(root / "net" / f"{file}.png", target)
     if image is not None:

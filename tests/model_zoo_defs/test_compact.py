@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import pytest
 import torch
 from torch import Tensor
@@ -110,15 +112,38 @@ def dense_frame(*, outliers: float) -> tuple[Tensor, Tensor]:
     return torch.where(outlier, 2.0 * truth, truth)[None, None], outlier[None, None]
 
 
-def test_every_point_of_a_dense_map_has_one_of_its_depth_and_of_its_place_that_stands_for_it() -> (
-    None
-):
+class Thinned(NamedTuple):
+    """The points of a dense map and those chosen of them; `of` stands for each point."""
+
+    value: Tensor
+    rows: Tensor
+    columns: Tensor
+    chosen: Tensor
+    of: Tensor
+    sends: Tensor
+
+
+@pytest.fixture(scope="module")
+def dense_points() -> Thinned:
     depth, _ = dense_frame(outliers=0.05)
-    value, (rows, columns) = depth.log().flatten(), torch.nonzero(depth[0, 0]).T
+    value = depth.log().flatten()
+    rows, columns = torch.nonzero(depth[0, 0]).T
     chosen, stand_in, sends = thinned(rows, columns, value, len(value))
-    of = chosen[stand_in]
-    assert len(value) / 16 <= int(sends.sum()) <= CELLS
-    assert int(sends.sum()) < len(chosen) < len(value) / 2
+    return Thinned(value, rows, columns, chosen, chosen[stand_in], sends)
+
+
+def test_of_a_dense_map_fewer_than_half_of_the_points_are_chosen_and_fewer_send(
+    dense_points: Thinned,
+) -> None:
+    count = len(dense_points.value)
+    assert count / 16 <= int(dense_points.sends.sum()) <= CELLS
+    assert int(dense_points.sends.sum()) < len(dense_points.chosen) < count / 2
+
+
+def test_every_point_of_a_dense_map_has_one_of_its_depth_and_of_its_place_that_stands_for_it(
+    dense_points: Thinned,
+) -> None:
+    value, rows, columns, chosen, of, _ = dense_points
     assert torch.equal(of[chosen], chosen)
     assert int((rows[of] - rows).abs().max()) < 4
     assert int((columns[of] - columns).abs().max()) < 4

@@ -126,19 +126,27 @@ def test_groups_are_clusters_and_so_is_each_frame_of_one_uncorrelated_sequence()
 
 
 def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
-    series, short = autoregression(0.5, 1000), autoregression(0.5, 60)
+    series = autoregression(0.5, 1000)
     # 2ρ/(1 − ρ²)/L of the variance is missing: 1.33/L, a tenth at 13.3
-    length = block_length(series)
-    assert length == pytest.approx(14, abs=3)
+    assert block_length(series) == pytest.approx(14, abs=3)
     clusters = find_clusters(["drive"] * 1000, series)
     assert clusters.ids.tolist() == [number // 100 for number in range(1000)]
-    assert "blocks of about 100 consecutive frames" in clusters.text
+    assert "100 consecutive frames" in clusters.text
+
+
+def test_the_correlation_of_a_short_sequence_is_corrected_and_its_blocks_are_too_few() -> None:
+    short = autoregression(0.5, 60)
     correlation = np.corrcoef(short[1:, 0], short[:-1, 0])[0, 1]
     correlation += (1 + 3 * correlation) / 60  # Kendall's correction
     expected = 2 * correlation / (1 - correlation**2) / statistics.BLOCK_BIAS
     assert block_length(short) == pytest.approx(expected, abs=1.5)
     assert find_clusters(["drive"] * 60, short).count == 60 // block_length(short) < 6
-    assert block_length(np.column_stack([series, np.full(1000, np.nan)])) == length
+
+
+def test_a_measure_without_values_or_changes_does_not_lengthen_the_blocks() -> None:
+    series = autoregression(0.5, 1000)
+    with_unknown = np.column_stack([series, np.full(1000, np.nan)])
+    assert block_length(with_unknown) == block_length(series)
     assert block_length(np.full((200, 1), np.nan)) == block_length(np.ones((200, 1))) == 1
     rounded = 0.1 + 1e-16 * np.arange(200)[:, None]  # differences that are equal
     assert block_length(rounded) == 1
