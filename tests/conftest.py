@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,14 @@ def pytest_configure(config: pytest.Config) -> None:
         from tests.rounding import enter_in_every_thread
 
         enter_in_every_thread()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_shared_fixtures(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What fixtures of a whole module decide about networks is not in the user's folder either."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PNPDEPTH_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -45,7 +45,13 @@ MAY_IMPORT = {
     "dataset": {*GROUND_FLOOR, "completion", "frames", "sensors", "io"},
     "commands": {
         *GROUND_FLOOR,
-        *("core", "completion", "models", "frames", "sensors", "io", "dataset"),
+        "core",
+        "completion",
+        "models",
+        "frames",
+        "sensors",
+        "io",
+        "dataset",
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
     "refiner": {*GROUND_FLOOR, "completion", "models", "frames", "dataset"},
@@ -170,7 +176,8 @@ def test_a_benchmark_is_importable(file: Path) -> None:
 
 
 def test_few_functions_wrap_equation_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stacks, backward = [], torch.Tensor.backward
+    stacks = []
+    backward = torch.Tensor.backward
 
     def watched(tensor: torch.Tensor) -> None:
         stacks.append(traceback.extract_stack())
@@ -181,9 +188,11 @@ def test_few_functions_wrap_equation_3(tmp_path: Path, monkeypatch: pytest.Monke
     files = [str(sample / "rgb.png"), "--sparse", str(sample / "sparse.png")]
     method = ["--model", "fcrn-tiny", "--method", "paper", "-o", str(tmp_path / "depth.npy")]
     assert run(["refine", *files, *method]) == 0
-    own = [each for each in stacks[0] if PACKAGE in Path(each.filename).parents]
-    own = [each for each in own if PACKAGE / "core" / "split" not in Path(each.filename).parents]
-    names = [each.name for each in own if Path(each.filename).parent.name != "cli"]
+    calls = [(call.name, Path(call.filename)) for call in stacks[0]]
+    of_package = [(name, file) for name, file in calls if PACKAGE in file.parents]
+    split = PACKAGE / "core" / "split"
+    outside = [(name, file) for name, file in of_package if split not in file.parents]
+    names = [name for name, file in outside if file.parent.name != "cli"]
     assert names[0] == "refine_image"
     assert len(names) <= 5, names
 

@@ -15,8 +15,9 @@ from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 from pnpdepth_cli.sensors.simulation import LIDARS
 
 
-def test_folders_and_entry_points_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Two entry points of another package.
+@pytest.fixture
+def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OpenList[object]:
+    """The files of io/, with two entry points of another package, one of which is such a file."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
@@ -25,15 +26,26 @@ def test_folders_and_entry_points_are_read(tmp_path: Path, monkeypatch: pytest.M
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    table = OpenList("test_table", folder="pnpdepth_cli.io:__name__")
+    return OpenList("test_table", folder="pnpdepth_cli.io:__name__")
+
+
+def test_the_names_of_a_list_are_the_files_of_its_folder_and_then_the_entry_points(
+    table: OpenList[object],
+) -> None:
     names = list(table)
     assert names == [*sorted({*names} - {"elsewhere"}), "elsewhere"]
     assert "scans" in names
     assert not {"--init--", "bags"} & set(names)  # subpackages are no entries
     assert len(table) == len(names)
-    assert table["scans"] == "pnpdepth_cli.io.scans"  # of this package first
+
+
+def test_an_entry_is_loaded_from_this_package_first(table: OpenList[object]) -> None:
+    assert table["scans"] == "pnpdepth_cli.io.scans"
     assert table["elsewhere"] == "loaded from elsewhere"
-    with pytest.raises(UsageError, match=r"'scanss' is none of .* scans"):
+
+
+def test_a_name_that_is_not_in_a_list_is_refused_with_the_names(table: OpenList[object]) -> None:
+    with pytest.raises(UsageError, match=r"'scanss' .* scans"):
         table["scanss"]
 
 

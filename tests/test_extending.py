@@ -5,27 +5,30 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from safetensors.torch import save_file
 
 from pnpdepth_cli.models.registry import find_definition
-from tests.test_readme import YOUR_NETWORK, titled_blocks
-from tests.test_readme import run as run_python
+from tests.pages import ROOT, YOUR_NETWORK, run_python, titled_blocks
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
 SHOWN = titled_blocks(ROOT / "docs" / "extending.md")
+NETWORK = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
 
 
-def test_the_files_of_the_page_work_from_another_package(tmp_path: Path) -> None:
-    def run(*arguments: str) -> str:
-        return run_python(["-m", "pnpdepth_cli", *arguments], tmp_path, str(tmp_path))
+def pnpdepth(folder: Path, *arguments: str) -> str:
+    """What the command printed, with the packages in the folder."""
+    return run_python(["-m", "pnpdepth_cli", *arguments], folder, str(folder))
 
-    # The page's files as an installed package.
-    package, info = tmp_path / "my_package", tmp_path / "my_package-1.0.dist-info"
+
+def install(folder: Path) -> None:
+    """Writes the page's files as an installed package."""
+    package = folder / "my_package"
+    info = folder / "my_package-1.0.dist-info"
     package.mkdir()
     info.mkdir()
     shown = {**SHOWN, "__init__.py": "", "my_net.py": titled_blocks(YOUR_NETWORK)["my_net.py"]}
@@ -35,40 +38,66 @@ def test_the_files_of_the_page_work_from_another_package(tmp_path: Path) -> None
     entries = SHOWN["pyproject.toml"].replace('[project.entry-points."', "[").replace('"]\n', "]\n")
     (info / "entry_points.txt").write_text(entries.replace('"', ""))
 
-    # A batch with the page's losses and rules, as a user has them.
-    shutil.copytree(ROOT / "samples" / "indoor", tmp_path / "indoor")
-    net = find_definition(str(package / "my_net.py")).build()
-    save_file(net.state_dict(), tmp_path / "my_net.safetensors")
-    files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
-    network = ["--model", "my-net", "--checkpoint", "my_net.safetensors", "--align", "none"]
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package, a sample, and the batch of it by the objects of the package."""
+    folder = tmp_path_factory.mktemp("extended")
+    install(folder)
+    shutil.copytree(ROOT / "samples" / "indoor", folder / "indoor")
+    network = find_definition(str(folder / "my_package" / "my_net.py")).build()
+    save_file(network.state_dict(), folder / "my_net.safetensors")
+    frames = "image,sparse,calib\nindoor/rgb.png,indoor/sparse.png,k.txt\n"
+    (folder / "list.csv").write_text(frames)
+    (folder / "k.txt").write_text("K: [550, 0, 320, 0, 550, 240, 0, 0, 1]")
     method = ["--loss", "charbonnier", "--update", "rmsprop", "--lr", "1%"]
     more = ["--propagate", "median", "--baselines", "--format", "raw"]
-    frames = "image,sparse,calib\nindoor/rgb.png,indoor/sparse.png,k.txt\n"
-    (tmp_path / "list.csv").write_text(frames)
-    (tmp_path / "k.txt").write_text("K: [550, 0, 320, 0, 550, 240, 0, 0, 1]")
-    run("batch", "list.csv", *network, *method, *more, "-o", "out")
-    record = json.loads((tmp_path / "out" / "rgb.json").read_text())
+    pnpdepth(folder, "batch", "list.csv", *NETWORK, *method, *more, "-o", "out")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> Any:
+    return json.loads((folder / "out" / "rgb.json").read_text())
+
+
+def test_a_network_a_loss_a_rule_and_a_propagation_are_used_by_name(record: Any) -> None:
     assert record["model"]["name"] == "my-net"
     named = [record["result"]["settings"][key] for key in ("loss", "update", "propagate")]
     assert named == ["charbonnier", "rmsprop", "median"]
-    assert record["errors"]["validation"]["farthest"]["mae"] > 0
     assert record["result"]["loss"][-1] < record["result"]["loss"][0]
-    files_of = [f"my_package/{name}.py" for name in ("charbonnier", "rmsprop")]
-    by_file = ["--loss", files_of[0], "--update", files_of[1], "--lr", "1%"]
-    by_file += ["--propagate", "median", "-o", "by_file.raw", "--json"]
-    again = json.loads(run("refine", *files, *network, *by_file))
+
+
+def test_a_baseline_is_scored(record: Any) -> None:
+    assert record["errors"]["validation"]["farthest"]["mae"] > 0
+
+
+def test_a_loss_and_a_rule_in_files_do_what_they_do_by_name(folder: Path, record: Any) -> None:
+    files = ["indoor/rgb.png", "--sparse", "indoor/sparse.png"]
+    method = ["--loss", "my_package/charbonnier.py", "--update", "my_package/rmsprop.py"]
+    more = ["--lr", "1%", "--propagate", "median", "-o", "by_file.raw", "--json"]
+    again = json.loads(pnpdepth(folder, "refine", *files, *NETWORK, *method, *more))
     assert again["result"]["loss"] == record["result"]["loss"]
-    measures = ["--columns", "mae,median_error", "--json"]
-    scores = json.loads(run("eval", "out/rgb_depth.raw", "indoor/gt.png", *measures))
-    assert {"rmse", "median_error"} <= {each["key"] for each in scores["measures"]}
+
+
+def test_a_measure_is_a_column_of_depth_in_a_format_of_the_package(folder: Path) -> None:
+    columns = ["--columns", "mae,median_error", "--json"]
+    printed = pnpdepth(folder, "eval", "out/rgb_depth.raw", "indoor/gt.png", *columns)
+    scores = json.loads(printed)
+    assert {"rmse", "median_error"} <= {measure["key"] for measure in scores["measures"]}
     assert scores["mean"]["median_error"] < scores["mean"]["mae"]
-    run("export", "out", "--to", "arrays", "-o", "exported")
-    raw = (tmp_path / "out" / "rgb_depth.raw").read_bytes()
-    depth = np.load(tmp_path / "exported" / "rgb.npy")
+
+
+def test_an_export_writes_the_depth_of_the_results(folder: Path) -> None:
+    pnpdepth(folder, "export", "out", "--to", "arrays", "-o", "exported")
+    raw = (folder / "out" / "rgb_depth.raw").read_bytes()
+    depth = np.load(folder / "exported" / "rgb.npy")
     np.testing.assert_array_equal(depth.ravel(), np.frombuffer(raw, "<f4", offset=12))
-    # A folder in the layout of the page.
-    (tmp_path / "data").mkdir()
-    shutil.copy(tmp_path / "indoor" / "rgb.png", tmp_path / "data" / "a_image.png")
-    shutil.copy(tmp_path / "indoor" / "sparse.png", tmp_path / "data" / "a_lidar.png")
-    run("batch", "data", "-o", "flat", "--iterations", "0")
-    assert (tmp_path / "flat" / "a.json").is_file()
+
+
+def test_a_folder_in_a_layout_of_the_package_is_a_batch(folder: Path) -> None:
+    (folder / "data").mkdir()
+    shutil.copy(folder / "indoor" / "rgb.png", folder / "data" / "a_image.png")
+    shutil.copy(folder / "indoor" / "sparse.png", folder / "data" / "a_lidar.png")
+    pnpdepth(folder, "batch", "data", "-o", "flat", "--iterations", "0")
+    assert (folder / "flat" / "a.json").is_file()

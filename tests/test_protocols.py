@@ -22,7 +22,7 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.protocols import PROTOCOLS, FramePart
 from pnpdepth_cli.sensors.projection import behind_foreground
 from tests.builders import result_record
-from tests.commands.test_eval import code_image, depth_file
+from tests.commands.predictions import code_image, depth_file
 from tests.data_sets import SELECTED, codes, eth3d, ibims, image, void
 
 KITTI = (352, 1216)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shlex
 import shutil
-import subprocess
-import sys
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,33 +16,12 @@ from scipy.spatial import cKDTree
 
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.models.registry import find_definition
+from tests.pages import ROOT, YOUR_NETWORK, blocks, run_python, shown_commands, titled_blocks
 
-ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
-YOUR_NETWORK = ROOT / "docs" / "guides" / "your-network.md"
 RECONSTRUCTION = ROOT / "docs" / "guides" / "reconstruction.md"
-BLOCK = re.compile(r'^```(\w+)(?: title="(.+?)")?\n(.*?)^```', re.DOTALL | re.MULTILINE)
 WRITES_FILES = ("refine", "project", "sample", "simulate", "cloud")
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    """The code blocks of a page in this language, with or without a title."""
-    return [
-        text for of_block, _, text in BLOCK.findall(page.read_text("utf-8")) if of_block == language
-    ]
-
-
-def shown_commands(page: Path) -> list[list[str]]:
-    """The arguments of the `pnpdepth …` lines of the console blocks, continued lines joined."""
-    lines = "\n".join(blocks(page, "console")).replace("\\\n", " ").splitlines()
-    commands = (line.removeprefix("$ ").split("  #")[0] for line in lines)
-    return [shlex.split(text.removeprefix("pnpdepth ")) for text in commands if text.strip()]
-
-
-def titled_blocks(page: Path) -> dict[str, str]:
-    """The files that a page shows, by their name."""
-    return {title: text for _, title, text in BLOCK.findall(page.read_text("utf-8")) if title}
 
 
 def named(page: Path) -> str:
@@ -63,17 +38,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(arguments: list[str], folder: Path, *path: str) -> str:
-    """What the finished Python process printed. Fails with its stderr if it failed."""
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *path])},
-        capture_output=True, text=True, check=False, cwd=folder,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 WITH_COMMANDS = [page for page in PAGES if shown_commands(page) and page != RECONSTRUCTION]
 
 
@@ -84,19 +48,19 @@ def test_the_commands_of_a_page_run(page: Path, folder: Path) -> None:
         (folder / name).write_text(code)
     for arguments in shown_commands(page):
         if arguments[0] == "python":
-            run(arguments[1:], folder)
+            run_python(arguments[1:], folder)
             continue
         # those with a * as the shell hands them over
         paths = [map(str, sorted(folder.glob(a))) if "*" in a else [a] for a in arguments]
         overwrite = ["--overwrite"] if arguments[0] in WRITES_FILES else []
-        run(["-m", "pnpdepth_cli", *chain(*paths), *overwrite], folder)
+        run_python(["-m", "pnpdepth_cli", *chain(*paths), *overwrite], folder)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [README, ROOT / "docs" / "python-api.md"], ids=named)
 def test_the_python_example_of_a_page_runs(page: Path, folder: Path) -> None:
     (code,) = [block for block in blocks(page, "python") if "import pnpdepth_cli as pnp" in block]
-    assert run(["-c", code], folder)
+    assert run_python(["-c", code], folder)
 
 
 @pytest.mark.parametrize("name", ["main-job", "tests"])
@@ -133,11 +97,11 @@ def test_the_guide_of_reconstruction_gives_the_scene_and_every_export(folder: Pa
     (folder / "reconstruct.py").write_text(script)
     for program, *arguments in shown_commands(RECONSTRUCTION):
         command = [] if program == "python" else ["-m", "pnpdepth_cli", program]
-        run([*command, *arguments], folder)
+        run_python([*command, *arguments], folder)
     dense = folder / "room" / "dense"
     # The cloud lies on the points of the model.
     model = pycolmap.Reconstruction(str(dense / "sparse"))
-    image = sorted(model.images.values(), key=lambda each: each.name)[1]
+    image = sorted(model.images.values(), key=lambda image: image.name)[1]
     seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
     points = np.array([model.points3D[n].xyz for n in seen if model.points3D[n].track.length() > 2])
     pose = image.cam_from_world()

@@ -52,8 +52,8 @@ def mean_error(depths: list[torch.Tensor], frames: list[EvalFrame]) -> float:
 def test_without_drift_all_maps_have_one_scale_and_shift() -> None:
     disparity = [1 / frame.gt for frame in slanted(3)]
     fits = [
-        np.polyfit(true.ravel(), given.ravel(), 1)
-        for true, given in zip(disparity, drifting(disparity, "none", 0), strict=True)
+        np.polyfit(true.ravel(), drifted.ravel(), 1)
+        for true, drifted in zip(disparity, drifting(disparity, "none", 0), strict=True)
     ]
     np.testing.assert_allclose(fits, [fits[0]] * 3, rtol=1e-3)
 
@@ -62,8 +62,8 @@ def test_a_drift_moves_scale_and_shift_further_with_each_frame() -> None:
     disparity = [np.linspace(0.1, 1, 20, dtype=np.float32).reshape(4, 5)] * 400
     fits = np.array(
         [
-            np.polyfit(true.ravel(), given.ravel(), 1)
-            for true, given in zip(disparity, drifting(disparity, "5 %", 0), strict=True)
+            np.polyfit(true.ravel(), drifted.ravel(), 1)
+            for true, drifted in zip(disparity, drifting(disparity, "5 %", 0), strict=True)
         ]
     )
     assert np.diff(np.log(fits[:, 0])).std() == pytest.approx(0.05, rel=0.15)

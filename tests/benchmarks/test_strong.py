@@ -66,9 +66,9 @@ def test_a_run_scores_every_column_and_the_result_of_an_exact_network_is_better_
 ) -> None:
     pytest.importorskip("embreex")
     (case,) = (
-        one
-        for one in strong_frames(Path("nowhere"), ("simulated",), ["rendered desks"], 1)
-        if one.row == "simulated, 2 %"
+        found
+        for found in strong_frames(Path("nowhere"), ("simulated",), ["rendered desks"], 1)
+        if found.row == "simulated, 2 %"
     )
     run = measure(case, 20, 0)
     assert run["mae"].keys() == set(STAGES)

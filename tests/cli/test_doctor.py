@@ -9,20 +9,35 @@ from pathlib import Path
 import pytest
 
 from pnpdepth_cli.cli.main import run
+from tests.command_line import printed
 
 
-def test_doctor_reports_versions_what_is_missing_and_a_refined_plane(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture(scope="module")
+def shown() -> str:
+    """What `doctor` prints where two of the required packages are not installed."""
     required = ["torch", "none-such>=1", 'none-other; extra == "plot"', 'pytest; extra == "test"']
-    monkeypatch.setattr(metadata, "requires", lambda _: required)
-    assert run(["doctor"]) == 0
-    out = capsys.readouterr().out
-    assert f"torch {metadata.version('torch')}\n" in out
-    assert "none-such not installed\n" in out
-    assert "none-other not installed, of the extra plot\n" in out
-    assert "pytest" not in out
-    error = re.search(r"self-test +passed; a plane refined in [\d.]+ s, MAE ([\d.]+) m", out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metadata, "requires", lambda _: required)
+        done = printed("doctor")
+    assert done.code == 0
+    return done.out
+
+
+def test_doctor_shows_the_versions_of_what_is_installed(shown: str) -> None:
+    assert f"torch {metadata.version('torch')}\n" in shown
+
+
+def test_doctor_names_what_is_missing_with_the_extra_that_installs_it(shown: str) -> None:
+    assert "none-such not installed\n" in shown
+    assert "none-other not installed, of the extra plot\n" in shown
+
+
+def test_doctor_says_nothing_of_packages_for_the_tests(shown: str) -> None:
+    assert "pytest" not in shown
+
+
+def test_doctor_refines_a_plane_and_shows_its_error(shown: str) -> None:
+    error = re.search(r"self-test +passed; .* MAE ([\d.]+) m", shown)
     assert error is not None
     assert float(error[1]) < 0.02
 

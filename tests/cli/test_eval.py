@@ -44,7 +44,7 @@ def test_json_holds_what_all_options_give(frames: Path, capsys: pytest.CaptureFi
     assert (scores["factor"], record["mean"]["mre"]) == pytest.approx((1 / 1.1, 0), abs=1e-6)
 
 
-def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path) -> None:
+def test_csv_has_a_line_for_each_frame_also_for_one_without_prediction(frames: Path) -> None:
     Path("out/a.npy").unlink()
     assert code_of("eval out gt --csv new/scores.csv") == 7
     text = Path("new/scores.csv").read_bytes().decode()
@@ -53,20 +53,40 @@ def test_csv_has_a_line_for_each_frame_and_replaces_nothing_unasked(frames: Path
     assert a["error"]
     assert c["name"] == "c\nd"
     assert float(b["mre"]) == pytest.approx(0.1, rel=1e-5)
+
+
+def test_csv_replaces_a_file_only_if_asked(frames: Path) -> None:
+    assert code_of("eval out gt --csv new/scores.csv") == 0
     assert code_of("eval out gt --csv new/scores.csv") == 2
-    assert code_of("eval out gt --csv new/scores.csv --overwrite") == 7
-    for file in ("gt/e.npy", "gt/e.npy/s.csv"):
-        assert code_of(f"eval out/e.npy gt/e.npy --csv {file} --overwrite") == 2
+    assert code_of("eval out gt --csv new/scores.csv --overwrite") == 0
+
+
+@pytest.mark.parametrize("file", ["gt/e.npy", "gt/e.npy/s.csv"])
+def test_csv_never_replaces_an_input(file: str, frames: Path) -> None:
+    assert code_of(f"eval out/e.npy gt/e.npy --csv {file} --overwrite") == 2
     assert np.load("gt/e.npy").shape == (6, 8)
 
 
-def test_columns_choose_measures_in_latex(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def far_frames(frames: Path) -> Path:
+    """The same, ten times as far."""
     for path in frames.glob("*/*.npy"):
         np.save(path, 10 * np.load(path))
+    return frames
+
+
+def test_columns_choose_measures_and_their_order(
+    far_frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code_of("eval out gt --protocol kitti --columns delta1,rmse") == 0
     text = capsys.readouterr().out
     assert "MAE" not in text
     assert text.index("δ1") < text.index("RMSE")
+
+
+def test_columns_of_a_comparison_are_those_of_its_latex_table_in_the_unit_of_the_protocol(
+    far_frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code_of("eval out gt --protocol kitti --json") == 0
     Path("a.json").write_text(capsys.readouterr().out)
     assert code_of("compare a.json a.json --columns delta1,rmse --latex -") == 0

@@ -21,18 +21,19 @@ MOST_COMMON = 13
 
 def commands_of(group: click.Group) -> Iterator[click.Command]:
     for name in group.list_commands(click.Context(group)):
-        each = group.get_command(click.Context(group), name)
-        assert each is not None
-        yield from commands_of(each) if isinstance(each, click.Group) else [each]
+        command = group.get_command(click.Context(group), name)
+        assert command is not None
+        yield from commands_of(command) if isinstance(command, click.Group) else [command]
 
 
 def own_options(command: click.Command) -> dict[str, click.Option]:
     """The options of a command by their long names, without those that print help."""
-    found = {each.opts[-1]: each for each in command.params if isinstance(each, click.Option)}
-    return {name: each for name, each in found.items() if name not in ("--help", "--help-all")}
+    options = [param for param in command.params if isinstance(param, click.Option)]
+    by_name = {option.opts[-1]: option for option in options}
+    return {name: by_name[name] for name in by_name if name not in ("--help", "--help-all")}
 
 
-COMMANDS = {str(each.name): each for each in commands_of(cli)}
+COMMANDS = {str(command.name): command for command in commands_of(cli)}
 
 
 @pytest.mark.parametrize("name", ["refine", "batch", "eval"])
@@ -40,7 +41,8 @@ def test_every_option_has_one_group_of_the_longer_help_and_few_are_common(name: 
     # The help is printed before anything is checked.
     arguments = [name, "missing.png", "--help-all"]
     result = CliRunner().invoke(cli, arguments, terminal_width=80, prog_name="pnpdepth")
-    grouped, names = COMMANDS[name], {*own_options(COMMANDS[name])}
+    grouped = COMMANDS[name]
+    names = {*own_options(COMMANDS[name])}
     assert isinstance(grouped, GroupedCommand)
     members = [option for options in grouped.groups.values() for option in options]
     assert len(members) == len(set(members))
@@ -54,7 +56,7 @@ def test_no_command_has_too_many_options_and_none_but_vary_holds_others_in_its_v
     options = {name: own_options(command) for name, command in COMMANDS.items()}
     assert all(len(options[name]) <= most for name, most in MOST_OPTIONS.items())
     assert sum(map(len, options.values())) + len(own_options(cli)) <= MOST_IN_ALL
-    found = [option for each in options.values() for option in each.values()]
+    found = [option for of_command in options.values() for option in of_command.values()]
     assert [o.name for o in found if "NAME=VALUE" in f"{o.metavar} {o.help}"] == ["vary"]
 
 
@@ -88,7 +90,8 @@ def test_an_empty_text_is_no_file_and_not_the_current_folder(line: list[str]) ->
 def test_every_field_of_a_request_has_one_name_and_its_option_is_one_of_batch() -> None:
     request = RefineRequest()
     groups = [request, *(getattr(request, name) for name in GROUPS)]
-    names = [each.name for group in groups for each in fields(group) if each.name not in GROUPS]
+    every = [field.name for group in groups for field in fields(group)]
+    names = [name for name in every if name not in GROUPS]
     assert len(names) == len(set(names))
-    flags = {flag_of(each) for group in groups for each in options_of(type(group))}
+    flags = {flag_of(option) for group in groups for option in options_of(type(group))}
     assert flags <= {name for option in COMMANDS["batch"].params for name in option.opts}

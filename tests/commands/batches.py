@@ -62,8 +62,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
     """
     (root / "net").mkdir(parents=True)
     image = cv2.imread(str(frame_on_disk(root / "net").image))
-    for part in ("rgb", "sparse", "calib"):
-        (root / part).mkdir()
+    for folder in ("rgb", "sparse", "calib"):
+        (root / folder).mkdir()
     down, right = (np.mgrid[:46, :62] - np.array([22.5, 30.5])[:, None, None]) / 60
     rows = []
     for number in range(frames):
@@ -72,7 +72,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
             left = np.where(right < 0, -1 / right, np.inf)
         depth = np.minimum(np.minimum(floor, left), 5 - STEP_M * number)
         known = np.random.default_rng(number).permutation(depth.size)[:points]
-        sparse, name = np.zeros(depth.shape, np.float32), f"drive_{number:03}"
+        sparse = np.zeros(depth.shape, np.float32)
+        name = f"drive_{number:03}"
         sparse.flat[known] = depth.flat[known]
         write_depth(root / f"sparse/{name}.png", sparse, scale=1000)
         cv2.imwrite(str(root / f"rgb/{name}.png"), np.roll(image, number, axis=1))
@@ -84,8 +85,8 @@ def drive_on_disk(root: Path, frames: int = 4, *, points: int = 400) -> Path:
 
 def add_frame(root: Path, name: str, image: Any = None) -> None:
     """One more frame, with the image of the network by default."""
-    for part, file in (("rgb", "img"), ("sparse", "s"), ("gt", "gt")):
-        target = root / part / f"{name}.png"
+    for folder, file in (("rgb", "img"), ("sparse", "s"), ("gt", "gt")):
+        target = root / folder / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(root / "net" / f"{file}.png", target)
     if image is not None:

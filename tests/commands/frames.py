@@ -65,7 +65,8 @@ def frame_on_disk(folder: Path, height: int = 46, width: int = 62) -> FrameOnDis
     rgb = np.stack([255 * x / width, 255 * y / height, 128 + 0 * x], -1).astype(np.uint8)
     image, sparse, gt = folder / "img.png", folder / "s.png", folder / "gt.png"
     cv2.imwrite(str(image), rgb)
-    points, thin = np.random.default_rng(0).permutation(depth.size)[:60], np.zeros_like(depth)
+    points = np.random.default_rng(0).permutation(depth.size)[:60]
+    thin = np.zeros_like(depth)
     thin.flat[points] = depth.flat[points]
     write_depth(sparse, thin, scale=1000)
     write_depth(gt, depth, scale=1000)

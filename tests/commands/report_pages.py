@@ -23,7 +23,7 @@ def page_data(folder: Path) -> dict[str, Any]:
         "facts": _found("<dt>(.*?)</dt><dd>(.*?)</dd>", head),
         "without": _found("<strong>(.*?)</strong><span>(.*?)</span>", head),
         "notes": [note for (note,) in _found("<li[^>]*>([^<]*)</li>", head)],
-        "tables": [_table(each) for each in tables],
+        "tables": [_table(table) for table in tables],
     }
 
 

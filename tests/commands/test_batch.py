@@ -7,7 +7,7 @@ import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from pnpdepth_cli.choices import BASELINES
 from pnpdepth_cli.commands.many_frames.find_frames import find_frames
-from pnpdepth_cli.commands.many_frames.summary import write_summary
+from pnpdepth_cli.commands.many_frames.summary import BatchSummary, write_summary
 from pnpdepth_cli.commands.refine import refine_image
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
@@ -63,7 +63,8 @@ def test_a_second_run_does_nothing_and_a_batch_equals_single_refinements(root: P
     os.utime(root / "rgb/a.png", (1, 1))  # that a file was touched or moved does not matter
     os.utime(root / "out/b_depth.png", (1, 1))
     moved = root.rename(root.with_name("moved"))
-    together, listener = results(moved / "out"), Recorder()
+    together = results(moved / "out")
+    listener = Recorder()
     before = {path: path.stat().st_mtime_ns for path in (moved / "out").glob("[a-d]*")}
     assert done(moved, listener, refine=refine) == []
     assert listener.messages[-1] == "4 frames, all of them done already"
@@ -71,8 +72,8 @@ def test_a_second_run_does_nothing_and_a_batch_equals_single_refinements(root: P
     moved.rename(root)
     shutil.rmtree(root / "out")
     for name in NAMES:
-        parts = (("image", "rgb"), ("sparse", "sparse"), ("gt", "gt"))
-        files = {part: root / folder / f"{name}.png" for part, folder in parts}
+        folders = {"image": "rgb", "sparse": "sparse", "gt": "gt"}
+        files = {kind: root / folder / f"{name}.png" for kind, folder in folders.items()}
         refine_image(refinement(root, output=root / "out", **files, **refine))
     assert len(together) == 4 * len(NAMES)
     assert together == results(root / "out")
@@ -182,7 +183,8 @@ def test_what_no_batch_made_is_not_replaced_unless_asked_for(name: str, root: Pa
     "name", ["../up", "/up", ".batch.lock/x", "summary", "fine\u0301", "ok_view", "ok_depth.png/x"]
 )
 def test_a_name_without_files_of_its_own_is_refused(root: Path, name: str) -> None:
-    rows = [f'rgb/a.png,sparse/a.png,"{each}"' for each in ("ok", "fin\u00e9", name)]
+    names = ["ok", "fin\u00e9", name]
+    rows = [f'rgb/a.png,sparse/a.png,"{listed}"' for listed in names]
     (root / "list.csv").write_text("\n".join(["image,sparse,name", *rows]), encoding="utf-8")
     with pytest.raises(InputError, match=re.escape(repr(name))):
         batch(root, source=root / "list.csv", html=root / "report", html_3d=True)
@@ -258,29 +260,70 @@ def test_frames_on_which_a_network_diverges_are_counted_and_not_done_again(root:
     assert (read_depth(root / "out/a_depth.png").values > 0).all()
 
 
-def test_the_summary_has_the_means_of_its_rows_and_all_earlier_frames(root: Path) -> None:
+class Summarised(NamedTuple):
+    """A batch in two runs: what the last one returned, both files of it, and what was said."""
+
+    result: BatchSummary
+    content: dict[str, Any]
+    table: list[dict[str, str]]
+    messages: list[str]
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The frames of summary.json."""
+        return list(self.content["frames"])
+
+
+@pytest.fixture(scope="module")
+def summarised(tmp_path_factory: pytest.TempPathFactory) -> Summarised:
+    """Four frames, and seven images that are of no frame."""
+    root = pairs_on_disk(tmp_path_factory.mktemp("summarised") / "drive")
     for number in range(7):
         shutil.copy(root / "rgb/a.png", root / f"rgb/x{number}.png")
-    listener, refine = Recorder(), {"holdout": 0.2, "baselines": True}
+    listener = Recorder()
+    refine = {"holdout": 0.2, "baselines": True}
     batch(root, listener, limit=2, refine=refine)
     result = batch(root, refine=refine)
-    content = summary(root)
-    rows, table = content.pop("frames"), rows_of(root)
-    assert content == plain(asdict(result))
-    assert [row["name"] for row in rows] == [line["name"] for line in table] == list(NAMES)
-    assert content["errors"].keys() == {"ground_truth", "held_out", "validation", "used"}
-    for basis, stages in content["errors"].items():
+    return Summarised(result, summary(root), rows_of(root), listener.messages)
+
+
+def test_the_summary_is_what_the_batch_returns_with_the_frames_of_all_runs(
+    summarised: Summarised,
+) -> None:
+    content = {key: value for key, value in summarised.content.items() if key != "frames"}
+    assert content == plain(asdict(summarised.result))
+    assert [row["name"] for row in summarised.rows] == list(NAMES)
+
+
+def test_the_table_of_the_summary_has_its_rows(summarised: Summarised) -> None:
+    second = summarised.rows[1]
+    assert [line["name"] for line in summarised.table] == list(NAMES)
+    after = second["errors"]["ground_truth"]["after"]
+    assert float(summarised.table[1]["rmse_after"]) == after["rmse"]
+
+
+def test_the_summary_has_the_errors_of_every_stage_at_all_points(summarised: Summarised) -> None:
+    errors = summarised.content["errors"]
+    assert errors.keys() == {"ground_truth", "held_out", "validation", "used"}
+    for basis, stages in errors.items():
         assert {"before", "after"} <= stages.keys()
         assert basis not in ("ground_truth", "validation") or {*BASELINES} <= stages.keys()
+
+
+def test_an_error_of_the_summary_is_the_mean_of_its_rows(summarised: Summarised) -> None:
+    for basis, stages in summarised.content["errors"].items():
         for stage, means in stages.items():
-            assert means.pop("frames") == 4
-            for measure, mean in means.items():
-                values = [row["errors"][basis][stage][measure] for row in rows]
-                assert mean == pytest.approx(np.mean(values), rel=1e-12)
-    assert float(table[1]["rmse_after"]) == rows[1]["errors"]["ground_truth"]["after"]["rmse"]
-    # Files that are in no frame: five are named, and all are in the summary.
-    assert len(content["unmatched"]) == 7
-    assert sum("rgb/x" in text for text in listener.messages) == 5
+            assert means["frames"] == 4
+            for measure in means.keys() - {"frames"}:
+                values = [row["errors"][basis][stage][measure] for row in summarised.rows]
+                assert means[measure] == pytest.approx(np.mean(values), rel=1e-12)
+
+
+def test_files_of_no_frame_are_all_in_the_summary_and_five_are_named(
+    summarised: Summarised,
+) -> None:
+    assert len(summarised.content["unmatched"]) == 7
+    assert sum("rgb/x" in text for text in summarised.messages) == 5
 
 
 def test_the_summary_counts_weights_notes_and_frames_that_are_independent(root: Path) -> None:
@@ -319,14 +362,14 @@ def test_mean_weights_add_up_where_a_frame_lacks_a_network(root: Path) -> None:
         FrameRecord(
             name=f"{number}",
             errors={"ground_truth": {"before": {"mae": 1.0}, "after": {"mae": 2.0}}},
-            result=result_record("net", "compact", weights=own),
+            result=result_record("net", "compact", weights=of_frame),
         )
-        for number, own in enumerate(weights)
+        for number, of_frame in enumerate(weights)
     ]
     (root / "out").mkdir()
     request = BatchRequest(source=root, output=root / "out", refine=refinement(root))
     told = write_summary(request, find_frames(request), {}, records)
-    means = {name: own["mean"] for name, own in told.weights.items()}
+    means = {name: spread["mean"] for name, spread in told.weights.items()}
     assert means == pytest.approx({"net": 0.7 / 3, "compact": 2.2 / 3, "linear": 0.1 / 3})
     assert sum(means.values()) == pytest.approx(1)
     assert told.weights["net"]["least"] == 0

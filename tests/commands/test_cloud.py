@@ -40,7 +40,8 @@ def frame(folder: Path, name: str, depth: float = 2.0, **entries: Any) -> Path:
 def camera(right: float | None) -> CameraRecord:
     """A camera that is so far to the right in the world; None: its pose is unknown."""
     pose = None if right is None else [[1.0, 0, 0, right], [0, 1, 0, 0], [0, 0, 1, 0]]
-    lens, intrinsics = "radial-tangential", [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
+    lens = "radial-tangential"
+    intrinsics = [[20.0, 0, 0], [0, 20, 0], [0, 0, 1]]
     return CameraRecord(intrinsics=intrinsics, lens=lens, source="of the test", pose=pose)
 
 
@@ -59,32 +60,66 @@ def written(path: Path, output: Path, **values: Any) -> tuple[int, str]:
     return count, " ".join([what, *notes])
 
 
-def test_image_camera_and_pose_come_from_the_record_unless_they_are_given(tmp_path: Path) -> None:
+def test_the_camera_and_the_pose_come_from_the_record(tmp_path: Path) -> None:
     path = frame(tmp_path, "a", camera=camera(5))
     assert "of the test" in written(path, tmp_path / "a.ply", calib=None)[1]
     last = [5 + 2 * (WIDTH - 1) / 20, 2 * (HEIGHT - 1) / 20, 2]
     assert points_of(tmp_path / "a.ply")[-1] == pytest.approx(last)
+
+
+def test_a_cloud_is_replaced_only_if_asked(tmp_path: Path) -> None:
+    path = frame(tmp_path, "a")
+    written(path, tmp_path / "a.ply")
     with pytest.raises(OutputError, match="--overwrite"):
         written(path, tmp_path / "a.ply")
+
+
+def test_a_calibration_that_is_given_places_every_pixel(tmp_path: Path) -> None:
     path = frame(tmp_path, "b")
     assert written(path, tmp_path / "b.ply")[0] == HEIGHT * WIDTH
     corner = [-WIDTH / 2 / 15, -HEIGHT / 2 / 15, 2]  # by the calibration of `written`
     assert points_of(tmp_path / "b.ply")[0] == pytest.approx(corner, rel=1e-5)
+
+
+def test_points_have_the_colours_of_the_image_that_the_record_names(tmp_path: Path) -> None:
+    path = frame(tmp_path, "b")
+    written(path, tmp_path / "b.ply")
     row = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")[1][:27]
     assert list(row[24:27]) == [30, 20, 10]  # OpenCV wrote blue, green, red
+
+
+def test_an_image_that_is_not_there_is_named_with_the_folder_it_was_looked_for_from(
+    tmp_path: Path,
+) -> None:
+    path = frame(tmp_path, "b")
     (tmp_path / "b.png").unlink()
-    assert f"b.png is not found from {Path.cwd()}" in written(path, tmp_path / "lost.ply")[1]
+    said = written(path, tmp_path / "lost.ply")[1]
+    assert "b.png" in said
+    assert str(Path.cwd()) in said
 
 
-def test_pixels_that_are_far_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
+def far_wall(folder: Path) -> tuple[Path, np.ndarray]:
+    """A file of depth from 2 to 8 m, with a far plane in the first five rows."""
     depth = np.linspace(2, 8, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
     depth[:5] = 1e10
-    write_depth(tmp_path / "d.exr", depth)
-    count, said = written(tmp_path / "d.exr", tmp_path / "d.ply")
+    write_depth(folder / "d.exr", depth)
+    return folder / "d.exr", depth
+
+
+def test_a_far_plane_is_no_part_of_a_cloud(tmp_path: Path) -> None:
+    path, _ = far_wall(tmp_path)
+    count, said = written(path, tmp_path / "d.ply")
     assert count == (HEIGHT - 5) * WIDTH
     assert "far plane" in said
     assert "without colours" in said
-    assert written(tmp_path / "d.exr", tmp_path / "e.ply", max_depth=5)[0] == (depth <= 5).sum()
+
+
+def test_pixels_beyond_the_largest_depth_are_left_out(tmp_path: Path) -> None:
+    path, depth = far_wall(tmp_path)
+    assert written(path, tmp_path / "e.ply", max_depth=5)[0] == (depth <= 5).sum()
+
+
+def test_pixels_that_are_not_valid_or_not_sure_are_left_out(tmp_path: Path) -> None:
     path = frame(tmp_path, "a", outputs={"sigma": "a_sigma.png", "valid": "a_valid.png"})
     valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
     valid[:4] = 0
@@ -120,7 +155,8 @@ def test_frames_are_one_cloud_in_which_views_agree_and_voxels_merge(tmp_path: Pa
 def test_what_cannot_be_done_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
     out, cloud = tmp_path / "out", tmp_path / "o.ply"
     frame(out, "a", camera=camera(5))
-    b, c = frame(out, "b", camera=camera(None)), frame(tmp_path, "c")
+    b = frame(out, "b", camera=camera(None))
+    c = frame(tmp_path, "c")
     big, resized = tmp_path / "big.png", tmp_path / "c_depth.exr"
     cv2.imwrite(str(big), np.zeros((HEIGHT * 2, WIDTH, 3), np.uint8))
     write_depth(resized, np.ones((HEIGHT // 2, WIDTH // 2), np.float32))

@@ -26,7 +26,7 @@ from pnpdepth_cli.commands.compare import (
 from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.file_bytes import write_json
-from tests.commands.test_eval import frame, scored
+from tests.commands.predictions import frame, scored
 
 
 def saved(folder: Path, *frames: dict[str, Scores], groups: str = "", **summary: object) -> str:
@@ -45,31 +45,63 @@ def saved(folder: Path, *frames: dict[str, Scores], groups: str = "", **summary:
 def run(folder: Path, errors: Iterable[float]) -> str:
     """A saved run of frames with these errors."""
     scores: list[Scores] = [{"rmse": error, "mae": error, "delta1": 1.0} for error in errors]
-    return saved(folder, *({"after": own} for own in scores))
+    return saved(folder, *({"after": of_frame} for of_frame in scores))
+
+
+def compared_by_factors(folder: Path, frames: int) -> tuple[Comparison, float, float]:
+    """Two runs of which the second is better on every frame, and their mean errors."""
+    errors, factors = np.random.default_rng(0).uniform(0.5, 0.9, (2, frames))
+    better = errors * factors
+    comparison = compare([run(folder / "one", errors), run(folder / "two", better)])
+    return comparison, errors.mean(), better.mean()
+
+
+def test_a_lower_error_is_a_gain_in_per_cent_of_the_first_run(tmp_path: Path) -> None:
+    comparison, before, after = compared_by_factors(tmp_path, 6)
+    first, second = comparison.runs
+    assert (first.name, first.gains, second.name) == ("one", {}, "two")
+    assert first.mean["mae"] == pytest.approx(before)
+    assert second.gains["mae"].percent == pytest.approx(100 * (1 - after / before))
 
 
 @pytest.mark.parametrize("frames", [3, 6])
-def test_a_lower_error_is_a_gain_with_interval_from_6_frames(tmp_path: Path, frames: int) -> None:
-    errors, factors = np.random.default_rng(0).uniform(0.5, 0.9, (2, frames))
-    better = errors * factors
-    comparison = compare([run(tmp_path / "one", errors), run(tmp_path / "two", better)])
-    first, second = comparison.runs
-    assert (first.name, first.gains, second.name) == ("one", {}, "two")
-    assert first.mean["mae"] == pytest.approx(errors.mean())
-    gain = second.gains["mae"]
-    assert gain.percent == pytest.approx(100 * (1 - better.sum() / errors.sum()))
-    assert gain.p_value == 2 / 2**frames  # all got better: two of the swaps differ as much
-    assert (gain.low_percent < gain.percent < gain.high_percent) == (frames == 6)
+def test_the_p_value_is_the_part_of_the_swaps_that_differ_as_much(
+    tmp_path: Path, frames: int
+) -> None:
+    comparison, *_ = compared_by_factors(tmp_path, frames)
+    # All got better: two of the swaps differ as much.
+    assert comparison.runs[1].gains["mae"].p_value == 2 / 2**frames
+
+
+def test_six_frames_have_an_interval_around_the_gain(tmp_path: Path) -> None:
+    comparison, *_ = compared_by_factors(tmp_path, 6)
+    gain = comparison.runs[1].gains["mae"]
+    assert gain.low_percent < gain.percent < gain.high_percent
     (_, of_json) = json.loads(json.dumps(comparison.to_json()))["runs"]
-    assert (of_json["gains"]["mae"]["low_percent"] is None) == (frames == 3)
-    assert (comparison_table(comparison).rows[1][4:6] == ["–", "–"]) == (frames == 3)
+    assert of_json["gains"]["mae"]["low_percent"] == gain.low_percent
+    assert "–" not in comparison_table(comparison).rows[1][4:6]
+
+
+def test_three_frames_have_no_interval_anywhere(tmp_path: Path) -> None:
+    comparison, *_ = compared_by_factors(tmp_path, 3)
+    gain = comparison.runs[1].gains["mae"]
+    assert np.isnan([gain.low_percent, gain.high_percent]).all()
+    (_, of_json) = json.loads(json.dumps(comparison.to_json()))["runs"]
+    assert of_json["gains"]["mae"]["low_percent"] is None
+    assert comparison_table(comparison).rows[1][4:6] == ["–", "–"]
+
+
+@pytest.mark.parametrize("frames", [3, 6])
+def test_few_frames_are_warned_of(tmp_path: Path, frames: int) -> None:
+    comparison, *_ = compared_by_factors(tmp_path, frames)
     (note,) = comparison.notes
-    assert note.startswith(f"warning: {frames} frames are too few")
+    assert note.startswith(f"warning: {frames} frames")
 
 
 def test_p_values_are_adjusted_for_the_number_of_measures_and_runs(tmp_path: Path) -> None:
     errors = np.random.default_rng(0).uniform(0.5, 1, 12)
-    one, two = run(tmp_path / "one", errors), run(tmp_path / "two", errors / 2)
+    one = run(tmp_path / "one", errors)
+    two = run(tmp_path / "two", errors / 2)
     for runs, columns, tests in (
         ([one, two], ["mae"], 1),
         ([one, two, two], ["rmse", "mae"], 4),
@@ -142,21 +174,32 @@ def test_runs_of_other_definitions_frames_or_pixels_are_refused_or_said(tmp_path
         compare([one, run(tmp_path / "other", [1.0])])
 
 
-def test_a_batch_is_compared_with_what_it_started_from_by_groups(tmp_path: Path) -> None:
+@pytest.fixture
+def with_its_start(tmp_path: Path) -> Comparison:
+    """A batch of nine frames in three groups against what it started from.
+
+    The first frame alone has an MRE.
+    """
     stages: dict[str, Scores] = {
         "before": {"rmse": 2.0, "mae": 1.5, "delta1": 0.5},
         "after": {"rmse": 1.0, "mae": 1.2, "delta1": 0.6},
     }
-    with_mre = {stage: own | {"mre": 0.5} for stage, own in stages.items()}
+    with_mre = {stage: scores | {"mre": 0.5} for stage, scores in stages.items()}
     path = saved(tmp_path / "x", with_mre, *[stages] * 8, groups="abcabcabc")
-    comparison = compare([f"{path}:before", str(tmp_path / "x")])
-    assert [each.name for each in comparison.runs] == ["x:before", "x"]
-    assert len(comparison.frames) == 9
-    gains = comparison.runs[1].gains
+    return compare([f"{path}:before", str(tmp_path / "x")])
+
+
+def test_a_batch_is_compared_with_what_it_started_from(with_its_start: Comparison) -> None:
+    assert [run.name for run in with_its_start.runs] == ["x:before", "x"]
+    assert len(with_its_start.frames) == 9
+    gains = with_its_start.runs[1].gains
     assert [*gains] == ["rmse", "mae", "delta1"]
     assert (gains["rmse"].percent, gains["delta1"].percent) == (50, pytest.approx(20))
-    assert gains["mae"].p_value == 2 / 8
-    assert comparison.notes[-1].startswith("warning: 3 groups of frames are too few")
+
+
+def test_frames_of_a_group_are_swapped_together(with_its_start: Comparison) -> None:
+    assert with_its_start.runs[1].gains["mae"].p_value == 2 / 2**3
+    assert with_its_start.notes[-1].startswith("warning: 3 groups")
 
 
 def test_errors_before_are_averaged_over_the_frames_of_those_after(tmp_path: Path) -> None:
@@ -176,9 +219,9 @@ BROKEN = ['{"frames": [1]}', '{"frames": [{"errors": {"ground_truth": {}}}]}', '
 def test_a_file_without_scores_is_refused(tmp_path: Path, text: str) -> None:
     one = run(tmp_path / "one", [1.0])
     (tmp_path / "broken.json").write_text(text)
-    for other in (str(tmp_path / "broken.json"), f"{one}:before"):
+    for without_scores in (str(tmp_path / "broken.json"), f"{one}:before"):
         with pytest.raises(InputError, match=r"broken\.json|one") as error:
-            compare([one, other])
+            compare([one, without_scores])
         assert "ValueError" not in str(error.value)
 
 

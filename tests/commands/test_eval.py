@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -20,35 +19,13 @@ from pnpdepth_cli.commands.requests.eval_request import EvalRequest
 from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
 from pnpdepth_cli.errors import InputError, UsageError
 from pnpdepth_cli.file_record import FileRecord, SamplePattern
-from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.measures import MEASURES
 from pnpdepth_cli.sensors.projection import as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from tests.builders import result_record
+from tests.commands.predictions import code_image, depth_file, frame, scored
 from tests.data_sets import SELECTED, image, touch
 from tests.plain_scores import brute
-
-
-def depth_file(path: Path, rows: Any, scale: float = 1000) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_depth(path, np.array(rows, np.float32), scale=scale)
-    return path
-
-
-def frame(root: Path, prediction: Any, gt: Any, name: str = "a") -> Path:
-    """A prediction in out/ and its ground truth in gt/."""
-    depth_file(root / "gt" / f"{name}.npy", gt)
-    return depth_file(root / "out" / f"{name}_depth.npy", prediction)
-
-
-def code_image(path: Path, codes: Any) -> None:
-    """A PNG that does not say its scale."""
-    path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), np.array(codes, np.uint16))
-
-
-def scored(root: Path, **options: Any) -> Evaluation:
-    return evaluate(EvalRequest(prediction=root / "out", ground_truth=root / "gt", **options))
 
 
 def says(evaluation: Evaluation, text: str) -> bool:
@@ -81,10 +58,10 @@ def test_files_are_matched_by_name(tmp_path: Path) -> None:
     predictions = [name for _, name in MATCHED.values() if name != "."]
     others = ["b_preview.png", "b.png", ".hidden/c_depth.png"]  # of a refinement, and hidden
     names = dict[str, tuple[str, str]]()
-    for each in scored(folders(tmp_path, [*predictions, *others], MATCHED)).frames:
-        files = {side: Path(file.path) for side, file in each.inputs.items()}
+    for found in scored(folders(tmp_path, [*predictions, *others], MATCHED)).frames:
+        files = {side: Path(file.path) for side, file in found.inputs.items()}
         prediction = files.get("prediction", tmp_path / "out").relative_to(tmp_path / "out")
-        names[files["gt"].relative_to(tmp_path / "gt").as_posix()] = (each.name, str(prediction))
+        names[files["gt"].relative_to(tmp_path / "gt").as_posix()] = (found.name, str(prediction))
     assert names == MATCHED
 
 
@@ -115,49 +92,88 @@ def test_a_folder_of_data_sets_is_read_as_a_batch_reads_it(tmp_path: Path) -> No
         depth_file(tmp_path / f"gt/{place}/depth/0.png", [[2]])
         depth_file(tmp_path / f"out/{place}/0_depth.png", [[2]])
     (tmp_path / "out/summary.json").write_text(json.dumps({"layout": "image-depth"}))
-    found = {each.name: each.status for each in scored(tmp_path).frames}
-    assert found == {"north/0": "done", "south/0": "done"}
+    statuses = {found.name: found.status for found in scored(tmp_path).frames}
+    assert statuses == {"north/0": "done", "south/0": "done"}
 
 
-def test_images_count_alike_and_one_without_prediction_not_at_all(tmp_path: Path) -> None:
+@pytest.fixture
+def three_frames(tmp_path: Path) -> Path:
+    """Two predictions with their ground truth and sparse depth, and ground truth without one."""
     depth_file(tmp_path / "gt" / "c.npy", [[1, 1]])
     sparse = FileRecord(path=str(depth_file(tmp_path / "sparse.npy", [[0, 9]])), kind="depth")
     for name, prediction, gt in (("a", [2, 3], [1, 4]), ("ü b", [8, 0], [5, 5])):
         frame(tmp_path, [prediction], [gt], name)
         FrameRecord(inputs={"sparse": sparse}).write(tmp_path / "out" / f"{name}.json")
-    result = scored(tmp_path)
-    assert [each.name for each in result.frames if each.status == "failed"] == ["c"]
+    return tmp_path
+
+
+def test_images_count_alike_and_one_without_prediction_not_at_all(three_frames: Path) -> None:
+    result = scored(three_frames)
+    assert [found.name for found in result.frames if found.status == "failed"] == ["c"]
     assert result.mean["rmse"] == (1 + 3) / 2
-    assert "coverage over 2 of 3 frames" in means_table(result).title
+
+
+def test_coverage_is_of_the_frames_with_a_prediction(three_frames: Path) -> None:
+    result = scored(three_frames)
+    assert "2 of 3 frames" in means_table(result).title
     assert result.to_json()["counts"] == {"frames": 3, "scored": 2, "pixels": 3, "coverage": 3 / 4}
-    assert says(result, "1 of the scored pixels have a point of the sparse input")
-    without = scored(tmp_path, exclude_sparse=True)
-    assert (without.counts["pixels"], says(without, "sparse input")) == (2, False)
 
 
-def test_a_failed_frame_is_reported_and_the_others_are_scored(tmp_path: Path) -> None:
-    faults: dict[str, tuple[list[float], list[float], str]] = {
-        "damaged": ([1, 1], [5, 5], "damaged_depth.npy"),
-        "empty": ([0, 0], [5, 5], "empty_depth.npy holds no valid depth"),
-        "large": ([1, 1, 1], [5, 5], "large_depth.npy is 3×1 but the ground truth"),
-        "unknown": ([1, 1], [0, 0], "unknown.npy"),
-    }
+def test_scored_pixels_of_the_sparse_input_are_said_unless_they_are_excluded(
+    three_frames: Path,
+) -> None:
+    assert says(scored(three_frames), "1 of the scored pixels")
+    without = scored(three_frames, exclude_sparse=True)
+    assert without.counts["pixels"] == 2
+    assert not says(without, "of the scored pixels")
+
+
+FAULTS: dict[str, tuple[list[float], list[float], str]] = {
+    "damaged": ([1, 1], [5, 5], "damaged_depth.npy"),
+    "empty": ([0, 0], [5, 5], "empty_depth.npy"),
+    "large": ([1, 1, 1], [5, 5], "large_depth.npy"),
+    "unknown": ([1, 1], [0, 0], "unknown.npy"),
+}
+"""A prediction and its ground truth by name, and the file that is at fault."""
+
+
+@pytest.fixture
+def with_faults(tmp_path: Path) -> Path:
+    """One good frame, those with faults, and a prediction without ground truth."""
     frame(tmp_path, [[8, 2]], [[5, 5]], "good")
-    for name, (prediction, gt, _) in faults.items():
+    for name, (prediction, gt, _) in FAULTS.items():
         frame(tmp_path, [prediction], [gt], name)
     (tmp_path / "out" / "damaged_depth.npy").write_bytes(b"no depth")
     depth_file(tmp_path / "out" / "extra.depth.npy", [[1]])
-    result = scored(tmp_path)
-    assert says(result, "warning: 1 of 6 predictions have no ground truth")
-    assert says(result, "warning: frame damaged was not scored")
-    assert says(result, "1 more frame like that")
-    messages = {each.name: each.message or "" for each in result.frames if each.status == "failed"}
-    assert messages.keys() == faults.keys()
-    for name, (*_, message) in faults.items():
-        assert message in messages[name]
-        file, truth = tmp_path / "out" / f"{name}_depth.npy", tmp_path / "gt" / f"{name}.npy"
-        with pytest.raises(InputError, match=message):
-            evaluate(EvalRequest(prediction=file, ground_truth=truth))
+    return tmp_path
+
+
+def test_frames_that_failed_are_warned_of_once_and_then_counted(with_faults: Path) -> None:
+    result = scored(with_faults)
+    assert says(result, "warning: 1 of 6 predictions")
+    assert says(result, "warning: frame damaged")
+    assert says(result, "1 more frame")
+
+
+def test_a_frame_that_failed_has_a_message_that_names_the_file(with_faults: Path) -> None:
+    frames = scored(with_faults).frames
+    messages = {found.name: found.message or "" for found in frames if found.status == "failed"}
+    assert messages.keys() == FAULTS.keys()
+    assert all(file in messages[name] for name, (*_, file) in FAULTS.items())
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_frame_that_fails_in_a_folder_is_an_error_where_it_is_alone(
+    name: str, with_faults: Path
+) -> None:
+    prediction = with_faults / "out" / f"{name}_depth.npy"
+    truth = with_faults / "gt" / f"{name}.npy"
+    with pytest.raises(InputError, match=FAULTS[name][2]):
+        evaluate(EvalRequest(prediction=prediction, ground_truth=truth))
+
+
+def test_the_means_are_of_the_frames_that_did_not_fail(with_faults: Path) -> None:
+    result = scored(with_faults)
     assert (result.mean["rmse"], result.interval) == (3, None)
 
 
@@ -174,7 +190,9 @@ PROTOCOLS: list[tuple[dict[str, Any], tuple[int, int], tuple[float, float], tupl
 def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     options: dict[str, Any], size: Any, bounds: Any, window: Any, tmp_path: Path
 ) -> None:
-    rng, (low, high), (top, bottom, left, right) = np.random.default_rng(0), bounds, window
+    rng = np.random.default_rng(0)
+    low, high = bounds
+    top, bottom, left, right = window
     gt = rng.uniform(0.2, 12, (2, *size)).astype(np.float32)
     prediction = (gt * np.exp(rng.normal(0, 0.2, gt.shape))).astype(np.float32)
     gt[rng.random(gt.shape) < 0.3] = 0
@@ -187,7 +205,7 @@ def test_a_protocol_is_what_plain_numpy_makes_of_its_definition(
     coverage = np.mean(prediction[truth > 0] > 0)
     if "protocol" in options:
         prediction = np.clip(prediction, np.float32(low), high)  # empty ones too, as BTS does
-    rows = [brute(*each) for each in zip(prediction, truth, strict=True)]
+    rows = [brute(*maps) for maps in zip(prediction, truth, strict=True)]
     result = scored(tmp_path, **options)
     assert result.mean == {
         measure.key: pytest.approx(np.mean([row[measure.key] for row in rows]), rel=1e-9)
@@ -206,7 +224,7 @@ def test_an_interval_ends_at_what_a_measure_can_be_and_few_groups_have_none(tmp_
     result = scored(tmp_path / "two")
     assert result.interval is None
     assert says(result, "no interval: 2 groups of frames are too few")
-    assert [each.group for each in result.frames] == ["f"] * 4 + ["g"] * 4
+    assert [found.group for found in result.frames] == ["f"] * 4 + ["g"] * 4
 
 
 def test_integer_files_are_read_by_option_then_themselves_then_protocol(tmp_path: Path) -> None:
@@ -223,9 +241,9 @@ def test_integer_files_are_read_by_option_then_themselves_then_protocol(tmp_path
 
 def test_a_scale_that_was_assumed_and_is_wrong_stops_and_names_the_option(tmp_path: Path) -> None:
     depth = np.random.default_rng(0).integers(1, 9, (6, 8))
-    for side, other, option in (("gt", "out", "gt_scale"), ("out", "gt", "pred_scale")):
+    for side, opposite, option in (("gt", "out", "gt_scale"), ("out", "gt", "pred_scale")):
         root = tmp_path / option
-        depth_file(root / other / "a.npy", depth)
+        depth_file(root / opposite / "a.npy", depth)
         code_image(root / side / "a.png", depth * 1000)
         with pytest.raises(InputError, match=rf"--{option.replace('_', '-')} 1000 \(now 256\)"):
             scored(root)
@@ -237,10 +255,11 @@ def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Pa
     gt = np.random.default_rng(0).uniform(1, 4, (10, 10)).astype(np.float32)
     points = as_depth_image(sample_points(gt, SamplePattern(count=30), 7))
     frame(tmp_path, np.where(points > 0, gt, gt + 1), gt)
-    path, record = str(depth_file(tmp_path / "points.npy", points)), tmp_path / "out" / "a.json"
+    path = str(depth_file(tmp_path / "points.npy", points))
+    record = tmp_path / "out" / "a.json"
     pattern = SamplePattern(kind="uniform", count=30, seed=7)
     drawn = FileRecord(path=path, kind="sampled", sampled=pattern)
-    for source, size, given in (
+    for source, size, count in (
         (FileRecord(path=path, kind="depth"), None, 30),
         (FileRecord(path=path, kind="scan", calibration="calib.txt"), None, None),
         (drawn, (10, 10), 30),  # drawn again
@@ -248,8 +267,8 @@ def test_points_that_a_record_names_are_counted_and_can_be_excluded(tmp_path: Pa
     ):
         result = None if size is None else result_record(size=size)
         FrameRecord(inputs={"sparse": source}, result=result).write(record)
-        assert scores_of(scored(tmp_path).frames[0])["given"] == given
-        if given is None:
+        assert scores_of(scored(tmp_path).frames[0])["given"] == count
+        if count is None:
             with pytest.raises(InputError, match="no frame could be scored"):
                 scored(tmp_path, exclude_sparse=True)
         else:
@@ -293,7 +312,7 @@ def test_additional_measures_follow_the_default_ones(tmp_path: Path) -> None:
     default = scored(tmp_path)
     more = scored(tmp_path, columns=("mae", "boundary_f1"), depth_limits=(4.0, 6.0))
     assert [*more.mean.items()][: len(default.mean)] == [*default.mean.items()]
-    first, second, near = (scores_of(each)["rmse_far"] for each in more.frames)
+    first, second, near = (scores_of(found)["rmse_far"] for found in more.frames)
     assert math.isnan(near)
     assert more.mean["rmse_far"] == pytest.approx((first + second) / 2)
     assert [measure.key for measure in more.shown] == ["mae", "boundary_f1"]
@@ -314,7 +333,8 @@ def test_the_sigma_beside_a_prediction_is_evaluated(tmp_path: Path) -> None:
 
 def test_distances_of_a_wide_camera_are_scored_as_depth(tmp_path: Path) -> None:
     depth = np.random.default_rng(0).uniform(2, 4, (48, 64))
-    x, y = (np.arange(64) - 31.5) / 32, (np.arange(48) - 23.5) / 32  # 90° across
+    x = (np.arange(64) - 31.5) / 32  # 90° across
+    y = (np.arange(48) - 23.5) / 32
     frame(tmp_path, depth + 1, depth * np.sqrt(1 + x**2 + y[:, None] ** 2))
     request = EvalRequest(prediction=tmp_path / "out", ground_truth=tmp_path / "gt", gt_range=True)
     with pytest.raises(InputError, match="calib"):
@@ -359,7 +379,7 @@ def test_rules_that_score_alike_are_equal_whatever_they_are_called() -> None:
     assert request("paper").scoring == request("kitti", resize=True).scoring
     kinds = ("paper", "nyu-eigen", "kitti-devkit", "eigen", "garg")
     asked = [*map(request, kinds), request("paper", exclude_sparse=True)]
-    rules = [each.scoring for each in (*asked, request("paper", scale_by="median"))]
+    rules = [asking.scoring for asking in (*asked, request("paper", scale_by="median"))]
     assert all(a != b for i, a in enumerate(rules) for b in rules[:i])
 
 
@@ -400,7 +420,8 @@ def test_predictions_of_the_opposite_order_are_warned_of(
     gt = np.random.default_rng(0).uniform(1, 9, (30, 40)).astype(np.float32)
     frame(tmp_path, 10 / gt if stored == "disparity" else gt / 2, gt)
     found = [note for note in scored(tmp_path, scale_by=scale_by).notes if "rank" in note]
-    assert [said in note for note in found] == [True] * bool(said)
+    assert len(found) == (1 if said else 0)
+    assert all(said in note for note in found)
 
 
 def test_ground_truth_of_disparity_is_read_and_a_scale_of_floats_is_obeyed(tmp_path: Path) -> None:

@@ -6,54 +6,18 @@ import json
 import shutil
 from functools import reduce
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 
 from pnpdepth_cli.commands.export import export_results
-from pnpdepth_cli.dataset.frame_record import CameraRecord, FrameRecord
-from pnpdepth_cli.dataset.sparse_depth import read_colmap_points
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError
-from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.depth import write_depth
 from pnpdepth_cli.io.scans import read_scan
-from tests.builders import result_record
-from tests.colmap_models import HEIGHT, WIDTH, write_text_model
-
-DEPTH = (3.6 + 0.01 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.float32)
-NAMES = ("a", "b", "c")
-
-
-def project(root: Path, camera: str = "PINHOLE") -> Path:
-    """A COLMAP project of three images."""
-    write_text_model(root / "sparse", names=tuple(f"{n}.png" for n in NAMES), camera=camera)
-    (root / "images").mkdir()
-    pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    for name in NAMES:
-        cv2.imwrite(str(root / "images" / f"{name}.png"), pixels)
-    return root
-
-
-def results(root: Path, depth: np.ndarray = DEPTH, unit_scale: float | None = None) -> Path:
-    """What `batch` writes for the project that the exports read."""
-    folder = root / "out"
-    folder.mkdir()
-    for name in NAMES:
-        image = root / "images" / f"{name}.png"
-        seen = read_colmap_points(root, image, (HEIGHT, WIDTH), unit_scale=unit_scale)
-        write_depth(folder / f"{name}_depth.exr", depth * np.float32(unit_scale or 1))
-        assert seen.camera is not None
-        FrameRecord(
-            unit=seen.unit,
-            inputs={"image": FileRecord(path=str(image), kind="image"), "sparse": seen.record},
-            result=result_record(
-                camera=CameraRecord.of(seen.camera, seen.pose),
-                size=(WIDTH, HEIGHT),
-                outputs={"valid": f"{name}_valid.png"},
-            ),
-        ).write(folder / f"{name}.json")
-    return folder
+from tests.colmap_models import HEIGHT, WIDTH
+from tests.commands.projects import DEPTH, NAMES, project, results
 
 
 @pytest.fixture
@@ -69,7 +33,7 @@ def test_maps_have_the_layout_that_colmap_publishes_and_are_in_model_units(root:
         """The map, of which columns come first."""
         data = (root / f"stereo/{kind}_maps/a.png.geometric.bin").read_bytes()
         *header, rest = data.split(b"&", 3)
-        assert [int(each) for each in header] == [WIDTH, HEIGHT, channels]
+        assert [int(number) for number in header] == [WIDTH, HEIGHT, channels]
         columns = np.frombuffer(rest, "<f4").reshape((WIDTH, HEIGHT, channels), order="F")
         return columns.transpose(1, 0, 2)
 
@@ -104,38 +68,82 @@ def test_3dgs_gets_the_inverse_depth_of_the_model_at_every_pixel(root: Path) -> 
     assert any(f"{3 * 3 * WIDTH:,} pixels are unknown" in note for note in notes)
     parameters = json.loads((root / "sparse/0/depth_params.json").read_text())
     assert set(parameters) == set(NAMES)
-    for name, each in parameters.items():
+    for name, coding in parameters.items():
         png = cv2.imread(str(root / f"inverse_depths/{name}.png"), cv2.IMREAD_UNCHANGED)
         assert png.dtype == np.uint16
-        inverse = png.astype(np.float32) / float(2**16) * each["scale"] + each["offset"]
+        inverse = png.astype(np.float32) / float(2**16) * coding["scale"] + coding["offset"]
         assert inverse == pytest.approx(1 / np.concatenate([DEPTH[[2, 2]], DEPTH[2:]]), rel=2e-4)
 
 
-@pytest.mark.parametrize("unit_scale", [None, 0.25])
-def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: float | None) -> None:
-    scene, far = root / "scene", DEPTH.copy()
-    far[:2] = np.array([[65.532], [65.534]]) / (unit_scale or 1)  # 16 bits of millimetres hold it
-    what, notes = export_results(results(root, far, unit_scale), scene, to="nerfstudio")
-    assert what == f"3 frames in {'m' if unit_scale else 'model units'}"
-    assert notes == []
-    content = json.loads((scene / "transforms.json").read_text())
-    assert (content["camera_model"], len(content["frames"])) == ("OPENCV", 3)
-    entry = content["frames"][1]
-    assert (entry["w"], entry["h"]) == (WIDTH, HEIGHT)
-    assert (scene / entry["file_path"]).read_bytes() == (root / "images/b.png").read_bytes()
-    depth = cv2.imread(str(scene / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED) * 1e-3
-    assert depth[:2, 0] == pytest.approx([65.532, 65.534])
-    assert content["enable_depth_loading"]  # Instant-NGP's names
-    assert (content["integer_depth_scale"], entry["depth_path"]) == (1e-3, entry["depth_file_path"])
+class Scene(NamedTuple):
+    """An export for Nerfstudio: the metres of a model unit, what was returned, and the files."""
+
+    unit_scale: float | None
+    root: Path
+    folder: Path
+    what: str
+    notes: list[str]
+    content: Any
+
+    @property
+    def entry(self) -> Any:
+        """The second frame, of the image b."""
+        return self.content["frames"][1]
+
+    @property
+    def depth(self) -> np.ndarray:
+        """Its depth (H, W) in metres, or in model units where their length is not known."""
+        path = self.folder / self.entry["depth_file_path"]
+        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * 1e-3
+
+
+@pytest.fixture(scope="module", params=[None, 0.25])
+def scene(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    root = project(tmp_path_factory.mktemp("scene"))
+    far = DEPTH.copy()
+    # 16 bits of millimetres just hold it.
+    far[:2] = np.array([[65.532], [65.534]]) / (request.param or 1)
+    folder = root / "scene"
+    what, notes = export_results(results(root, far, request.param), folder, to="nerfstudio")
+    content = json.loads((folder / "transforms.json").read_text())
+    return Scene(request.param, root, folder, what, notes, content)
+
+
+def test_the_unit_of_an_export_is_said(scene: Scene) -> None:
+    assert scene.what == f"3 frames in {'m' if scene.unit_scale else 'model units'}"
+    assert scene.notes == []
+
+
+def test_transforms_have_the_images_and_the_camera_of_the_model(scene: Scene) -> None:
+    assert (scene.content["camera_model"], len(scene.content["frames"])) == ("OPENCV", 3)
+    assert (scene.entry["w"], scene.entry["h"]) == (WIDTH, HEIGHT)
+    copied = scene.folder / scene.entry["file_path"]
+    assert copied.read_bytes() == (scene.root / "images/b.png").read_bytes()
+
+
+def test_depth_of_transforms_is_in_millimetres_as_far_as_16_bits_go(scene: Scene) -> None:
+    assert scene.depth[:2, 0] == pytest.approx([65.532, 65.534])
+
+
+def test_transforms_name_depth_as_instant_ngp_does_too(scene: Scene) -> None:
+    assert scene.content["enable_depth_loading"]
+    assert scene.content["integer_depth_scale"] == 1e-3
+    assert scene.entry["depth_path"] == scene.entry["depth_file_path"]
+
+
+def test_transforms_put_pixels_and_points_where_the_model_does(scene: Scene) -> None:
     u, v = 10, 20
     z = DEPTH[v, u]
     # Nerfstudio's ray of a pixel centre, in OpenGL's axes; depth is z
-    ray = [(u + 0.5 - entry["cx"]) / entry["fl_x"], -(v + 0.5 - entry["cy"]) / entry["fl_y"], -1]
-    world = np.array(entry["transform_matrix"]) @ [*(depth[v, u] * np.array(ray)), 1]
+    across = (u + 0.5 - scene.entry["cx"]) / scene.entry["fl_x"]
+    up = -(v + 0.5 - scene.entry["cy"]) / scene.entry["fl_y"]
+    at = [*(scene.depth[v, u] * np.array([across, up, -1])), 1]
+    world = np.array(scene.entry["transform_matrix"]) @ at
     # The model of tests/colmap_models: 50 and 52 pixels, centre at 32.5 and 23, b at x = -0.1
-    expected = np.array([(u - 32) / 50 * z - 0.1, (v - 22.5) / 52 * z, z]) * (unit_scale or 1)
+    metres = scene.unit_scale or 1
+    expected = np.array([(u - 32) / 50 * z - 0.1, (v - 22.5) / 52 * z, z]) * metres
     assert world[:3] == pytest.approx(expected, rel=1e-3)
-    start = read_scan(scene / content["ply_file_path"])[0]
+    start = read_scan(scene.folder / scene.content["ply_file_path"])[0]
     assert np.median(start[:, 2]) == pytest.approx(np.median(DEPTH) * world[2] / z, rel=0.01)
 
 
@@ -143,7 +151,8 @@ def test_transforms_put_pixels_where_the_model_does(root: Path, unit_scale: floa
 def test_codes_of_nerfstudio_are_larger_where_the_scene_is(
     root: Path, farthest: float, factor: float
 ) -> None:
-    scene, far = root / "scene", DEPTH.copy()
+    scene = root / "scene"
+    far = DEPTH.copy()
     far[0] = farthest
     _, notes = export_results(results(root, far), scene, to="nerfstudio")
     assert f"--depth-unit-scale-factor {factor:g}`" in notes[0]
@@ -162,24 +171,43 @@ def test_3dgs_leaves_out_what_is_unknown_where_asked(root: Path) -> None:
     assert png[2:].all()
 
 
-def test_3dgs_finds_a_model_of_the_refined_images_and_points_of_their_depth(root: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    scene, splats = root / "scene", "gaussian-splatting"
-    what, _ = export_results(results(root, unit_scale=0.25), scene, to=splats)
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project with its export for 3DGS in scene/."""
+    pytest.importorskip("pycolmap")
+    root = project(tmp_path_factory.mktemp("splats"))
+    what, _ = export_results(
+        results(root, unit_scale=0.25), root / "scene", to="gaussian-splatting"
+    )
     assert what == "3 frames in model units"
-    own, new = (pycolmap.Reconstruction(root / path) for path in ("sparse", "scene/sparse/0"))
-    assert new.num_points3D() > 500
-    depths = [point.xyz[2] for point in new.points3D.values()]
+    return root
+
+
+def test_3dgs_finds_points_of_the_refined_depth(splats: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(splats / "scene/sparse/0")
+    assert model.num_points3D() > 500
+    depths = [point.xyz[2] for point in model.points3D.values()]
     assert np.median(depths) == pytest.approx(np.median(DEPTH), rel=0.01)
-    pose_of = {image.name: image.cam_from_world().matrix() for image in own.images.values()}
-    for image in new.images.values():
+
+
+def test_3dgs_finds_the_images_with_the_cameras_and_poses_of_the_model(splats: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    original = pycolmap.Reconstruction(splats / "sparse")
+    pose_of = {image.name: image.cam_from_world().matrix() for image in original.images.values()}
+    for image in pycolmap.Reconstruction(splats / "scene/sparse/0").images.values():
         assert image.cam_from_world().matrix() == pytest.approx(pose_of[image.name], abs=1e-6)
         assert image.camera.params == pytest.approx([50, 52, 32.5, 23])
-        assert (root / "scene/images" / image.name).is_file()
-    shutil.copytree(root / "sparse", root / "sparse/0")  # COLMAP's own stays
-    export_results(root / "out", root, to=splats)
-    own, kept = (root / path / "cameras.txt" for path in ("sparse", "sparse/0"))
-    assert kept.read_bytes() == own.read_bytes()
+        assert (splats / "scene/images" / image.name).is_file()
+
+
+def test_3dgs_gets_no_other_model_where_colmap_has_made_one(root: Path) -> None:
+    pytest.importorskip("pycolmap")
+    folder = results(root, unit_scale=0.25)
+    shutil.copytree(root / "sparse", root / "sparse/0")
+    export_results(folder, root, to="gaussian-splatting")
+    original, kept = (root / path / "cameras.txt" for path in ("sparse", "sparse/0"))
+    assert kept.read_bytes() == original.read_bytes()
 
 
 def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path: Path) -> None:
@@ -187,7 +215,7 @@ def test_lens_distortion_is_kept_for_nerfstudio_and_warned_of_elsewhere(tmp_path
     export_results(folder, tmp_path, to="nerfstudio")
     entry, *_ = frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     # images in the folder itself are not copied
-    assert [each["file_path"] for each in frames] == [f"images/{n}.png" for n in NAMES]
+    assert [frame["file_path"] for frame in frames] == [f"images/{n}.png" for n in NAMES]
     names = ("k1", "k2", "p1", "p2", "k3")
     assert [entry[name] for name in names] == [-0.1, 0.02, 0.001, -0.002, 0]
     for to in ("colmap", "gaussian-splatting"):
@@ -225,7 +253,8 @@ def test_what_cannot_be_exported_is_one_line(root: Path, entry: str, value: obje
 
 
 def test_results_need_depth_and_masks_of_one_size_and_stay_unasked(root: Path) -> None:
-    folder, dense = results(root), root / "dense"
+    folder = results(root)
+    dense = root / "dense"
     export_results(folder, dense, to="colmap")
     export_results(folder, dense, to="colmap", overwrite=True)
     cv2.imwrite(str(folder / "a_valid.png"), np.zeros((2, 2), np.uint8))
@@ -269,14 +298,17 @@ def test_a_bag_has_the_lens_as_ros_names_it(
     project(other, camera)
     export_results(results(other), other / "bag", to="mcap")
     with rosbags.AnyReader([other / "bag"]) as reader:
-        wanted = [each for each in reader.connections if each.topic == "/camera/camera_info"]
+        topic = "/camera/camera_info"
+        wanted = [found for found in reader.connections if found.topic == topic]
         _, _, data = next(reader.messages(connections=wanted))
         info = reader.deserialize(data, wanted[0].msgtype)
     assert (info.distortion_model, len(info.d)) == (model, count)
     of_record = FrameRecord.read(other / "out/a.json").refined().camera
     assert of_record is not None
-    expected = [*of_record.distortion, *[0.0] * count][:count]
-    assert info.d.tolist() == expected
+    expected = np.zeros(count)
+    given = of_record.distortion[:count]
+    expected[: len(given)] = given
+    assert info.d.tolist() == expected.tolist()
 
 
 def test_maps_of_a_model_whose_unit_is_the_metre_are_said_to_be_in_metres(root: Path) -> None:

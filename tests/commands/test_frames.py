@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -12,11 +12,12 @@ pytest.importorskip("rosbags")
 
 from rosbags.highlevel import AnyReader
 
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.frames import RECORD, write_frames
 from pnpdepth_cli.commands.requests.frames_request import FramesRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ScanOptions
-from pnpdepth_cli.dataset.frame_record import FrameRecord
+from pnpdepth_cli.dataset.frame_record import FrameRecord, ResultRecord
 from pnpdepth_cli.dataset.scan_points import read_scan_points
 from pnpdepth_cli.errors import InputError, OutputError, UsageError
 from pnpdepth_cli.io.bags.messages import cloud_points, nearest_pairs
@@ -67,7 +68,20 @@ def test_depth_has_the_unit_that_the_bag_says(kind: str, unit_m: float, tmp_path
     (path,) = sorted((tmp_path / "frames" / "sparse").iterdir())[:1]
     np.testing.assert_allclose(read_depth(path).values, depth_m(), atol=unit_m)
     assert any("Depth_Units" in line for line in said)
-    # the user's own word goes before
+
+
+@pytest.mark.parametrize("kind", ["16UC1", "mono16", "16UC1; compressedDepth"])
+def test_a_unit_of_depth_that_is_stated_goes_before_that_of_the_bag(
+    kind: str, tmp_path: Path
+) -> None:
+    unit_m = 0.00025
+    extracted(
+        tmp_path,
+        depth=kind,
+        depth_topic=f"{SENSOR}/Depth_0/image/data",
+        depth_frame="camera",
+        unit=(f"{SENSOR}/option/Depth_Units/value", unit_m),
+    )
     frames = tmp_path / "stated"
     said = written(tmp_path / "a.mcap", frames, depth_scale=2000.0)
     (path,) = sorted((frames / "sparse").iterdir())[:1]
@@ -103,27 +117,62 @@ FORWARD = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 """The camera in base: z is base's x."""
 
 
-@pytest.mark.parametrize("topic", [IMAGES, f"{IMAGES}/compressed"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_becomes_calibrated_frames_with_poses(kind: str, topic: str, tmp_path: Path) -> None:
-    assert extracted(tmp_path, kind, topic=topic, poses="/odom")[-1] == "poses: of /odom"
-    record = read_json(tmp_path / "frames" / RECORD)
+class FromBag(NamedTuple):
+    """The folder of the frames of a bag, the topic of its images, and what was said."""
+
+    folder: Path
+    topic: str
+    said: list[str]
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(kind, topic) for kind in KINDS for topic in (IMAGES, f"{IMAGES}/compressed")],
+    ids=lambda param: f"{param[0]}, {param[1]}",
+)
+def from_bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> FromBag:
+    kind, topic = request.param
+    folder = tmp_path_factory.mktemp("from_bag")
+    said = extracted(folder, kind, topic=topic, poses="/odom")
+    return FromBag(folder=folder / "frames", topic=topic, said=said)
+
+
+def test_the_topics_of_a_bag_that_became_frames_are_recorded(from_bag: FromBag) -> None:
+    assert from_bag.said[-1] == "poses: of /odom"
+    record = read_json(from_bag.folder / RECORD)
     topics = [record[name] for name in ("image_topic", "points_topic", "poses")]
-    assert topics == [topic, POINTS, "/odom"]
-    frames = read_frames(tmp_path / "frames")
+    assert topics == [from_bag.topic, POINTS, "/odom"]
+
+
+def test_frames_of_a_bag_have_their_time_as_name_and_the_pixels_of_their_image(
+    from_bag: FromBag,
+) -> None:
+    frames = read_frames(from_bag.folder)
     assert [frame.name for frame in frames] == [f"1700000000_0{n}0000" for n in (0, 3, 6)]
     pixels = read_rgb(frames[1].image).values
     assert pixels.shape == (HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(pixels[5, 5] * 255, [200, 41, 41], atol=0 if topic == IMAGES else 4)
-    calibration = read_calibration(tmp_path / "frames" / "calib.txt")
+    of_jpeg = 0 if from_bag.topic == IMAGES else 4
+    np.testing.assert_allclose(pixels[5, 5] * 255, [200, 41, 41], atol=of_jpeg)
+
+
+def test_frames_of_a_bag_have_the_camera_and_where_the_scanner_is(from_bag: FromBag) -> None:
+    calibration = read_calibration(from_bag.folder / "calib.txt")
     assert calibration.camera.size == (HEIGHT, WIDTH)
     np.testing.assert_allclose(calibration.scanner.rotation, np.transpose(FORWARD), atol=1e-9)
     np.testing.assert_allclose(calibration.scanner.translation, [0, -0.2, 0], atol=1e-9)
-    points = points_of(frames[1])
+
+
+def test_the_scan_of_a_frame_of_a_bag_lies_where_the_camera_sees_it(from_bag: FromBag) -> None:
+    points = points_of(read_frames(from_bag.folder)[1])
     # y = 0, z = -0.1667 in the LiDAR is 0.0333 m above the camera's axis, 5 m ahead
     np.testing.assert_allclose(points.depth, [5] * 150)
     assert np.abs(points.xy - [31.5, 23.5 - 60 * 0.03333 / 5]).sum(axis=1).min() < 0.01
-    poses = read_poses(tmp_path / "frames/poses.txt")  # as the body that the camera is fixed to
+
+
+def test_frames_of_a_bag_have_the_poses_of_the_body_that_the_camera_is_fixed_to(
+    from_bag: FromBag,
+) -> None:
+    poses = read_poses(from_bag.folder / "poses.txt")
     np.testing.assert_allclose(poses[:, :, :3], [FORWARD] * 3, atol=1e-9)
     np.testing.assert_allclose(poses[:, :, 3], [[1, 0, 0], [1.3, 0, 0], [1.6, 0, 0]], atol=1e-5)
 
@@ -149,7 +198,8 @@ def test_depth_images_are_sparse_depth(kind: str, error: float, tmp_path: Path) 
 
 
 def test_a_batch_writes_a_bag_out_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag, frame = write_bag(tmp_path / "drive.mcap", poses="/odom"), frame_on_disk(tmp_path)
+    bag = write_bag(tmp_path / "drive.mcap", poses="/odom")
+    frame = frame_on_disk(tmp_path)
     network = ["--model", str(frame.model), "--checkpoint", str(frame.checkpoint)]
     command = ["batch", str(bag), "-o", str(tmp_path / "out"), *network, "--iterations", "1"]
     times = []
@@ -217,7 +267,8 @@ def test_what_a_bag_has_or_lacks_decides_the_calibration_and_is_said(
 
 
 def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path) -> None:
-    bag, folder = write_bag(tmp_path / "drive.mcap"), tmp_path / "frames"
+    bag = write_bag(tmp_path / "drive.mcap")
+    folder = tmp_path / "frames"
     folder.mkdir()
     written(bag, folder)
     with pytest.raises(OutputError, match="--overwrite"):
@@ -236,13 +287,14 @@ def test_frames_of_a_bag_are_replaced_and_other_files_left_alone(tmp_path: Path)
 
 
 def test_the_users_own_files_beside_frames_stay_and_a_folder_is_named(tmp_path: Path) -> None:
-    folder, bag = tmp_path / "frames", write_bag(tmp_path / "drive.mcap", without="/tf_static")
+    folder = tmp_path / "frames"
+    bag = write_bag(tmp_path / "drive.mcap", without="/tf_static")
     written(bag, folder)
     name = next((folder / "rgb").iterdir()).stem
     own = [f"rgb/{name}.txt", "rgb/mine.png", f"sparse/{name}_mask.png", "poses.txt", "notes.md"]
-    touch(*(folder / each for each in own))
+    touch(*(folder / file for file in own))
     written(bag, folder, between=(1, 1), overwrite=True)
-    assert all((folder / each).exists() for each in own)
+    assert all((folder / file).exists() for file in own)
     assert not (folder / f"rgb/{name}.png").exists()
     (folder / "rgb/more").mkdir()
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -271,65 +323,125 @@ def test_each_image_gets_the_nearest_scan_within_the_tolerance() -> None:
     assert [scan for *_, scan in nearest_pairs(messages, 0.01)] == [None] * 3
 
 
-@pytest.mark.parametrize("depth", ["", "16UC1"])
-def test_a_bag_goes_in_and_a_bag_comes_out(depth: str, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "drive.mcap", poses="/odom", depth=depth)
-    out, again = tmp_path / "out", tmp_path / "again"
+class OfBag(NamedTuple):
+    """A frame that was refined, and the messages of the bag that it was exported to."""
+
+    out: Path
+    rgb: Path
+    name: str
+    messages: dict[str, Any]
+    times_ns: set[int]
+
+    @property
+    def result(self) -> ResultRecord:
+        return FrameRecord.read(self.out / f"{self.name}.json").refined()
+
+    @property
+    def time_ns(self) -> int:
+        """The time in the name of the frame, which has microseconds."""
+        return int(self.name.replace("_", "")) * 1000
+
+    @property
+    def camera(self) -> tuple[Camera, Any]:
+        """The camera and its pose (3, 4) in the record."""
+        camera = self.result.camera
+        assert camera is not None
+        return camera.read()
+
+    @property
+    def valid_depth(self) -> np.ndarray:
+        """The depth (H, W) that was written, 0 where it is not valid."""
+        written_depth = read_depth(self.out / f"{self.name}_depth.exr").values
+        valid = read_rgb(self.out / f"{self.name}_valid.png").values[..., 0] > 0
+        return np.where(valid, written_depth, 0)
+
+
+@pytest.fixture(scope="module", params=["", "16UC1"], ids=["scan", "depth"])
+def of_bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[OfBag]:
+    """The three frames of a bag that were refined and became a bag again."""
+    folder = tmp_path_factory.mktemp("of_bag")
+    bag = write_bag(folder / "drive.mcap", poses="/odom", depth=request.param)
+    out = folder / "out"
+    again = folder / "again"
     options = ["--method", "alone", "--model", "fcrn-tiny", "--format", "exr"]
     assert run(["batch", str(bag), "-o", str(out), *options, "--uncertainty"]) == 0
     assert run(["export", str(out), "--to", "mcap", "-o", str(again)]) == 0
-    names = sorted(path.name.removesuffix("_depth.exr") for path in out.glob("*_depth.exr"))
-    assert len(names) == 3
+    # The messages of each topic, in the order of the frames.
     by_topic = dict[str, list[Any]]()
     with AnyReader([again]) as reader:
         for connection, time_ns, data in reader.messages():
             message = reader.deserialize(data, connection.msgtype)
             by_topic.setdefault(connection.topic, []).append((time_ns, message))
-    for place, name in enumerate(names):
-        record = FrameRecord.read(out / f"{name}.json")
-        assert record.refined().camera is not None
-        assert record.refined().points is not None
-        camera, pose = record.refined().camera.read()
-        time_ns = int(name.replace("_", "")) * 1000
-        of_frame = {topic: messages[place][1] for topic, messages in by_topic.items()}
-        assert {messages[place][0] for messages in by_topic.values()} == {time_ns}
-        # Depth and its standard deviation, bit for bit.
-        written_depth, valid = (
-            read_depth(out / f"{name}_depth.exr").values,
-            out / f"{name}_valid.png",
+    names = sorted(path.name.removesuffix("_depth.exr") for path in out.glob("*_depth.exr"))
+    assert len(names) == 3
+    return [
+        OfBag(
+            out=out,
+            rgb=folder / "out_frames/rgb",
+            name=name,
+            messages={topic: messages[place][1] for topic, messages in by_topic.items()},
+            times_ns={messages[place][0] for messages in by_topic.values()},
         )
-        valid_depth = np.where(read_rgb(valid).values[..., 0] > 0, written_depth, 0)
-        found = floats_of(of_frame["/camera/depth/image"])
-        np.testing.assert_array_equal(np.isnan(found), valid_depth == 0)
-        known = valid_depth > 0
-        assert found[known].tobytes() == valid_depth[known].tobytes()
-        sigma = read_depth(out / f"{name}_sigma.exr").values
-        assert floats_of(of_frame["/camera/depth/sigma"]).tobytes() == sigma.tobytes()
-        # The image and the camera.
-        image = of_frame["/camera/image"]
-        pixels = image.data.reshape(HEIGHT, WIDTH, 3) / np.float32(255)
-        np.testing.assert_allclose(
-            pixels,
-            read_rgb(next((tmp_path / "out_frames/rgb").glob(f"{name}.*"))).values,
-            atol=1e-6,
-        )
+        for place, name in enumerate(names)
+    ]
+
+
+def test_messages_of_a_refined_frame_have_the_time_of_its_name(of_bag: list[OfBag]) -> None:
+    for frame in of_bag:
+        assert frame.times_ns == {frame.time_ns}
+        stamp = frame.messages["/camera/image"].header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == frame.time_ns
+
+
+def test_a_bag_has_refined_depth_and_its_standard_deviation_bit_for_bit(
+    of_bag: list[OfBag],
+) -> None:
+    for frame in of_bag:
+        found = floats_of(frame.messages["/camera/depth/image"])
+        known = frame.valid_depth > 0
+        np.testing.assert_array_equal(np.isnan(found), ~known)
+        assert found[known].tobytes() == frame.valid_depth[known].tobytes()
+        sigma = read_depth(frame.out / f"{frame.name}_sigma.exr").values
+        assert floats_of(frame.messages["/camera/depth/sigma"]).tobytes() == sigma.tobytes()
+
+
+def test_a_bag_has_the_image_and_the_camera_of_a_refined_frame(of_bag: list[OfBag]) -> None:
+    for frame in of_bag:
+        pixels = frame.messages["/camera/image"].data.reshape(HEIGHT, WIDTH, 3) / np.float32(255)
+        expected = read_rgb(next(frame.rgb.glob(f"{frame.name}.*"))).values
+        np.testing.assert_allclose(pixels, expected, atol=1e-6)
+        camera, _ = frame.camera
         for topic in ("/camera/camera_info", "/camera/depth/camera_info"):
-            np.testing.assert_array_equal(of_frame[topic].k.reshape(3, 3), camera.intrinsics)
-        stamp = image.header.stamp
-        assert stamp.sec * 10**9 + stamp.nanosec == time_ns
-        # The points that were used, where the camera sees them, and the cloud of the depth.
-        points = cloud_points(of_frame["/camera/points_used"], "")
-        assert len(points) == record.refined().points.used
-        nearest, farthest = record.refined().points.nearest, record.refined().points.farthest
-        assert (points[:, 2].min(), points[:, 2].max()) == pytest.approx((nearest, farthest))
-        cloud = cloud_points(of_frame["/camera/cloud"], "")
-        x, y, z = cloud.T.astype(np.float64)
+            matrix = frame.messages[topic].k.reshape(3, 3)
+            np.testing.assert_array_equal(matrix, camera.intrinsics)
+
+
+def test_a_bag_has_the_points_that_were_used_where_the_camera_sees_them(
+    of_bag: list[OfBag],
+) -> None:
+    for frame in of_bag:
+        points = cloud_points(frame.messages["/camera/points_used"], "")
+        used = frame.result.points
+        assert used is not None
+        assert len(points) == used.used
+        ends = (points[:, 2].min(), points[:, 2].max())
+        assert ends == pytest.approx((used.nearest, used.farthest))
+
+
+def test_a_bag_has_the_cloud_of_the_refined_depth(of_bag: list[OfBag]) -> None:
+    for frame in of_bag:
+        x, y, z = cloud_points(frame.messages["/camera/cloud"], "").T.astype(np.float64)
+        camera, _ = frame.camera
         pixel = camera.intrinsics @ [x / z, y / z, np.ones(len(z))]
         column, row = np.rint(pixel[:2]).astype(int)
-        np.testing.assert_allclose(z, valid_depth[row, column], rtol=1e-6)
-        # The pose is from world to camera's origin.
-        (transform,) = of_frame["/tf"].transforms
+        np.testing.assert_allclose(z, frame.valid_depth[row, column], rtol=1e-6)
+
+
+def test_a_bag_has_the_pose_from_the_world_to_the_camera(of_bag: list[OfBag]) -> None:
+    for frame in of_bag:
+        (transform,) = frame.messages["/tf"].transforms
         shift = transform.transform.translation
+        _, pose = frame.camera
         np.testing.assert_allclose([shift.x, shift.y, shift.z], pose[:, 3], atol=1e-9)
         assert (transform.header.frame_id, transform.child_frame_id) == ("world", "camera")
 

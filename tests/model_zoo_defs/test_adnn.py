@@ -20,9 +20,11 @@ SHAPES = {"kernel0": (11, 11, 1, 8), "kernel1": (5, 5, 8, 16), "kernel2": (3, 3,
 def dense(kernel: Array, size: tuple[int, int]) -> Array:
     """The matrix of `analysed` for maps (c, h, w) of this size, element by element."""
     count, channels, k, _ = kernel.shape
-    (height, width), (rows, columns) = size, (-(-size[0] // 2), -(-size[1] // 2))
+    height, width = size
+    rows, columns = -(-height // 2), -(-width // 2)
     matrix = np.zeros((count, rows, columns, channels, height, width))
-    top, left = max((rows - 1) * 2 + k - height, 0) // 2, max((columns - 1) * 2 + k - width, 0) // 2
+    top = max((rows - 1) * 2 + k - height, 0) // 2
+    left = max((columns - 1) * 2 + k - width, 0) // 2
     for i, j, a, b in np.ndindex(rows, columns, k, k):
         y, x = 2 * i + a - top, 2 * j + b - left
         if 0 <= y < height and 0 <= x < width:
@@ -53,7 +55,7 @@ def solved(network: Adnn, sparse: Array, iterations: int) -> Array:
     for i in (1, 2):
         z.append(wt[i] @ masked(i, y[i - 1]))
         y.append(np.maximum(z[i] - penalty[i], 0))
-    multiplier = [np.zeros_like(one) for one in z]
+    multiplier = [np.zeros_like(level) for level in z]
     for _ in range(iterations):
         for i in range(3):
             target = masked(i, y[i - 1]) if i else d

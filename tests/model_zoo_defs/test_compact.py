@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import pytest
 import torch
 from torch import Tensor
@@ -49,7 +51,8 @@ def prior_of(sparse: Tensor) -> Tensor:
 
 def test_depth_scales_with_its_inputs_and_an_unknown_prior_does_nothing(network: Compact) -> None:
     rgb, sparse = frame(300)
-    prior, unknown = prior_of(sparse), torch.zeros_like(sparse)
+    prior = prior_of(sparse)
+    unknown = torch.zeros_like(sparse)
     with torch.no_grad():
         pairs = (
             (network(rgb, 10 * sparse), 10 * network(rgb, sparse)),
@@ -67,7 +70,8 @@ def test_wherever_points_lie_rear_of_front_is_the_network_and_errors_reach_every
 ) -> None:
     assert definition.static_graph
     row, same = torch.zeros(2, 1, 1, HEIGHT, WIDTH)
-    row[..., 40, :], same[..., ::7, ::7] = torch.linspace(1, 5, WIDTH), 2.0
+    row[..., 40, :] = torch.linspace(1, 5, WIDTH)
+    same[..., ::7, ::7] = 2.0
     rgb, some = frame(200)
     with Split(network, layer, static_graph=True) as split:
         for sparse in (*(frame(count)[1] for count in (60, 0, 1, 20_000)), row, same, some):
@@ -108,15 +112,38 @@ def dense_frame(*, outliers: float) -> tuple[Tensor, Tensor]:
     return torch.where(outlier, 2.0 * truth, truth)[None, None], outlier[None, None]
 
 
-def test_every_point_of_a_dense_map_has_one_of_its_depth_and_of_its_place_that_stands_for_it() -> (
-    None
-):
+class Thinned(NamedTuple):
+    """The points of a dense map and those chosen of them; `of` stands for each point."""
+
+    value: Tensor
+    rows: Tensor
+    columns: Tensor
+    chosen: Tensor
+    of: Tensor
+    sends: Tensor
+
+
+@pytest.fixture(scope="module")
+def dense_points() -> Thinned:
     depth, _ = dense_frame(outliers=0.05)
-    value, (rows, columns) = depth.log().flatten(), torch.nonzero(depth[0, 0]).T
+    value = depth.log().flatten()
+    rows, columns = torch.nonzero(depth[0, 0]).T
     chosen, stand_in, sends = thinned(rows, columns, value, len(value))
-    of = chosen[stand_in]
-    assert len(value) / 16 <= int(sends.sum()) <= CELLS
-    assert int(sends.sum()) < len(chosen) < len(value) / 2
+    return Thinned(value, rows, columns, chosen, chosen[stand_in], sends)
+
+
+def test_of_a_dense_map_fewer_than_half_of_the_points_are_chosen_and_fewer_send(
+    dense_points: Thinned,
+) -> None:
+    count = len(dense_points.value)
+    assert count / 16 <= int(dense_points.sends.sum()) <= CELLS
+    assert int(dense_points.sends.sum()) < len(dense_points.chosen) < count / 2
+
+
+def test_every_point_of_a_dense_map_has_one_of_its_depth_and_of_its_place_that_stands_for_it(
+    dense_points: Thinned,
+) -> None:
+    value, rows, columns, chosen, of, _ = dense_points
     assert torch.equal(of[chosen], chosen)
     assert int((rows[of] - rows).abs().max()) < 4
     assert int((columns[of] - columns).abs().max()) < 4
@@ -150,7 +177,8 @@ def test_the_shipped_inlier_weights_detect_outliers_of_a_dense_map_beside_a_jump
 def test_a_dense_map_has_the_same_weights_and_trust_in_a_prior_in_a_batch(network: Compact) -> None:
     dense, _ = dense_frame(outliers=0.1)
     sparse = dense * (torch.rand(dense.shape, generator=torch.Generator().manual_seed(0)) < 0.01)
-    both, rgb = torch.cat([sparse, dense]), torch.zeros(2, 3, 240, 320)
+    both = torch.cat([sparse, dense])
+    rgb = torch.zeros(2, 3, 240, 320)
     points = Points(both)
     cloud = Cloud.of(points, rgb)
     points.weigh(network.inlier_weights(points, cloud))

@@ -51,9 +51,11 @@ def test_published_weights_give_about_the_published_errors_on_kitti(
 def looped(x: Tensor, mask: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """A sparse convolution pixel by pixel: (c, h, w), (h, w) → (n, h, w)."""
     (out, channels, kernel, _), (height, width) = weight.shape, mask.shape
-    result, reach = torch.zeros(out, height, width), kernel // 2
+    result = torch.zeros(out, height, width)
+    reach = kernel // 2
     for i, j in np.ndindex(height, width):
-        total, count = torch.zeros(out), 0
+        total = torch.zeros(out)
+        count = 0
         for di, dj in np.ndindex(kernel, kernel):
             a, b = i + di - reach, j + dj - reach
             if 0 <= a < height and 0 <= b < width and mask[a, b]:
@@ -68,7 +70,8 @@ def test_a_sparse_layer_is_the_sum_over_known_pixels_over_their_number(kernel: i
     torch.manual_seed(0)
     layer = SparseConv(3, 4, kernel).requires_grad_(False)
     layer.bias.normal_()
-    x, mask = torch.randn(1, 3, 9, 11), (torch.rand(1, 1, 9, 11) < 0.05).float()
+    x = torch.randn(1, 3, 9, 11)
+    mask = (torch.rand(1, 1, 9, 11) < 0.05).float()
     features, grown = layer(x, mask)
     expected = looped(x[0], mask[0, 0], layer.conv.weight, layer.bias)
     torch.testing.assert_close(features[0], expected)

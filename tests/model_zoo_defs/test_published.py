@@ -117,9 +117,9 @@ def test_a_network_computes_what_published_tensors_say(name: str, height: int, w
 def test_a_folder_with_eigens_two_published_files_loads_whole(tmp_path: Path) -> None:
     network = NARROW["eigen"]()
     state = by_formula(network.state_dict())
-    for part in ("coarse", "fine"):
-        own = {n.removeprefix(f"{part}."): t for n, t in state.items() if n.startswith(part)}
-        torch.save(own, tmp_path / f"{part}_model_12.pth")
+    for stage in ("coarse", "fine"):
+        own = {n.removeprefix(f"{stage}."): t for n, t in state.items() if n.startswith(stage)}
+        torch.save(own, tmp_path / f"{stage}_model_12.pth")
     (note,) = load_checkpoint(network, find_definition("eigen"), tmp_path)
     assert "coarse_model_12.pth, fine_model_12.pth" in note
     assert all(torch.equal(network.state_dict()[name], tensor) for name, tensor in state.items())
@@ -147,7 +147,7 @@ def layers_of_fcrn() -> Iterator[tuple[str, str]]:
     yield from (("conv1", "bn_conv1"), ("layer1", "layer1_BN"), ("ConvPred", ""))
     for stage, letters in ((2, "abc"), (3, "abcd"), (4, "abcdef"), (5, "abc")):
         yield f"res{stage}a_branch1", f"bn{stage}a_branch1"
-        for place in (f"{letter}_branch2{part}" for letter in letters for part in "abc"):
+        for place in (f"{letter}_branch2{branch}" for letter in letters for branch in "abc"):
             yield f"res{stage}{place}", f"bn{stage}{place}"
     for up in ("layer2x", "layer4x", "layer8x", "layer16x"):
         yield f"{up}_Conv", f"{up}_BN"

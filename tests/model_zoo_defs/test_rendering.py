@@ -22,7 +22,8 @@ HEIGHT, WIDTH = 48, 64
 
 
 def test_the_depth_of_a_slanted_floor_solves_its_plane_equation() -> None:
-    palette, group = Palette(np.random.default_rng(0)), Group()
+    palette = Palette(np.random.default_rng(0))
+    group = Group()
     floor = [(-90, -90, 0), (90, -90, 0), (90, 90, 0), (-90, 90, 0)]
     group.add(shapes.quads([floor]), palette.new("plain"))
     mesh, materials = group.merged()
@@ -41,17 +42,35 @@ def test_the_depth_of_a_slanted_floor_solves_its_plane_equation() -> None:
     np.testing.assert_allclose(depth, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", scenes.KINDS)
-def test_every_kind_renders_a_full_scene_of_known_depth(kind: str) -> None:
-    frames = scenes.scene_frames(11, 0, height=HEIGHT, width=WIDTH, kinds=(kind,))
+@pytest.fixture(scope="module", params=scenes.KINDS)
+def rendered(request: pytest.FixtureRequest) -> tuple[str, list[scenes.Frame]]:
+    """A kind of scene with its frames."""
+    return request.param, scenes.scene_frames(
+        11, 0, height=HEIGHT, width=WIDTH, kinds=(request.param,)
+    )
+
+
+def test_a_scene_has_its_views_and_they_are_of_its_kind(
+    rendered: tuple[str, list[scenes.Frame]],
+) -> None:
+    kind, frames = rendered
     assert len(frames) == scenes.VIEWS_PER_SCENE
-    for frame in frames:
+    assert {frame.kind for frame in frames} == {scenes.KINDS.index(kind)}
+
+
+def test_a_view_shows_something(rendered: tuple[str, list[scenes.Frame]]) -> None:
+    for frame in rendered[1]:
         assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
         assert frame.rgb.std() > 3
+
+
+def test_a_view_has_depth_of_a_room_or_a_street_at_a_third_of_its_pixels(
+    rendered: tuple[str, list[scenes.Frame]],
+) -> None:
+    for frame in rendered[1]:
         known = frame.depth[frame.depth > 0]
         assert known.size > 0.3 * HEIGHT * WIDTH
         assert 0.05 < known.min() <= known.max() <= 120
-        assert frame.kind == scenes.KINDS.index(kind)
 
 
 def test_only_the_same_seed_gives_the_same_bytes_by_any_number_of_workers(tmp_path: Path) -> None:

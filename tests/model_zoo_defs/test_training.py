@@ -28,10 +28,10 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows, columns = np.indices((48, 64))
     for number in range(2):
         depth = np.stack([4.0 + 0.02 * rows - 0.01 * columns] * 3)
-        for i, each in enumerate(depth):
-            rng = np.random.default_rng(10 * number + i)
+        for place, view in enumerate(depth):
+            rng = np.random.default_rng(10 * number + place)
             top, left = rng.integers(5, 25, 2)
-            each[top : top + 15, left : left + 20] = rng.uniform(0.5, 3.0)
+            view[top : top + 15, left : left + 20] = rng.uniform(0.5, 3.0)
         depth[:, :4, :6] = 0.0
         rgb = np.repeat((depth * 50.0).astype(np.uint8)[..., None], 3, axis=-1)
         np.savez(folder / f"shard_{number:05d}.npz", rgb=rgb, depth=depth.astype(np.float32))

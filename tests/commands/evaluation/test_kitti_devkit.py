@@ -48,7 +48,7 @@ def test_the_figures_are_those_of_the_official_program() -> None:
     gt = read_depth(SAMPLES / "street" / "gt.png").values
     printed = "5.375677 11.679524 0.025707 0.039534 0.325306 0.521867 0.501333 0.289888 0.218769"
     errors = kitti_devkit.devkit_errors(predicted, gt)
-    assert [f"{errors[each.key]:f}" for each in DEVKIT_MEASURES] == printed.split()
+    assert [f"{errors[measure.key]:f}" for measure in DEVKIT_MEASURES] == printed.split()
 
 
 def test_the_mean_over_frames_is_added_up_in_single_precision_too() -> None:

@@ -22,7 +22,8 @@ def test_a_fit_is_that_of_monodepth2_marigold_or_midas(scale_by: str) -> None:
     both = (TRUTH > 0) & (predicted > 0)
     if scale_by == "median":
         # evaluate_depth.py: ratio = np.median(gt_depth) / np.median(pred_depth), both masked
-        s, t = np.median(GT[both]) / np.median(predicted[both]), 0.0
+        s = np.median(GT[both]) / np.median(predicted[both])
+        t = 0.0
     else:
         a = np.stack([predicted[both], np.ones(both.sum())], axis=1).astype(np.float64)
         (s, t), *_ = np.linalg.lstsq(a, target[both].astype(np.float64), rcond=None)

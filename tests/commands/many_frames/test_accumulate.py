@@ -43,15 +43,13 @@ def test_points_of_neighbours_lower_the_error_at_held_out_points(tmp_path: Path)
     accumulating(root, refine=refine)
     first, second = record_of(root, "drive_000"), record_of(root, "drive_001")
     assert 40 < first["result"]["points"]["moved"] < second["result"]["points"]["moved"]
-    assert [Path(each["path"]).stem for each in second["result"]["neighbours"]] == [
-        "drive_000",
-        "drive_002",
-    ]
+    neighbours = [Path(file["path"]).stem for file in second["result"]["neighbours"]]
+    assert neighbours == ["drive_000", "drive_002"]
     shutil.rmtree(root / "out")
     batch(root, refine=refine)
     alone = record_of(root, "drive_001")
     assert second["result"]["points"]["held_out"] == alone["result"]["points"]["held_out"] == 30
-    errors = [each["errors"]["held_out"]["after"]["mae"] for each in (second, alone)]
+    errors = [record["errors"]["held_out"]["after"]["mae"] for record in (second, alone)]
     assert errors[0] < 0.85 * errors[1]
 
 
@@ -98,41 +96,60 @@ def test_neighbours_are_of_one_camera_and_move_to_that_of_the_frame(tmp_path: Pa
     rows = [f"{name},s.png,{camera},calib.txt" for name, camera in kinds]
     still, turned = "1 0 0 0 0 1 0 0 0 0 1 0\n", "0 -1 0 4 1 0 0 0 0 0 1 1\n"
     frames = linked(tmp_path, rows, still + turned + 3 * still)
-    names = [[each.files.name for each in frame.neighbours] for frame in frames]
+    names = [[neighbour.files.name for neighbour in frame.neighbours] for frame in frames]
     assert names == [["a_2"], ["a_1"], [], ["a_4"], ["a_3"]]
-    (of_turned,), (of_still,) = (each.neighbours for each in frames[:2])
+    (of_turned,), (of_still,) = (frame.neighbours for frame in frames[:2])
     assert of_turned.motion == ((0, -1, 0, 4), (1, 0, 0, 0), (0, 0, 1, 1))
     assert of_still.motion is not None
     back = [[0, 1, 0, 0], [-1, 0, 0, 4], [0, 0, 1, -1]]
     np.testing.assert_allclose(of_still.motion, back, atol=1e-12)
-    with pytest.raises(UsageError, match="a_2: --accumulate"):  # neither images nor poses
+
+
+def test_neighbours_with_neither_images_nor_poses_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a_2: --accumulate"):
         linked(tmp_path, ["a_1,s.png,,", "a_2,s.png,,"])
 
 
-@pytest.mark.parametrize("turned", [None, 0.0, 0.02])
-def test_poses_are_estimated_or_checked_by_images(turned: float | None, tmp_path: Path) -> None:
-    for part in ("rgb", "sparse", "calib"):
-        shutil.copytree(DRIVE / part, tmp_path / part)
-    (tmp_path / "net").mkdir()
-    frame_on_disk(tmp_path / "net")
-    poses, listener = tmp_path / "steps.txt", Recorder()
-    turn = Rotation.from_rotvec([0, turned or 0, 0]).as_matrix()
-    step = np.column_stack([turn, [0, 0, 0.3 if turned else 0.6]])
-    np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
-    accumulating(tmp_path, listener=listener, limit=1, poses=None if turned is None else poses)
-    record, messages = record_of(tmp_path, "drive_000"), " ".join(listener.messages)
+def real_drive(root: Path) -> None:
+    """The sample's three frames without their poses, and net/ with a network."""
+    for folder in ("rgb", "sparse", "calib"):
+        shutil.copytree(DRIVE / folder, root / folder)
+    (root / "net").mkdir()
+    frame_on_disk(root / "net")
+
+
+def test_poses_that_are_not_given_are_estimated_from_the_images(tmp_path: Path) -> None:
+    real_drive(tmp_path)
+    listener = Recorder()
+    accumulating(tmp_path, listener=listener, limit=1, poses=None)
+    record = record_of(tmp_path, "drive_000")
     (neighbour,) = record["result"]["neighbours"]
+    assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
+    assert "images" in neighbour["poses"]
+    assert record["result"]["points"]["moved"] > 500
+    assert any(message.startswith("poses: ") for message in listener.messages)
+    assert not neighbour.get("contradicts_images", False)
+
+
+@pytest.mark.parametrize(("turned", "step_m"), [(0.0, 0.6), (0.02, 0.3)])
+def test_poses_that_are_given_are_checked_by_the_images(
+    turned: float, step_m: float, tmp_path: Path
+) -> None:
+    real_drive(tmp_path)
+    poses = tmp_path / "steps.txt"
+    turn = Rotation.from_rotvec([0, turned, 0]).as_matrix()
+    step = np.column_stack([turn, [0, 0, step_m]])
+    np.savetxt(poses, np.reshape([np.eye(3, 4), step, step], (3, 12)))
+    listener = Recorder()
+    accumulating(tmp_path, listener=listener, limit=1, poses=poses)
+    (neighbour,) = record_of(tmp_path, "drive_000")["result"]["neighbours"]
     assert neighbour.get("contradicts_images", False) == bool(turned)
-    assert ("contradict the images" in messages) == bool(turned)
-    if turned is None:
-        assert "poses: estimated from the images" in messages
-        assert neighbour["poses"].startswith("estimated from the images: ")
-        assert abs(neighbour["motion"][2][3] - 0.6) < 0.03
-        assert record["result"]["points"]["moved"] > 500
+    assert ("contradict" in " ".join(listener.messages)) == bool(turned)
 
 
 def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=2), Recorder()
+    root = drive_on_disk(tmp_path, frames=2)
+    listener = Recorder()
     poses = (root / "poses.txt").rename(root / "kept.txt")
     accumulating(root, listener=listener, poses=None)
     shutil.rmtree(root / "calib")
@@ -143,7 +160,8 @@ def test_a_frame_without_motion_or_calibration_fails_with_the_reason(tmp_path: P
 
 
 def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path) -> None:
-    root, listener = drive_on_disk(tmp_path, frames=3), Recorder()
+    root = drive_on_disk(tmp_path, frames=3)
+    listener = Recorder()
     away = np.column_stack([Rotation.from_rotvec([0, np.radians(150), 0]).as_matrix(), [0, 0, 0]])
     ahead = np.column_stack([np.eye(3), [0, 0, 300.0]])
     np.savetxt(root / "away.txt", np.reshape([away, np.eye(3, 4), ahead], (3, 12)))
@@ -158,12 +176,9 @@ def test_a_neighbour_that_sees_nothing_of_the_view_adds_no_points(tmp_path: Path
 
 
 def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> None:
-    for part in ("rgb", "sparse", "calib"):
-        shutil.copytree(DRIVE / part, tmp_path / part)
+    real_drive(tmp_path)
     for last in tmp_path.glob("*/drive_002.*"):
         last.unlink()
-    (tmp_path / "net").mkdir()
-    frame_on_disk(tmp_path / "net")
     accumulating(tmp_path, poses=None, refine={"iterations": 0})
     notes = record_of(tmp_path, "drive_001")["notes"]
     (said,) = (note for note in notes if "estimated from the images" in note)
@@ -179,7 +194,8 @@ def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> Non
         write_depth_cloud(CloudRequest(depth=depth, output=single))
         xyz = read_scan(single)[0]
         ends.append((len(xyz), xyz))
-    whole, start = read_scan(output)[0], 0
+    whole = read_scan(output)[0]
+    start = 0
     for number, (count, xyz) in enumerate(ends):
         shift = np.median(whole[start : start + count] - xyz, axis=0)
         np.testing.assert_allclose(shift, [0, 0, 0.6 * number], atol=0.06)
@@ -187,7 +203,8 @@ def test_an_estimated_motion_is_said_and_places_the_cloud(tmp_path: Path) -> Non
 
 
 def test_poses_go_into_the_records_and_from_there_into_the_cloud(tmp_path: Path) -> None:
-    root, other = drive_on_disk(tmp_path / "drive", frames=2), tmp_path / "other.txt"
+    root = drive_on_disk(tmp_path / "drive", frames=2)
+    other = tmp_path / "other.txt"
     other.write_text((root / "poses.txt").read_text().replace(f"1 {STEP_M}\n", "1 100\n"))
     # Poses of the folder; then of a file, with which the frames that moved are done again.
     farthest, both = [], ["drive_000", "drive_001"]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -13,44 +16,86 @@ from pnpdepth_cli.frames import adapt as adapting
 from tests.commands import batches
 from tests.commands.batches import Recorder, drive_on_disk
 
-NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0")
+NETWORK = ("--model", "sparse2dense-tiny", "--iterations", "0", "--method", "alone")
+
+
+@contextlib.contextmanager
+def quick_learning() -> Iterator[pytest.MonkeyPatch]:
+    """Four steps, also from points that count as dense."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adapting, "is_dense", lambda points: False)
+        patch.setattr(adapting, "STEPS", 4)
+        yield patch
 
 
 @pytest.fixture
-def drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def drive(tmp_path: Path) -> Iterator[Path]:
     """Eight frames whose points do not count as dense."""
-    monkeypatch.setattr(adapting, "is_dense", lambda points: False)
-    monkeypatch.setattr(adapting, "STEPS", 4)
-    return drive_on_disk(tmp_path / "drive", frames=8)
+    with quick_learning():
+        yield drive_on_disk(tmp_path / "drive", frames=8)
 
 
 def batch(drive: Path, *more: str) -> int:
     return run(["batch", str(drive), "-o", str(drive.parent / "out"), *NETWORK, "--adapt", *more])
 
 
-@pytest.mark.parametrize("is_better", [True, False])
-def test_weights_are_kept_used_for_every_frame_and_found_again_if_they_are_better(
-    is_better: bool, drive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(adapting.Learnt, "is_better", is_better)
-    assert batch(drive) == 0
-    out, weights = drive.parent / "out", drive.parent / "out/adapted/drive.safetensors"
-    records = [json.loads(path.read_text()) for path in out.glob("drive_*.json")]
+class Adapted(NamedTuple):
+    """The results of eight frames whose weights learnt, and whether those were better."""
+
+    drive: Path
+    out: Path
+    is_better: bool
+
+    @property
+    def weights(self) -> Path:
+        return self.out / "adapted/drive.safetensors"
+
+    def batch(self) -> int:
+        with quick_learning() as patch:
+            patch.setattr(adapting.Learnt, "is_better", self.is_better)
+            return batch(self.drive)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["better", "not better"])
+def adapted(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Adapted:
+    folder = tmp_path_factory.mktemp("adapted")
+    found = Adapted(drive_on_disk(folder / "drive", frames=8), folder / "out", request.param)
+    assert found.batch() == 0
+    return found
+
+
+def test_learnt_weights_are_kept_only_if_they_are_better(adapted: Adapted) -> None:
+    assert adapted.weights.is_file() == adapted.is_better
+
+
+def test_learnt_weights_are_used_for_every_frame_if_they_are_better(adapted: Adapted) -> None:
+    records = [json.loads(path.read_text()) for path in adapted.out.glob("drive_*.json")]
     used = [record["result"]["model"]["checkpoint"] for record in records]
-    assert [checkpoint == str(weights) for checkpoint in used] == [is_better] * 8
-    assert weights.is_file() == is_better
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("drive*")}
+    assert len(used) == 8
+    assert all((checkpoint == str(adapted.weights)) == adapted.is_better for checkpoint in used)
+
+
+def test_what_was_learnt_and_refined_is_found_again(adapted: Adapted) -> None:
+    before = {path: path.stat().st_mtime_ns for path in adapted.out.rglob("drive*")}
     assert len(before) > 16
-    assert batch(drive) == 0  # does nothing
+    assert adapted.batch() == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_stopped_without_use_of_points_or_with_a_bad_frame_nothing_is_learnt(drive: Path) -> None:
+def test_a_batch_that_is_stopped_learns_nothing(drive: Path) -> None:
     network = {"model": "sparse2dense-tiny", "checkpoint": None, "iterations": 0}
     with pytest.raises(KeyboardInterrupt):
         batches.batch(drive, Recorder(lambda: True), adapt=True, refine=network)
-    with pytest.raises(UsageError, match="--adapt needs a network that takes points"):
+    assert not list(drive.parent.rglob("adapted"))
+
+
+def test_a_network_that_takes_no_points_cannot_learn_from_them(drive: Path) -> None:
+    with pytest.raises(UsageError, match="--adapt"):
         batches.batch(drive, adapt=True, refine={"model": "fcrn-tiny", "checkpoint": None})
+    assert not list(drive.parent.rglob("adapted"))
+
+
+def test_nothing_is_learnt_from_a_sequence_with_a_bad_frame(drive: Path) -> None:
     (drive / "rgb/drive_000.png").write_bytes(b"")
     assert batch(drive) == 7
     assert len(list((drive.parent / "out").glob("drive_*_depth.png"))) == 7

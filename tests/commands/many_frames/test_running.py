@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -76,7 +76,8 @@ def test_results_equal_those_of_one_process_when_a_node_is_lost(cluster: Any, ro
 def test_a_frame_that_kills_its_worker_is_named_others_done(cluster: Any, tmp_path: Path) -> None:
     root = pairs_on_disk(tmp_path / "drive", NAMES[:6])
     add_frame(root, "bad", np.full((46, 62, 3), 255, np.uint8))
-    model, start = root / "net" / "my_net.py", "    def forward(self, rgb):\n"
+    model = root / "net" / "my_net.py"
+    start = "    def forward(self, rgb):\n"
     model.write_text(model.read_text().replace(start, start + DEADLY))
     listener = Recorder()
     batch(root, listener, ray=cluster.address)
@@ -101,18 +102,33 @@ def test_a_mistake_of_all_frames_or_the_user_ends_a_batch(cluster: Any, root: Pa
     assert {path.stem for path in (root / "out").glob("f*.json")} == set(listener.names)
 
 
-def test_addresses_of_clusters_are_checked(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for text in ("auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"):
-        assert parse_address(text) == text
-    for text in ("frames/", "out", "ray://host", "a/b:1"):
-        with pytest.raises(UsageError, match=text):
-            parse_address(text)
+@pytest.mark.parametrize("text", ["auto", "local", "host:6379", "ray://host:10001", "[::1]:6379"])
+def test_an_address_of_a_cluster_is_taken_as_it_is(text: str) -> None:
+    assert parse_address(text) == text
+
+
+@pytest.mark.parametrize("text", ["frames/", "out", "ray://host", "a/b:1"])
+def test_what_is_no_address_of_a_cluster_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        parse_address(text)
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_where_nothing_answers_is_named(scheme: str, root: Path) -> None:
     pytest.importorskip("ray")
-    for scheme in ("", "ray://"):  # where nothing answers
-        with pytest.raises(DeviceError, match=f"{scheme}127.0.0.1:9"):
-            batch(root, ray=f"{scheme}127.0.0.1:9")
+    with pytest.raises(DeviceError, match=f"{scheme}127.0.0.1:9"):
+        batch(root, ray=f"{scheme}127.0.0.1:9")
+
+
+def test_a_cluster_chooses_the_devices_itself(root: Path) -> None:
+    pytest.importorskip("ray")
     with pytest.raises(UsageError, match="--device"):
         batch(root, ray="auto", refine={"device": "cuda:1"})
+
+
+def test_a_cluster_without_ray_is_refused_with_what_installs_it(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match=r"pnpdepth\[ray\]"):
         batch(root, ray="local")
@@ -125,7 +141,10 @@ def test_a_batch_compares_input_ranges_on_three_frames(tmp_path: Path) -> None:
     batch(root)
     record = FrameRecord.read(root / "out" / "a.json")
     assert record.refined().settings["normalise"] in NORMALISATIONS
-    assert any("mean of 3 frames" in note for note in record.notes)
+    assert any("3 frames" in note for note in record.notes)
+
+
+def test_the_frames_that_decide_are_spread_evenly_over_a_batch() -> None:
     assert spread(3) == [0, 1, 2]
     assert spread(37) == [0, 2, 4, 7, 9, 12, 14, 16, 19, 21, 24, 26, 28, 31, 33, 36]
 
@@ -141,12 +160,47 @@ def recorded(out: Path) -> dict[str, int]:
     return {name: (out / f"{name}_depth.png").stat().st_mtime_ns for name in names}
 
 
-@pytest.mark.slow
-def test_many_kills_do_not_change_a_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+class Killed(NamedTuple):
+    """A run that was killed: its exit code, the frames recorded before and after, its results."""
+
+    exit_code: int
+    before: dict[str, int]
+    after: dict[str, int]
+    results: dict[str, Any]
+
+    @property
+    def shown(self) -> set[str]:
+        """The results but for hidden files, which were being written."""
+        return {name for name in self.results if not Path(name).name.startswith(".")}
+
+    @property
+    def is_in_a_frame(self) -> bool:
+        """Whether the kill left a frame half done."""
+        depths = sum(name.endswith("_depth.png") for name in self.shown)
+        return len(self.results) > len(self.shown) or depths > len(self.after)
+
+
+class Kills(NamedTuple):
+    """Batches that were killed, what one gives that was not, and the last one that ended."""
+
+    killed: list[Killed]
+    undisturbed: dict[str, Any]
+    last_exit_code: int
+    last: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def kills(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kills]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield kill_batches(tmp_path_factory.mktemp("kills"))
+
+
+def kill_batches(folder: Path) -> Kills:
+    """Kills batches at random moments until twelve of them had written a result."""
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])  # so that a batch begins in milliseconds
-    root = pairs_on_disk(tmp_path / "drive", FRAMES)
+    root = pairs_on_disk(folder / "drive", FRAMES)
     out = root / "out"
 
     def begin() -> Any:
@@ -154,36 +208,50 @@ def test_many_kills_do_not_change_a_byte(tmp_path: Path, monkeypatch: pytest.Mon
         process.start()
         return process
 
-    begin().join()  # starts the server
+    # What a batch gives, and how long it takes once the server runs.
+    begin().join()
     undisturbed = results(out)
     shutil.rmtree(out)
     started = time.monotonic()
     begin().join()
-    longest, moments = time.monotonic() - started, random.Random(0)
+    longest = time.monotonic() - started
     shutil.rmtree(out)
-    killed = interrupted = 0
-    while killed < 12:
-        before, process = recorded(out), begin()
+    # Each run goes on where the one before was killed, and one that ended begins anew.
+    moments = random.Random(0)
+    runs: list[Killed] = []
+    while sum(run.exit_code != 0 and bool(run.shown) for run in runs) < 12:
+        before = recorded(out)
+        process = begin()
         time.sleep(moments.uniform(0, longest))
         process.kill()
         process.join()
-        assert process.exitcode in (0, -9)
-        # What is there must be whole, but for hidden files, which were being written.
-        there = results(out)
-        shown = {name for name in there if not Path(name).name.startswith(".")}
-        assert {name: there[name] for name in shown}.items() <= undisturbed.items()
-        assert before.items() <= recorded(out).items(), "done work was done again"
+        runs.append(Killed(process.exitcode, before, recorded(out), results(out)))
         if process.exitcode == 0:
             shutil.rmtree(out)
-        elif shown:
-            killed += 1
-            depths = sum(name.endswith("_depth.png") for name in shown)
-            interrupted += len(there) > len(shown) or depths > len(recorded(out))
-    assert interrupted > 0
     process = begin()
     process.join()
-    assert process.exitcode == 0
-    assert results(out) == undisturbed
+    return Kills(runs, undisturbed, process.exitcode, results(out))
+
+
+@pytest.mark.slow
+def test_what_a_killed_batch_shows_is_whole(kills: Kills) -> None:
+    for run in kills.killed:
+        assert run.exit_code in (0, -9)
+        shown = {name: run.results[name] for name in run.shown}
+        assert shown.items() <= kills.undisturbed.items()
+    assert any(run.is_in_a_frame for run in kills.killed)
+
+
+@pytest.mark.slow
+def test_a_batch_after_a_kill_does_no_frame_again_that_is_done(kills: Kills) -> None:
+    for run in kills.killed:
+        assert run.before.items() <= run.after.items()
+
+
+@pytest.mark.slow
+def test_many_kills_do_not_change_a_byte_of_the_results(kills: Kills) -> None:
+    assert kills.last_exit_code == 0
+    assert kills.last == kills.undisturbed
 
 
 def test_a_disk_that_is_full_stops_it_and_with_room_it_goes_on(tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ from tests.commands.frames import FrameOnDisk, run
 
 
 def test_depths_beyond_16_bits_are_clipped_and_counted(frame: FrameOnDisk) -> None:
-    text, own = frame.model.read_text(), "2 + 3 * self"
+    text = frame.model.read_text()
+    own = "2 + 3 * self"
     frame.model.write_text(text.replace(own, "1e-6 + 90 * rgb[:, 2:] ** 9 + 0 * self"))
     run(frame, iterations=0, output=frame.folder / "d.npy")
     exact = np.load(frame.folder / "d.npy")

@@ -45,7 +45,8 @@ def test_each_end_is_the_farther_one_of_students_t_and_of_t_corrected_for_skewne
 @pytest.mark.parametrize("frames", [5, 8, 20])
 @pytest.mark.parametrize("spread", [0.05, 0.5])
 def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: float) -> None:
-    rng, trials = np.random.default_rng(0), 1500
+    rng = np.random.default_rng(0)
+    trials = 1500
     draws = rng.lognormal(-(spread**2) / 2, spread, (frames, trials))  # of mean 1
     low, high = np.array([interval(draw) for draw in draws.T]).T
     error = np.sqrt(0.95 * 0.05 / trials)
@@ -56,7 +57,8 @@ def test_intervals_hold_the_true_mean_in_93_to_97_per_cent(frames: int, spread: 
 def test_the_gain_is_in_per_cent_of_the_first_and_narrow_for_equal_gains(sign: int) -> None:
     before = np.random.default_rng(0).lognormal(0, 1, 9)
     noise = np.random.default_rng(1).uniform(0.3, 0.7, 9)
-    change, clusters = partial(statistics.gain, sign=sign), clusters_of(np.arange(9))
+    change = partial(statistics.gain, sign=sign)
+    clusters = clusters_of(np.arange(9))
     half = statistics.interval(change, [before, before / 2], clusters)
     assert half == pytest.approx((-50 * sign, -50 * sign), abs=1e-6)
     low, high = statistics.interval(change, [before, before * noise], clusters)
@@ -124,19 +126,27 @@ def test_groups_are_clusters_and_so_is_each_frame_of_one_uncorrelated_sequence()
 
 
 def test_one_correlated_sequence_is_cut_into_a_few_long_blocks() -> None:
-    series, short = autoregression(0.5, 1000), autoregression(0.5, 60)
+    series = autoregression(0.5, 1000)
     # 2ρ/(1 − ρ²)/L of the variance is missing: 1.33/L, a tenth at 13.3
-    length = block_length(series)
-    assert length == pytest.approx(14, abs=3)
+    assert block_length(series) == pytest.approx(14, abs=3)
     clusters = find_clusters(["drive"] * 1000, series)
     assert clusters.ids.tolist() == [number // 100 for number in range(1000)]
-    assert "blocks of about 100 consecutive frames" in clusters.text
+    assert "100 consecutive frames" in clusters.text
+
+
+def test_the_correlation_of_a_short_sequence_is_corrected_and_its_blocks_are_too_few() -> None:
+    short = autoregression(0.5, 60)
     correlation = np.corrcoef(short[1:, 0], short[:-1, 0])[0, 1]
     correlation += (1 + 3 * correlation) / 60  # Kendall's correction
     expected = 2 * correlation / (1 - correlation**2) / statistics.BLOCK_BIAS
     assert block_length(short) == pytest.approx(expected, abs=1.5)
     assert find_clusters(["drive"] * 60, short).count == 60 // block_length(short) < 6
-    assert block_length(np.column_stack([series, np.full(1000, np.nan)])) == length
+
+
+def test_a_measure_without_values_or_changes_does_not_lengthen_the_blocks() -> None:
+    series = autoregression(0.5, 1000)
+    with_unknown = np.column_stack([series, np.full(1000, np.nan)])
+    assert block_length(with_unknown) == block_length(series)
     assert block_length(np.full((200, 1), np.nan)) == block_length(np.ones((200, 1))) == 1
     rounded = 0.1 + 1e-16 * np.arange(200)[:, None]  # differences that are equal
     assert block_length(rounded) == 1
