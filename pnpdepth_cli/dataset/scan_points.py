@@ -140,7 +140,7 @@ def read_scan_points(
                 visible = project_velodyne(xyz, camera, scanner, size, has_scanner=False)
             seen = unproject(camera, visible.xy, visible.depth)
             of_camera = replace(calibration, scanner=SAME_PLACE)
-            warnings += fit_warning(seen, of_camera, {}, rgb)
+            warnings += fit_warning(seen, of_camera, {}, rgb, is_whole=False)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
