@@ -163,7 +163,7 @@ class ScanOptions:
         if self.calib is not None and suffix in (".npy", ".csv", ".txt"):
             from pnpdepth_cli.io.depth import holds_scan
 
-            if holds_scan(sparse):
+            if holds_scan(sparse, is_stated=self.extrinsics is not None):
                 return True
         if self.extrinsics is not None or (self.calib is None and self.camera is not None):
             why = "so --extrinsics and --camera do not apply; a scan needs --calib"

@@ -26,6 +26,7 @@ from pnpdepth_cli.dataset.neighbours import read_neighbours
 from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.dataset.predicted_depth import read_predicted_depth
 from pnpdepth_cli.dataset.scan_points import read_scan_points
+from pnpdepth_cli.dataset.time_stamps import time_warning
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import registration_to_make, tensor_of
@@ -78,6 +79,10 @@ def read_frame(
     if truth is not None:
         gt = files.part.apply(truth.values)
         compared = _compare(files, options, gt, truth.reading, sparse, given)
+    for depth in (files.sparse, files.gt):
+        if files.image_file is not None and depth is not None:
+            apart = time_warning(files.image_file, depth)
+            compared += [] if apart is None else [apart]
     # The camera, and with it the points of neighbouring frames.
     size = size or given.size
     camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)

@@ -88,6 +88,8 @@ def fit_warning(
     own: Calibration,
     others: Mapping[str, Calibration],
     rgb: NDArray[np.float32],
+    *,
+    is_whole: bool = True,
 ) -> list[str]:
     """Returns a warning if the image's edges contradict how the scan is projected, or none.
 
@@ -96,11 +98,14 @@ def fit_warning(
         own: The calibration that projects it.
         others: Further calibrations, such as those of other cameras, by what they are.
         rgb: (H, W, 3) in 0…1.
+        is_whole: Whether it has the returns of a scanner. The jumps of other clouds are known as
+            inexactly as their points are far apart. So few of them tell nothing, and many may fit
+            no better than by chance.
     """
     # Too few jumps of depth tell nothing.
     size = (rgb.shape[0], rgb.shape[1])
     jumps = _jumps(scan, own, size)
-    if jumps is None or jumps.clear < _SOME_JUMPS:
+    if jumps is None or jumps.clear < (_SOME_JUMPS if is_whole else _MANY_JUMPS):
         return []
     # Readings that are clearly better than the scan as it is.
     judge = _Judge(rgb, own.camera, jumps)
@@ -120,7 +125,7 @@ def fit_warning(
             f" {judge.as_it_is:.1f}; check calibration and times"
         ]
     # None is, and the scan as it is fits no better than by chance.
-    if judge.as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
+    if is_whole and judge.as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
         return [
             "warning: the image's edges do not meet the scan's jumps of depth"
             f" ({judge.as_it_is:.1f} standard deviations above chance), and no turn, shift, mirror"

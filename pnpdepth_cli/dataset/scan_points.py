@@ -28,6 +28,7 @@ from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import check_no_colmap_map, read_scan
 from pnpdepth_cli.points import Size, in_frame
 from pnpdepth_cli.sensors.edge_fit import edge_map, jumps_of
+from pnpdepth_cli.sensors.ground import height_above_ground
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import (
     describe_dropped,
@@ -43,6 +44,9 @@ _MOST_OUTSIDE = 1 / 3  # of the points ahead; more outside the image give a warn
 _FARTHEST_SCANNER_M = 20.0  # from its camera; farther apart are the origins of maps
 _CLEARLY_BETTER = 1.0  # in standard deviations by chance, of a camera that replaces the named one
 _CHANCE_PX = 80.0  # shifts by which the spread by chance is known
+_HIGH_M = 4.5  # above the ground; scanners on trucks are at 4 m
+_ON_VEHICLES_M = (0.15, 4.0)
+_UNITS = {"feet": 3.28084, "decimetres": 10.0, "inches": 39.3701}  # per metre
 _CAMERAS = 4  # of KITTI; more of a calibration are not tried
 _FEW_INSIDE = 0.5  # of the most points in the image; a camera with fewer is ruled out
 
@@ -128,13 +132,15 @@ def read_scan_points(
         rgb = read_rgb(image).values
         if of_scanner:
             warnings += fit_warning(xyz, calibration, others, rgb)
+            if scale is None or of_integers:
+                warnings += _height_note(xyz @ scanner.rotation.T)
         else:  # from elsewhere, hidden points of a cloud would be jumps
             visible = points
             if options.keep_occluded:
                 visible = project_velodyne(xyz, camera, scanner, size, has_scanner=False)
             seen = unproject(camera, visible.xy, visible.depth)
             of_camera = replace(calibration, scanner=SAME_PLACE)
-            warnings += fit_warning(seen, of_camera, {}, rgb)
+            warnings += fit_warning(seen, of_camera, {}, rgb, is_whole=False)
     # What a person should know, and what a record keeps.
     reading = Reading(f"{source} of {len(xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *mended]
@@ -299,6 +305,25 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: Size) -> l
         f"warning: {outside:,} of the {len(ahead):,} scan points within {_AHEAD_DEG:g}° of the"
         " camera's axis fall outside the image; check that the intrinsics belong to this image,"
         " such as those of a rectified one"
+    ]
+
+
+def _height_note(seen: NDArray[np.float64]) -> list[str]:
+    """A line if a scan (N, 3), in the camera's axes, is from as high as one in feet would be."""
+    height_m = height_above_ground(seen)
+    if height_m is None or height_m < _HIGH_M:
+        return []
+    low, high = _ON_VEHICLES_M
+    units = [
+        f"--depth-scale {scale:g} if it is in {name}"
+        for name, scale in _UNITS.items()
+        if low <= height_m / scale <= high
+    ]
+    if not units:
+        return []
+    return [
+        f"note: the ground is {height_m:.1f} m below the scanner, as of a drone or a mast;"
+        f" {', '.join(units)}"
     ]
 
 

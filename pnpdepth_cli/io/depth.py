@@ -78,6 +78,9 @@ _NEAR_END, _LEAST_AT_END = 64_000, 0.001  # codes, and of the codes, that a sens
 _MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
 _MANY_ROWS = 200  # of so few columns, which no depth map has
 _BELOW_ZERO = 0.1  # of the rows
+_LARGEST_IMAGE_PX = 65_535  # side of an image, in PNG, JPEG and TIFF of every program
+_LARGEST_RELATIVE = 2.0  # smaller coordinates are relative to an image, and share its first pixels
+_OWN_PIXEL = 0.5  # of the points of a list have a pixel that no other has
 
 _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
@@ -378,11 +381,15 @@ def _from_rows(
     return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
 
 
-def holds_scan(path: Path) -> bool:
+def holds_scan(path: Path, *, is_stated: bool = False) -> bool:
     """Returns whether a list holds x y z of a scan, not x y depth of pixels.
 
-    By its header or by more than three numbers a row; else many x or y are far below 0, as no
-    pixels are.
+    By its header or by more than three numbers a row, or as stated; else many x or y are no pixels:
+    far below 0, beyond the largest image, or several points share most of them.
+
+    Args:
+        path: The file.
+        is_stated: Whether the user states of the list what only a scan has.
 
     Raises:
         InputError: The file cannot be read.
@@ -395,9 +402,16 @@ def holds_scan(path: Path) -> bool:
         return False
     if not 3 <= rows.shape[1] <= _MOST_COLUMNS:
         return False
-    with np.errstate(invalid="ignore"):
-        below = (rows[:, :2] < -0.5).any(axis=1)
-    return rows.shape[1] > 3 or bool(np.count_nonzero(below) > _BELOW_ZERO * len(rows))
+    if rows.shape[1] > 3 or is_stated:
+        return True
+    xy = rows[np.isfinite(rows).all(axis=1), :2]
+    if not len(xy):
+        return False
+    no_pixel = ((xy < -0.5) | (xy > _LARGEST_IMAGE_PX)).any(axis=1)
+    if np.count_nonzero(no_pixel) > _BELOW_ZERO * len(rows):
+        return True
+    pixels = len(np.unique(np.rint(xy), axis=0))
+    return bool(xy.max() > _LARGEST_RELATIVE and pixels < _OWN_PIXEL * len(xy))
 
 
 def write_sparse(

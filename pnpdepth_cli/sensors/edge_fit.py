@@ -25,6 +25,7 @@ _LONGEST_PX = 1280  # the image is reduced to this size
 _BLUR = 1.0  # pixels of the reduced image, as the next three
 _SURROUNDINGS = 16.0  # in which an edge is compared with others
 _BAND = 12.0  # beyond which the strength of edges says nothing of a place
+_COARSER = 4  # times, in which blurs by more pixels than these are made
 _REACH = 1.0  # of an edge; jumps are no better known
 _DARK = 0.004  # gradient of noise, of the range of an image
 _NEIGHBOURS = 12  # nearest points, among which a jump of depth is looked for
@@ -139,12 +140,21 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
     )
     squared = products[:, :, 0] + products[:, :, 1] + 1e-12
     strength = np.sqrt(squared)
-    relative = np.sqrt(strength / (cv2.GaussianBlur(strength, (0, 0), _SURROUNDINGS) + _DARK))
+    relative = np.sqrt(strength / (_widely_blurred(strength, _SURROUNDINGS) + _DARK))
     # Each direction has its share: with the weights of `Jumps.projected`, it is the squared cosine
     # of the angle between the two.
     shares = products * (relative / squared)[:, :, None]
     sharp = cv2.GaussianBlur(shares, (0, 0), _REACH)
-    return EdgeMap(np.asarray(sharp - cv2.GaussianBlur(shares, (0, 0), _BAND)), scale)
+    return EdgeMap(np.asarray(sharp - _widely_blurred(shares, _BAND)), scale)
+
+
+def _widely_blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """The image blurred by many pixels, which needs a fraction of the resolution."""
+    height, width = values.shape[:2]
+    small = max(1, round(width / _COARSER)), max(1, round(height / _COARSER))
+    reduced = cv2.resize(values, small, interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(reduced, (0, 0), sigma_px / _COARSER)
+    return np.asarray(cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def jumps_of(
@@ -171,7 +181,8 @@ def jumps_of(
     depth = seen[:, 2]
     xy = focal_px * seen[:, :2] / seen[:, 2:]
     # A point's weight is that of the largest jump to a farther neighbour.
-    distances, neighbours = cKDTree(xy).query(xy, k=_NEIGHBOURS)
+    tree = cKDTree(xy, compact_nodes=False, balanced_tree=False)
+    distances, neighbours = tree.query(xy, k=_NEIGHBOURS)
     ratios = depth[neighbours] / depth[:, None]
     weights = np.clip(np.log(ratios) / np.log(_JUMP), 0, 1)
     largest = weights.max(axis=1)

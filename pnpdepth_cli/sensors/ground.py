@@ -1,0 +1,61 @@
+"""How far a scanner is above the ground, which tells units that nothing else in a scan does.
+
+All angles of a scan are the same in metres, feet and decimetres. Scanners on cars are 1.4 to 2.2 m
+above the ground, on robots 0.2 to 1.5 m, on trucks up to 4 m.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pnpdepth_cli.camera import Floats
+
+_FEW = 500  # points below the scanner; fewer show no ground
+_SAMPLED = 2000  # of these
+_TRIES = 200  # planes through three points
+_MOST_TILT_DEG = 15.0  # of the ground and a level camera
+_FLAT = 0.03  # of the height, by which points of the ground differ from a plane
+_LEAST_ON = 0.15  # of the points below the scanner are on the ground; 0.21 to 0.56 on KITTI
+_MOST_UNDER = 0.15  # of them are clearly under it; at most 0.12 on KITTI
+
+
+def height_above_ground(xyz: Floats) -> float | None:
+    """Returns how far the origin is above the ground; None where no ground is found.
+
+    It is 1.66 to 1.80 m in 21 scans of KITTI and of the samples, whose scanner is at 1.73 m.
+
+    Args:
+        xyz: (N, 3) of the scanner in the directions of a camera's axes: x right, y down, z ahead.
+    """
+    below = xyz[xyz[:, 1] > 0]
+    if len(below) < _FEW:
+        return None
+    # The plane that most points are on, of planes that are about level.
+    rng = np.random.default_rng(0)
+    sample = below[rng.permutation(len(below))[:_SAMPLED]]
+    most_on = 0
+    best: tuple[Floats, float] | None = None
+    for _ in range(_TRIES):
+        first, second, third = sample[rng.choice(len(sample), 3, replace=False)]
+        normal = np.cross(second - first, third - first)
+        length = float(np.linalg.norm(normal))
+        if length == 0:
+            continue
+        normal = normal / math.copysign(length, normal[1])
+        height = float(first @ normal)
+        if height <= 0 or normal[1] < math.cos(math.radians(_MOST_TILT_DEG)):
+            continue
+        on = int(np.count_nonzero(np.abs(sample @ normal - height) < _FLAT * height))
+        if on > most_on:
+            most_on = on
+            best = normal, height
+    if best is None:
+        return None
+    # It is the ground if it has many of the points, and few are under it.
+    normal, height = best
+    off = below @ normal - height
+    on_it = float((np.abs(off) < _FLAT * height).mean())
+    under = float((off > 2 * _FLAT * height).mean())
+    return height if on_it >= _LEAST_ON and under <= _MOST_UNDER else None
