@@ -376,7 +376,8 @@ def _points(
     """
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), 0
-    values, unknown = _numbers(sparse, "sparse depth"), 0
+    values = _numbers(sparse, "sparse depth")
+    unknown = 0
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
@@ -385,7 +386,8 @@ def _points(
             raise InputError("rows of x, y and depth need an image for the size of the frame")
         column = in_metres(values[:, 2], "the sparse depth", unit)
         known = np.isfinite(values).all(axis=1) & (column > 0)
-        xy, depth = values[known, :2].astype(np.float32), column[known]
+        xy = values[known, :2].astype(np.float32)
+        depth = column[known]
         unknown = int(np.count_nonzero(~known))
     else:
         # Anything else is a depth map, of which the known pixels are points.

@@ -115,7 +115,8 @@ def inlier_mask(field: Residuals) -> Tensor:
     Unless there are very many, the Gaussian process from the other points, with their weights,
     predicts each point then.
     """
-    weight, near = inlier_weights(field.points, field.residual), neighbourhoods(field, _MAX_EXACT)
+    weight = inlier_weights(field.points, field.residual)
+    near = neighbourhoods(field, _MAX_EXACT)
     if len(near) == 1 and near.shape[1] >= _MIN_POINTS:
         for cutoff in _CUTOFFS:
             error, variance = leave_one_out(field, near, weight)

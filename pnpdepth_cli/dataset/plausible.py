@@ -98,7 +98,8 @@ def scan_returns(
     range_m = np.linalg.norm(known.astype(np.float64), axis=1)
     odd = ~finite.all(axis=1) | (np.abs(known) > _FARTHEST_M).any(axis=1)
     # beams without return: as no numbers, as zeros, at one place, at the sensor's largest range
-    drops, row = DropCounter(), np.arange(len(xyz))
+    drops = DropCounter()
+    row = np.arange(len(xyz))
     row = row[drops.keep(finite.any(axis=1), "without return, as they are not finite")]
     seen = ~finite[row].all(axis=1) | (range_m[row] >= _AT_SENSOR_M)
     row = row[drops.keep(seen, "without return, as they are at the sensor")]
@@ -176,7 +177,8 @@ def has_scanner(xyz: NDArray[np.floating]) -> bool:
     cell = np.floor(azimuth / _CELL_DEG) * 4096 + np.floor(elevation / _CELL_DEG)
     _, place, counts = np.unique(cell, return_inverse=True, return_counts=True)
     log_range = np.log(range_m)
-    nearest, farthest = np.full(len(counts), np.inf), np.full(len(counts), -np.inf)
+    nearest = np.full(len(counts), np.inf)
+    farthest = np.full(len(counts), -np.inf)
     np.minimum.at(nearest, place, log_range)
     np.maximum.at(farthest, place, log_range)
     shared = counts >= 2
@@ -323,7 +325,8 @@ def divisor_to_metres(
     if not depth.size:
         return 1.0, []
     low, high = medians
-    median, floats = float(np.median(depth)), reading.scale is None
+    median = float(np.median(depth))
+    floats = reading.scale is None
     if floats and scale is not None and scale != 1 and not of_integers:
         made = median / scale
         lines = [f"{what}: ÷ {scale:g}, as is stated"]
@@ -406,9 +409,11 @@ def check_pixels(
     outside = len(xy) - int(np.count_nonzero(inside))
     relative = (np.abs(xy) <= _RELATIVE).all(axis=1)
     if len(xy) >= _RELATIVE_FEW and relative.mean() >= _NEARLY_ALL and min(size) > 2 * _FEW:
-        low, how = "0", f"multiply them by {width} and {height}"
+        low = "0"
+        how = f"multiply them by {width} and {height}"
         if (xy[relative] < 1 - _RELATIVE).any():
-            low, how = "−1", f"add 1 and multiply them by {width / 2:g} and {height / 2:g}"
+            low = "−1"
+            how = f"add 1 and multiply them by {width / 2:g} and {height / 2:g}"
         raise InputError(
             f"{path}: the coordinates of {np.count_nonzero(relative):,} of {len(xy):,} points are"
             f" within {low}…1, so they are relative to the image; {how} to make them pixels"

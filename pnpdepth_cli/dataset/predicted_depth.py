@@ -288,7 +288,8 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
 
 def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
     """0 and 255, beyond which a picture of depth is clipped, and a warning that it has steps."""
-    lowest, highest = codes == 0, codes == _STEPS - 1
+    lowest = codes == 0
+    highest = codes == _STEPS - 1
     levels = len(np.unique(codes[np.isfinite(codes)]))
     unknown.notes.append(
         f"warning: 8 bits have 256 steps, of which {levels} are used;"

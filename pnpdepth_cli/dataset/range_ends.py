@@ -42,7 +42,8 @@ class _End(NamedTuple):
 def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
     """Returns which of the known depths (N,) are no depth, and lines for a person."""
     values = np.asarray(depth, np.float64)
-    none, lines = np.zeros(len(values), bool), list[str]()
+    none = np.zeros(len(values), bool)
+    lines = list[str]()
     # One value for many, at either end.
     far, near = far_end(values), near_end(values)
     for found, what, most in (
@@ -124,7 +125,8 @@ def _end(values: Floats, beyond: float) -> _End:
     none = _End(np.zeros(len(values), bool), 0.0, 0.0)
     if len(values) < _FEW:
         return none
-    largest, enough = float(values.max()), max(_LEAST_SAME, _SAME * len(values))
+    largest = float(values.max())
+    enough = max(_LEAST_SAME, _SAME * len(values))
     alike = values >= largest * (1 - _NOISY)
     if np.count_nonzero(alike) < enough:
         return none

@@ -345,8 +345,8 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
 
 def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
     """Calibrations of other axes of the scan, of the inverse pose, and the others."""
-    assert own.scanner is not None
-    readings = {"with the extrinsics inverted": replace(own, scanner=own.scanner.inverse())}
+    scanner = own.known_scanner
+    readings = {"with the extrinsics inverted": replace(own, scanner=scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (
@@ -357,8 +357,8 @@ def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict
         ("with x and y of the scan exchanged", np.eye(3)[[1, 0, 2]]),
         ("with the scan turned by 180° about z", np.diag([-1.0, -1.0, 1.0])),
     ):
-        scanner = own.scanner @ Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
-        readings[text] = replace(own, scanner=scanner)
+        changed = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
+        readings[text] = replace(own, scanner=scanner @ changed)
     return readings | dict(others)
 
 
@@ -366,12 +366,11 @@ def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) 
     """Returns how many points of a scan (N, 3) are in the image (H, W), by other axes of it."""
     found = dict[str, int]()
     for text, reading in _other_readings(own, {}).items():
-        assert reading.scanner is not None
-        found[text] = len(points_in_image(reading.scanner.apply(scan), reading.camera, size)[0])
+        seen = reading.known_scanner.apply(scan)
+        found[text] = len(points_in_image(seen, reading.camera, size)[0])
     return found
 
 
 def _jumps(scan: NDArray[np.floating], reading: Calibration, size: Size) -> Jumps | None:
     """The jumps of depth of the scan (N, 3) that are in the image (H, W)."""
-    assert reading.scanner is not None
-    return jumps_of(scan, reading.camera, reading.scanner, size)
+    return jumps_of(scan, reading.camera, reading.known_scanner, size)

@@ -167,13 +167,15 @@ class OpenNetwork:
                             depth_of=reader, z0=z0,
                         )  # fmt: skip
                     if at_full_size:
-                        before, after = reader(at_full_size[0]), reader(at_full_size[-1])
+                        before = reader(at_full_size[0])
+                        after = reader(at_full_size[-1])
                         result = replace(result, before=before, after=after)
             except errors.DivergedError as error:
                 # A refinement that diverges ends with its last good depth.
                 if error.last_good is None:
                     raise
-                diverged, result = error, error.last_good
+                diverged = error
+                result = error.last_good
         aligned = updated = prepared.to_image(result.before)
         if result.after is not result.before:
             updated = prepared.to_image(result.after)
@@ -229,7 +231,8 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
-    prior, camera = None, frame.camera
+    prior = None
+    camera = frame.camera
     if frame.prior is not None and network.definition.takes_prior:
         prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)

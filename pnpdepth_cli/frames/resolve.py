@@ -79,7 +79,8 @@ def resolve_definition(
     Raises:
         ModelError: The network's own check fails.
     """
-    definition, notes = network.definition, list(network.notes)
+    definition = network.definition
+    notes = list(network.notes)
     with errors.out_of_memory_is_a_device_error(network.device):
         if definition.normalisation is None and frame.rgb is not None:
             with spent_on("input range"):
@@ -296,7 +297,8 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
 
     Frames without points in the network's view are left out; infinite where the network fails.
     """
-    definition, misfits = network.definition, list[float]()
+    definition = network.definition
+    misfits = list[float]()
     for frame in frames:
         try:
             prepared = prepare(network, frame)

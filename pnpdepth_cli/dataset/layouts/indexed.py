@@ -135,7 +135,8 @@ def _photos(root: Path) -> Path | None:
 def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each registered image that exists."""
     models = [read_model(folder) for folder in _colmap_models(root)]
-    model, photos = max(models, key=lambda other: len(other.images)), _photos(root)
+    model = max(models, key=lambda other: len(other.images))
+    photos = _photos(root)
     assert photos is not None
     files, unreadable = find_files(photos, IMAGE_SUFFIXES)
     yield from unreadable

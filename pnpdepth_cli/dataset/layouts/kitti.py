@@ -109,7 +109,8 @@ def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
         yield from _SELECTION.frames(root)
         return
     for scans in _scans_of_tree(root):
-        drive, camera = scans.parents[2], scans.name
+        drive = scans.parents[2]
+        camera = scans.name
         dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)
         images = _of_drive(drive, Path(camera, "data"), *dates)
         parts = {
@@ -137,7 +138,8 @@ def _raw_cameras(root: Path) -> list[Path]:
 
 def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
     for camera in _raw_cameras(root):
-        drive, calibration = camera.parent, _calibration_of(camera.parent)
+        drive = camera.parent
+        calibration = _calibration_of(camera.parent)
         if calibration is None:
             yield drive, f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
             continue

@@ -27,8 +27,15 @@ from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "sparse_mask", "depth", "gt", "calib", "mask")
 _OTHERS = (
-    *("camera", "sparse_scale", "sparse_kind", "min_confidence", "gt_scale", "gt_kind"),
-    *("gt_size_ok", "name", "group"),
+    "camera",
+    "sparse_scale",
+    "sparse_kind",
+    "min_confidence",
+    "gt_scale",
+    "gt_kind",
+    "gt_size_ok",
+    "name",
+    "group",
 )
 _COLUMNS = (*_PATHS, *_OTHERS, "protocol")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
