@@ -84,6 +84,7 @@ class Refiner:
         registration: Registration = "auto",
         adapt: Sequence[Pair] = (),
     ) -> None:
+        # What is asked for, checked.
         self._networks = list(network) if isinstance(network, Sequence) else [network]
         if not self._networks or not all(
             isinstance(network, Network) for network in self._networks
@@ -96,6 +97,7 @@ class Refiner:
         self._keep_measured = keep_measured
         self._register = registration_to_make(registration, self._asked)
         self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
+        # What follows from the first frame, and lasts until the refiner is closed.
         self._method: Method | None = None
         self._is_closed = False
         self._moved: dict[tuple[int, int], set[str]] = {}  # how images were moved, by their size
@@ -362,8 +364,10 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
         white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]  # as files are read
         return (values / white).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
-        given = f"{values.dtype} in {values.min()}..{values.max()}"
-        raise InputError(f"an image is uint8, uint16, or float in 0..1; this one is {given}")
+        raise InputError(
+            "an image is uint8, uint16, or float in 0..1; this one is"
+            f" {values.dtype} in {values.min()}..{values.max()}; divide it by its white"
+        )
     return values.astype(np.float32)
 
 
