@@ -270,7 +270,8 @@ def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFil
     stated = read_json(summary).get("layout") if summary.is_file() else None
     for layout in (stated if stated in LAYOUTS else None, None):
         with contextlib.suppress(InputError, OSError):
-            return list_frames(folder, layout)[:2]
+            found = list_frames(folder, layout)
+            return found.layout, found.frames
     return None, []
 
 
