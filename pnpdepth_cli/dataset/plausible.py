@@ -156,6 +156,7 @@ def scan_returns(
         InputError: Many coordinates are none of a scan, or are implausible in metres.
         NoPointsError: No point is left.
     """
+    # The returns, and how many of the others there are.
     range_m = np.linalg.norm(np.where(np.isfinite(xyz), xyz, 0).astype(np.float64), axis=1)
     drops = DropCounter()
     row = _drop_no_returns(path, xyz, range_m, drops)
@@ -164,6 +165,7 @@ def scan_returns(
             f"{path}: none of its {len(xyz):,} points is a return; give another scan"
         )
     dropped, notes = _described(drops, len(xyz))
+    # Their unit.
     divisor, lines = divisor_to_metres(
         range_m[row],
         Reading("scan"),

@@ -63,7 +63,8 @@ def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list
     none = np.zeros(len(values), bool)
     lines = list[str]()
     # One value for many, at either end.
-    far, near = far_end(values), near_end(values)
+    far = far_end(values)
+    near = near_end(values)
     for found, what, most in (
         (far, "of the sky or a far plane", f"at most {metres(far.rest)}"),
         (near, "of no surface", f"at least {metres(near.rest)}"),

@@ -181,6 +181,7 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
             f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
             " RGB' in Record3D, and give the folder EXR_RGBD"
         )
+    # The folder itself, else those in it.
     inside = sorted(root.iterdir()) if root.is_dir() else []
     below = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     for folders in ([root], below):
@@ -191,6 +192,7 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
                 found[folder] = matching
         if found:
             return found
+    # It is none. What a folder lacks is said where one layout is wanted.
     if root.is_file():
         raise InputError(
             f"{root} is one file; give a folder, a CSV list of frames or a bag, or refine one image"

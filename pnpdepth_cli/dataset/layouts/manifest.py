@@ -60,11 +60,14 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
-            earlier = first[frame.name.casefold()].name
-            alike = "" if earlier == frame.name else ", but for capitals"
+            if first[frame.name.casefold()].name != frame.name:
+                raise InputError(
+                    f"{root}, line {number}: a second frame {one_line(frame.name)!r}, but for"
+                    " capitals; give it a name of its own"
+                )
             raise InputError(
-                f"{root}, line {number}: a second frame {one_line(frame.name)!r}{alike}; give it a"
-                " name of its own"
+                f"{root}, line {number}: a second frame {one_line(frame.name)!r}; give it a name of"
+                " its own"
             )
     return [*broken, *named]
 
