@@ -84,6 +84,7 @@ class Refiner:
         registration: Registration = "auto",
         adapt: Sequence[Pair] = (),
     ) -> None:
+        # What is asked for, checked.
         self._networks = list(network) if isinstance(network, Sequence) else [network]
         if not self._networks or not all(
             isinstance(network, Network) for network in self._networks
@@ -96,6 +97,7 @@ class Refiner:
         self._keep_measured = keep_measured
         self._register = registration_to_make(registration, self._asked)
         self._adapt = [_frame_of_pair(pair, self._register) for pair in adapt]
+        # What follows from the first frame, and lasts until the refiner is closed.
         self._method: Method | None = None
         self._is_closed = False
         self._moved: dict[tuple[int, int], set[str]] = {}  # how images were moved, by their size
@@ -362,8 +364,10 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
         white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]  # as files are read
         return (values / white).astype(np.float32)
     if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
-        given = f"{values.dtype} in {values.min()}..{values.max()}"
-        raise InputError(f"an image is uint8, uint16, or float in 0..1; this one is {given}")
+        raise InputError(
+            "an image is uint8, uint16, or float in 0..1; this one is"
+            f" {values.dtype} in {values.min()}..{values.max()}; divide it by its white"
+        )
     return values.astype(np.float32)
 
 
@@ -376,7 +380,8 @@ def _points(
     """
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), 0
-    values, unknown = _numbers(sparse, "sparse depth"), 0
+    values = _numbers(sparse, "sparse depth")
+    unknown = 0
     if values.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
@@ -385,7 +390,8 @@ def _points(
             raise InputError("rows of x, y and depth need an image for the size of the frame")
         column = in_metres(values[:, 2], "the sparse depth", unit)
         known = np.isfinite(values).all(axis=1) & (column > 0)
-        xy, depth = values[known, :2].astype(np.float32), column[known]
+        xy = values[known, :2].astype(np.float32)
+        depth = column[known]
         unknown = int(np.count_nonzero(~known))
     else:
         # Anything else is a depth map, of which the known pixels are points.

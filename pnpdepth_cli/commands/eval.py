@@ -6,9 +6,10 @@ import contextlib
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +111,49 @@ def evaluate(
     scored = [row for row in rows if row.status == "done"]
     if not scored:
         raise InputError(f"no frame could be scored; the first: {rows[0].message}")
-    # The values of each frame, by the measures that any of them has.
-    scores = [scores_of(row) for row in scored]
+    # Means of what any of them has.
     every = (*request.measures, *OF_SIGMA)
+    means = _means_of(scored, every, request)
+    shown = means.measures
+    if request.columns is not None:
+        shown = choose_measures(every, request.columns)
+    notes += [*means.notes, *_notes_on_files(rows), *_notes_on_depths(scored, request)]
+    return Evaluation(
+        request=request,
+        frames=rows,
+        counts={
+            "frames": len(rows),
+            "scored": len(scored),
+            "pixels": sum(_numbers(scored, "pixels")),
+            "coverage": sum(_numbers(scored, "predicted")) / sum(_numbers(scored, "known")),
+        },
+        measures=means.measures,
+        shown=shown,
+        mean=means.mean,
+        interval=means.interval or None,
+        clusters=means.clusters,
+        notes=notes,
+    )
+
+
+class _Means(NamedTuple):
+    """Means over frames, and how sure they are."""
+
+    measures: tuple[Measure, ...]
+    """What any of the frames was measured by."""
+    mean: dict[str, float | None]
+    interval: dict[str, tuple[float, float]]
+    """The ends of the 95 % interval of each mean; empty with too few frames."""
+    clusters: Clusters
+    notes: list[str]
+
+
+def _means_of(
+    scored: Sequence[FrameRecord], every: Sequence[Measure], request: EvalRequest
+) -> _Means:
+    """The means over frames that were scored, by the measures of `every` that any of them has."""
+    # The values of each frame.
+    scores = [scores_of(row) for row in scored]
     measures = tuple(m for m in every if any(m.key in of_frame for of_frame in scores))
     measured = [{m.key: of_frame.get(m.key) for m in measures} for of_frame in scores]
     values = np.array([[*of_frame.values()] for of_frame in measured], float)
@@ -123,28 +164,13 @@ def evaluate(
         mean |= dict(zip(mean, exact, strict=False))
     clusters = find_clusters([row.group or "" for row in scored], values)
     ends = _intervals(measures, values, clusters)
-    notes += clusters.notes()
+    notes = [*clusters.notes()]
     if len(scored) > 1 and not ends:
         notes.append(
             f"no interval: {clusters.text} are too few to tell how sure the means are;"
             f" {MIN_CLUSTERS} are needed"
         )
-    return Evaluation(
-        request=request,
-        frames=rows,
-        counts={
-            "frames": len(rows),
-            "scored": len(scored),
-            "pixels": sum(_numbers(scored, "pixels")),
-            "coverage": sum(_numbers(scored, "predicted")) / sum(_numbers(scored, "known")),
-        },
-        measures=measures,
-        shown=measures if request.columns is None else choose_measures(every, request.columns),
-        mean=mean,
-        interval=ends or None,
-        clusters=clusters,
-        notes=[*notes, *_notes_on_files(rows), *_notes_on_depths(scored, request)],
-    )
+    return _Means(measures, mean, ends, clusters, notes)
 
 
 def _intervals(
@@ -183,18 +209,10 @@ def _pair_frames(
             f" {prediction} and {ground_truth}"
         )
     # The predictions by name, and the frames with ground truth.
-    notes: list[str] = []
+    notes = list[str]()
     predictions = _depth_files(prediction)
     if layout is not None:
-        frames = [replace(f, part=part or f.part) for f in frames if f.gt is not None]
-        if not frames:
-            raise InputError(
-                f"{ground_truth} looks like {layout!r}, without ground truth; give its folder"
-            )
-        cuts = ", ".join(sorted({str(frame.part) for frame in frames if frame.part != WHOLE}))
-        note = f"gt: layout {layout}; frames with ground truth: {len(frames):,}"
-        if cuts:
-            note += f", of which {cuts} is used"
+        frames, note = _frames_with_truth(ground_truth, layout, frames, part)
         notes.append(note)
     elif ground_truth.is_dir():
         frames = [FrameFiles(name=name, gt=gt) for name, gt in _depth_files(ground_truth).items()]
@@ -202,6 +220,35 @@ def _pair_frames(
         frames = [FrameFiles(name=name, gt=ground_truth) for name in predictions]
     # At least one name must be common to both.
     names = [frame.name for frame in frames]
+    notes += _notes_on_names(predictions, names)
+    groups = groups_of(names, [frame.group for frame in frames])
+    pairs = [
+        _pair(replace(frame, group=group), predictions.get(frame.name))
+        for frame, group in zip(frames, groups, strict=True)
+    ]
+    return pairs, notes
+
+
+def _frames_with_truth(
+    folder: Path, layout: str, frames: Sequence[FrameFiles], part: FramePart | None
+) -> tuple[list[FrameFiles], str]:
+    """The frames of a data set that have ground truth, in the part that is scored, and a line."""
+    having = [replace(frame, part=part or frame.part) for frame in frames if frame.gt is not None]
+    if not having:
+        raise InputError(f"{folder} looks like {layout!r}, without ground truth; give its folder")
+    cuts = ", ".join(sorted({str(frame.part) for frame in having if frame.part != WHOLE}))
+    note = f"gt: layout {layout}; frames with ground truth: {len(having):,}"
+    if cuts:
+        note += f", of which {cuts} is used"
+    return having, note
+
+
+def _notes_on_names(predictions: Mapping[str, Path], names: Sequence[str]) -> list[str]:
+    """A warning if predictions have no ground truth of their name.
+
+    Raises:
+        InputError: None has.
+    """
     extra = sorted(predictions.keys() - {*names})
     if len(extra) == len(predictions):
         raise InputError(
@@ -209,16 +256,12 @@ def _pair_frames(
             f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}; name both"
             " alike"
         )
-    if extra:
-        notes.append(
-            f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth and"
-            f" are not scored: {some_names(extra)}"
-        )
-    groups = groups_of(names, [frame.group for frame in frames])
+    if not extra:
+        return []
     return [
-        _pair(replace(frame, group=group), predictions.get(frame.name))
-        for frame, group in zip(frames, groups, strict=True)
-    ], notes
+        f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth and"
+        f" are not scored: {some_names(extra)}"
+    ]
 
 
 def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
@@ -227,7 +270,8 @@ def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFil
     stated = read_json(summary).get("layout") if summary.is_file() else None
     for layout in (stated if stated in LAYOUTS else None, None):
         with contextlib.suppress(InputError, OSError):
-            return list_frames(folder, layout)[:2]
+            found = list_frames(folder, layout)
+            return found.layout, found.frames
     return None, []
 
 

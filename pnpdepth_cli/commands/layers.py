@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from pnpdepth_cli import errors
 from pnpdepth_cli.core.influence import Field
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import ModelError, UsageError, out_of_memory_is_a_device_error
 from pnpdepth_cli.frames.resolve import fields_of
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, load_network
@@ -65,13 +65,13 @@ def list_layers(
     submodules = [name for name, _ in network.module.named_modules() if name]
     names = submodules if every else list(network.definition.layers)
     if not names:
-        raise errors.UsageError(
+        raise UsageError(
             f"the definition of {network.definition.name!r} lists no layers; --all lists every one"
         )
     # What a whole pass costs, then what lies behind each cut.
     frame = FrameMap.fit(network.definition.size, *_SYNTHETIC_SIZE)
     measured = []
-    with errors.out_of_memory_is_a_device_error(network.device):
+    with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
@@ -97,7 +97,7 @@ def _measure(
             split.rear(z)  # the first pass learns the cut
             with FlopCounterMode(display=False) as behind:
                 split.rear(z)
-    except errors.ModelError as error:
+    except ModelError as error:
         return MeasuredLayer(name=name, problem=str(error))
     return MeasuredLayer(
         name=name,

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pnpdepth_cli import errors
 from pnpdepth_cli.core.split import Split, gradient_at
+from pnpdepth_cli.errors import ModelError, out_of_memory_is_a_device_error, wrap_user_errors
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Multiple, Near
 from pnpdepth_cli.models.frame_map import FrameMap
@@ -27,7 +27,7 @@ def list_models() -> list[dict[str, object]]:
 
 def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting needs no memory.
-    with errors.wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
+    with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
     defaults = definition.defaults.closed()
     path = definition.checkpoint
@@ -84,7 +84,7 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
         rgb = torch.from_numpy(read_rgb(image).values).permute(2, 0, 1).contiguous()[None]
     height, width = _SYNTHETIC_SIZE if rgb is None else rgb.shape[-2:]
     frame = FrameMap.fit(definition.size, height, width)
-    with errors.out_of_memory_is_a_device_error(network.device):
+    with out_of_memory_is_a_device_error(network.device):
         arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
         if "rgb" in definition.input_kind and definition.normalisation is None:
@@ -123,7 +123,7 @@ def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], who
             if not torch.equal(raw.detach(), whole.nan_to_num()):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())
-    except errors.ModelError as error:
+    except ModelError as error:
         return str(error)
     reached = gradient is not None and bool(gradient.isfinite().all())
     return "ok" if reached else "no finite gradient comes back from the prediction"

@@ -20,25 +20,40 @@ ALONE = 10.0
 FAR = 0.2
 """Difference of log depth beyond which a network that weighs its points contradicts a point."""
 
-_COMPARED = 8  # neighbours that a point is compared with,
-_AGREEING = 2  # of which so many must agree with it
-_MIN_DISAGREEMENT = 0.005  # of log depth; less is none
+_COMPARED = 8
+"""Neighbours that a point is compared with."""
+_AGREEING = 2
+"""Of these, so many must agree with it."""
+_MIN_DISAGREEMENT = 0.005
+"""Of log depth; less is none."""
 
 _ALIKE = 0.15
 """Difference of these differences up to which neighbours agree with each other."""
 _AGREE_AROUND = 3
 """Of `_AROUND` neighbours, so many must agree with a point that is off with others."""
 
-_PASSES = 3  # without the worst outliers, others stand out
-_MIN_POINTS = 5  # fewer do not predict each other
-_MAX_EXACT = 256  # points up to which all predict each other, instead of neighbourhoods
-_CUTOFFS = (4.0, 4.0, 5.0, 6.0, 8.0)  # times the typical error at which a weight is 0, in turn
-_MIN_ERROR = 1e-3  # of the typical error over its standard deviation; less is none
-_MIN_WEIGHT = 0.05  # points with less weight are suspected
-_AROUND, _MOST_SUSPECTED, _HALF_SUSPECTED = 6, 4, 3
-# neighbours: with a fifth of outliers, 2 % of the points have 4 suspected ones
-_FAR_BETTER = 0.5  # the others' errors without the suspected points must fall to this fraction,
-_FAR_BETTER_MANY = 0.65  # or this one where there are many points, whose errors are well known
+_PASSES = 3
+"""Times that outliers are sought: without the worst ones, others stand out."""
+_MIN_POINTS = 5
+"""Fewer do not predict each other."""
+_MAX_EXACT = 256
+"""Points up to which all predict each other, instead of neighbourhoods."""
+_CUTOFFS = (4.0, 4.0, 5.0, 6.0, 8.0)
+"""Times the typical error at which a weight is 0, in turn."""
+_MIN_ERROR = 1e-3
+"""Typical error over its standard deviation; less is none."""
+_MIN_WEIGHT = 0.05
+"""Points with less weight are suspected."""
+_AROUND = 6
+"""Neighbours among which suspected points are counted."""
+_MOST_SUSPECTED = 4
+"""Of these; with a fifth of outliers, 2 % of the points have 4 suspected neighbours."""
+_HALF_SUSPECTED = 3
+"""Of these; beside points that are suspected together, so many are enough."""
+_FAR_BETTER = 0.5
+"""The others' errors without the suspected points must fall to this fraction."""
+_FAR_BETTER_MANY = 0.65
+"""The same where there are many points, whose errors are well known."""
 
 
 def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
@@ -115,24 +130,30 @@ def inlier_mask(field: Residuals) -> Tensor:
     Unless there are very many, the Gaussian process from the other points, with their weights,
     predicts each point then.
     """
-    weight, near = inlier_weights(field.points, field.residual), neighbourhoods(field, _MAX_EXACT)
+    weight = inlier_weights(field.points, field.residual)
+    near = neighbourhoods(field, _MAX_EXACT)
+    # Few points all predict each other, with weights that follow from the errors, again and again.
     if len(near) == 1 and near.shape[1] >= _MIN_POINTS:
         for cutoff in _CUTOFFS:
             error, variance = leave_one_out(field, near, weight)
             ratio = error[0].abs() / variance[0].sqrt()
             typical = max(MAD_TO_STD * float(ratio.median()), _MIN_ERROR)
             weight = (1 - (ratio / (cutoff * typical)).square()).clamp_min(0).square()
+    # Points of little weight are suspected, unless they are alone together.
     inliers = weight > _MIN_WEIGHT
     inliers = inliers | _suspected_together(field.points, ~inliers)
     weight = torch.where(inliers, weight.clamp_min(_MIN_WEIGHT), weight)
     if bool(inliers.all()) or not bool(inliers.any()):
         return torch.ones_like(inliers)
+    # They are outliers if the others predict each other far better without them.
     with_all, without = (
         float((error.abs() * weight[near[:, : error.shape[1]]]).sum())
         for error, _ in (leave_one_out(field, near), leave_one_out(field, near, weight))
     )
     far_better = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
-    return inliers if without < far_better * with_all else torch.ones_like(inliers)
+    if without >= far_better * with_all:
+        return torch.ones_like(inliers)
+    return inliers
 
 
 def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:

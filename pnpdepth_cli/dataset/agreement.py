@@ -22,11 +22,14 @@ from pnpdepth_cli.completion.two_depths import (
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.formats import Reading
 
-_OTHER_FIT = math.log(3.0)  # of the ratio of a prediction, which a network's own scale explains
+_OTHER_FIT = math.log(3.0)
+"""Log ratio of a prediction, up to which a network's own scale explains it."""
 _SCALES = (1000.0, 256.0, 5000.0, 100.0, 10.0, 1.0, 4000.0, 6553.5, 39.3701, 3.28084)
 """Numbers per metre in use. Millimetres, KITTI, TUM, cm, dm, m, 0.25 mm, Replica, inches, feet."""
-_ROUNDED = 0.05  # log ratio to the nearest of these, which is then meant
-_ROUNDED_FIT = 0.15  # the same of the depth of a network, which is biased
+_ROUNDED = 0.05
+"""Log ratio to the nearest of these, which is then meant."""
+_ROUNDED_FIT = 0.15
+"""The same of the depth of a network, which is biased."""
 
 
 def check_order(what: str, first: NDArray[np.floating], second: NDArray[np.floating]) -> str | None:
@@ -81,7 +84,8 @@ def unit_warning(
         f"{what} are {found.ratio:.4g} times the ground truth (median of {found.pairs:,} pixels)"
     )
     if not found.is_unit:
-        if abs(math.log(found.ratio)) <= (_OTHER_FIT if fitted else OTHER_UNIT):
+        most = _OTHER_FIT if fitted else OTHER_UNIT
+        if abs(math.log(found.ratio)) <= most:
             return None
         way_out = "; --scale-by fits each image" if fitted else ""
         return (
@@ -103,12 +107,13 @@ def unit_warning(
         f" {math.exp(found.spread):.2f}), so a scale is probably wrong; {advice} would"
         " remove it"
     )
-    if assumed := [f"{option} {read.scale:g}" for option, read, _ in integer if read.assumed]:
+    assumed = [f"{option} {read.scale:g}" for option, read, _ in integer if read.assumed]
+    if assumed:
         raise InputError(f"{fact}, {' '.join(assumed)} keeps it")
     return f"warning: {fact}"
 
 
 def _common(scale: float, within: float) -> float:
     """The scale in use that is meant by one that was estimated; else that one."""
-    nearest = min(_SCALES, key=lambda each: abs(math.log(each / scale)))
+    nearest = min(_SCALES, key=lambda usual: abs(math.log(usual / scale)))
     return nearest if abs(math.log(nearest / scale)) < within else scale

@@ -27,10 +27,13 @@ from pnpdepth_cli.io.rgb import (
 from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 
-_OFF_CENTRE = 0.15, 0.35
-"""Of the image's width and height: principal points nearer the centre give no warning. Rows are cut
-off above, where a LiDAR sees nothing, with the calibration adjusted."""
-_ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios of images of one view
+_OFF_CENTRE_ACROSS = 0.15
+"""Of the image's width: a principal point nearer to the middle gives no warning."""
+_OFF_CENTRE_DOWN = 0.35
+"""The same of its height. Rows are cut off above, where a LiDAR sees nothing, with the calibration
+adjusted."""
+_ASPECT_TOLERANCE = 0.02
+"""Relative difference of aspect ratios of images of one view."""
 
 
 def record_of(
@@ -61,8 +64,13 @@ def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.floa
     if rgb.shape[:2] != size and isinstance(source, Path):
         rgb = read_rgb(source, upright=False).values
     if rgb.shape[:2] != size:
-        way_out = "; give the image of this depth with --image"
-        raise unequal_sizes(str(source), rgb.shape, "its depth", size, way_out)
+        raise unequal_sizes(
+            str(source),
+            rgb.shape,
+            "its depth",
+            size,
+            "; give the image of this depth with --image",
+        )
     return rgb
 
 
@@ -109,11 +117,13 @@ def same_aspect_ratio(own: tuple[int, ...], size: tuple[int, ...]) -> bool:
 def check_same_view(what: str, own: tuple[int, ...], size: Size) -> None:
     """Raises InputError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
     if not same_aspect_ratio(own, size):
-        turned = same_aspect_ratio(own[::-1], size)
-        raise InputError(
-            f"{what} is {own[1]}×{own[0]} and the image {size[1]}×{size[0]}: they do not show the"
-            " same view" + ("; one is turned by 90°, turn it back" if turned else "")
-        )
+        sizes = f"{own[1]}×{own[0]} and the image {size[1]}×{size[0]}"
+        if same_aspect_ratio(own[::-1], size):
+            raise InputError(
+                f"{what} is {sizes}: they do not show the same view; one is turned by 90°, turn it"
+                " back"
+            )
+        raise InputError(f"{what} is {sizes}: they do not show the same view")
 
 
 def moved_note(own: tuple[int, ...], size: Size) -> str:
@@ -189,16 +199,18 @@ def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None
     """
     name = str(image or "the image")
     if camera.size is not None and camera.size != size:
-        way_out = "; give the image at that size"
-        raise unequal_sizes(name, size, f"the image of {path}", camera.size, way_out)
+        raise unequal_sizes(
+            name, size, f"the image of {path}", camera.size, "; give the image at that size"
+        )
     x, y = camera.intrinsics[:2, 2]
     if not (0 <= x < size[1] and 0 <= y < size[0]):
         raise InputError(
             f"{name} is {size[1]}×{size[0]}, which does not contain the principal point"
             f" ({x:.1f}, {y:.1f}) of {path}; one of them is of another camera or size"
         )
-    across, down = _OFF_CENTRE
-    if abs(x / size[1] - 0.5) > across or abs(y / size[0] - 0.5) > down:
+    across = abs(x / size[1] - 0.5)
+    down = abs(y / size[0] - 0.5)
+    if across > _OFF_CENTRE_ACROSS or down > _OFF_CENTRE_DOWN:
         return [
             f"warning: the principal point ({x:.1f}, {y:.1f}) of {path} is far from the centre of"
             f" a {size[1]}×{size[0]} image; does the calibration belong to this image?"
@@ -215,7 +227,8 @@ def camera_of_exif(image: ImageSource | None, size: Size, lacking: str) -> tuple
     focal = read_focal_length(image, size) if isinstance(image, Path) else None
     if focal is None:
         raise UsageError(f"{lacking} nor a focal length in EXIF; give --calib")
-    (focal_px, source), (height, width) = focal, size
+    focal_px, source = focal
+    height, width = size
     intrinsics = np.array(
         [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
     )

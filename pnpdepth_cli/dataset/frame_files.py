@@ -148,28 +148,6 @@ class ScanOptions:
     keep_occluded: bool = False
     """Whether points that are occluded from the camera stay."""
 
-    def describes(self, sparse: Path) -> bool:
-        """Returns whether the sparse depth is a scan: by its suffix, or x y z with a calibration.
-
-        A calibration of other sparse depth is that of the camera.
-
-        Raises:
-            InputError: A list of points cannot be read.
-            UsageError: It is not, and an option is given that only a scan has.
-        """
-        suffix = sparse.suffix.lower()
-        if suffix in SCAN_ONLY_SUFFIXES:
-            return True
-        if self.calib is not None and suffix in (".npy", ".csv", ".txt"):
-            from pnpdepth_cli.io.depth import holds_scan
-
-            if holds_scan(sparse, is_stated=self.extrinsics is not None):
-                return True
-        if self.extrinsics is not None or (self.calib is None and self.camera is not None):
-            why = "so --extrinsics and --camera do not apply; a scan needs --calib"
-            raise UsageError(f"{sparse} is no scan, {why}")
-        return False
-
     def over(self, files: FrameFiles) -> ScanOptions:
         """Returns these options, with the calibration and camera that the data set names.
 
@@ -287,7 +265,7 @@ def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path]
 
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Returns the key by which names are sorted as a person does: a2 before a10."""
-    return [(int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
+    return [(int(run) if run.isdecimal() else 0, run) for run in re.split(r"(\d+)", name)]
 
 
 def one_of_each(named: Iterable[tuple[str, Path]]) -> tuple[dict[str, Path], list[Unmatched]]:
@@ -334,7 +312,7 @@ def name_problem(name: str) -> str | None:
         return "holds a backslash or a drive letter, which lead out of the folder on Windows"
     if not path.parts:
         return "names no file"
-    if any(len(part.encode("utf-8", "surrogateescape")) > _LONGEST_PART for part in path.parts):
+    if any(len(folder.encode("utf-8", "surrogateescape")) > _LONGEST_PART for folder in path.parts):
         return f"is longer than {_LONGEST_PART} bytes"
     return None
 
@@ -352,4 +330,4 @@ def groups_of(names: Sequence[str], stated: Sequence[str | None]) -> list[str]:
     groups = [_FRAME_NUMBER.sub("", name) for name in names]
     if any(group == name for group, name in zip(groups, names, strict=True)):
         groups = [name.rpartition("/")[0] for name in names]
-    return [own or group for own, group in zip(stated, groups, strict=True)]
+    return [of_set or group for of_set, group in zip(stated, groups, strict=True)]

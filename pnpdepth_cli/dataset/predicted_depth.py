@@ -40,15 +40,24 @@ _OTHER_WORDS = re.compile(
     "|intrin|extrin|pose|fov|focal"
 )
 """Words in names of arrays that are depth, and that are maps beside it."""
-_MATRIX = 4  # rows or columns of a camera's matrix or pose at most
-_GREY = 2  # levels of 255 between the channels of a grey picture; compression makes some
-_STEPS = 256  # of 8 bits
-_FEW = 20  # different numbers; fewer are of labels
-_MANY = 1000  # pixels, of which so few different numbers tell something
-_FILLED = 0.005  # of the pixels; so many zeros in the middle of a range stand for unknown
-_MORE = 3  # times as many as any other number
-_SAMPLED = 2000  # pixels, whose neighbours are compared with the image's edges
-_KNOWN = 0.5 - 1e-6  # weight of known pixels, from which an interpolated one is known
+_MATRIX = 4
+"""Rows or columns of a camera's matrix or pose, at most."""
+_GREY = 2
+"""Levels of 255 between the channels of a grey picture; compression makes some."""
+_STEPS = 256
+"""Numbers of 8 bits."""
+_FEW = 20
+"""Different numbers; fewer are of labels."""
+_MANY = 1000
+"""Pixels, of which few different numbers tell something."""
+_FILLED = 0.005
+"""Of the pixels; so many zeros in the middle of a range stand for unknown."""
+_MORE = 3
+"""Times as many as any other number."""
+_SAMPLED = 2000
+"""Pixels, whose neighbours are compared with the image's edges."""
+_KNOWN = 0.5 - 1e-6
+"""Weight of known pixels, from which an interpolated one is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +185,7 @@ def _load_exr(path: Path, data: bytes, part: str) -> DepthFile:
 
 
 def _is_video(data: bytes) -> bool:
+    """Whether the content of a file is that of a video."""
     is_mp4 = data[4:8] == b"ftyp" and data[8:11] in VIDEO_BRANDS
     is_avi = data[:4] == b"RIFF" and data[8:11] == b"AVI"
     return is_mp4 or is_avi or data.startswith(b"\x1aE\xdf\xa3")  # Matroska and WebM
@@ -234,8 +244,10 @@ def _one_channel(path: Path, stored: DepthFile, size: Size | None) -> NDArray[np
 
 def _equal_channels(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
     """The first channel of (H, W, C), of which the others are copies."""
-    if all(np.array_equal(values[..., 0], values[..., c]) for c in range(1, values.shape[-1])):
-        return values[..., 0]
+    first = values[..., 0]
+    others = range(1, values.shape[-1])
+    if all(np.array_equal(first, values[..., channel]) for channel in others):
+        return first
     raise InputError(
         f"{path} has {values.shape[-1]} channels that differ, as of colours, points or normals,"
         f" and depth has one; {_RAW}"
@@ -288,7 +300,8 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
 
 def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
     """0 and 255, beyond which a picture of depth is clipped, and a warning that it has steps."""
-    lowest, highest = codes == 0, codes == _STEPS - 1
+    lowest = codes == 0
+    highest = codes == _STEPS - 1
     levels = len(np.unique(codes[np.isfinite(codes)]))
     unknown.notes.append(
         f"warning: 8 bits have 256 steps, of which {levels} are used;"
@@ -366,9 +379,9 @@ def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
             f"{path} is {known[0]:g} at all of its {known.size:,} known pixels, as a mask is; give"
             " the depth map"
         )
-    # Most maps show by a part that they have more.
-    part = known[:: max(1, known.size // _SAMPLED)]
-    if known.size < _MANY or len(np.unique(part)) > _STEPS:
+    # Most maps show by a sample that they have more.
+    sample = known[:: max(1, known.size // _SAMPLED)]
+    if known.size < _MANY or len(np.unique(sample)) > _STEPS:
         return []
     different = len(np.unique(known))
     if different > _STEPS:

@@ -17,18 +17,36 @@ from pnpdepth_cli.io.depth import metres
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_FEW = 10  # fewer numbers decide nothing
-_SAME, _LEAST_SAME = 0.005, 3  # of the numbers, and how many, that no surface shares
-_EQUAL = 1e-5  # relative difference of numbers that were computed from one
-_NOISY = 0.02  # relative difference of numbers that noise was added to
-_BEYOND = 10.0  # times the 98th percentile of the rest, which edges of the sky may exceed
-_BEYOND_MOST = 8.0  # times the 90th percentile of the rest, where all are exactly the same
-_ABOVE = 1.5  # times the largest of the rest
-_FAR_M, _NEAR_M = 40.0, 0.12  # beyond which surfaces are rare
-_SPIKE, _LEAST_SPIKE = 3.0, 10  # times as many as have any other value, and how many
-_NEXT = 10  # distinct values beside an extreme one, of which one may have as many
-_VALUES = 20  # distinct ones; fewer are of a drawing
-_FAR = 1000.0  # times the median depth; no point of an image is farther
+_FEW = 10
+"""Numbers; fewer decide nothing."""
+_SAME = 0.005
+"""Of the numbers, that no surface shares."""
+_LEAST_SAME = 3
+"""How many these are at least."""
+_EQUAL = 1e-5
+"""Relative difference of numbers that were computed from one."""
+_NOISY = 0.02
+"""Relative difference of numbers that noise was added to."""
+_BEYOND = 10.0
+"""Times the 98th percentile of the rest, which edges of the sky may exceed."""
+_BEYOND_MOST = 8.0
+"""Times the 90th percentile of the rest, where all are exactly the same."""
+_ABOVE = 1.5
+"""Times the largest of the rest."""
+_FAR_M = 40.0
+"""Beyond it, surfaces are rare."""
+_NEAR_M = 0.12
+"""Nearer, surfaces are rare."""
+_SPIKE = 3.0
+"""Times as many as have any other value."""
+_LEAST_SPIKE = 10
+"""How many these are at least."""
+_NEXT = 10
+"""Distinct values beside an extreme one, of which one may have as many."""
+_VALUES = 20
+"""Distinct values; fewer are of a drawing."""
+_FAR = 1000.0
+"""Times the median depth; no point of an image is farther."""
 
 
 class _End(NamedTuple):
@@ -42,9 +60,11 @@ class _End(NamedTuple):
 def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
     """Returns which of the known depths (N,) are no depth, and lines for a person."""
     values = np.asarray(depth, np.float64)
-    none, lines = np.zeros(len(values), bool), list[str]()
+    none = np.zeros(len(values), bool)
+    lines = list[str]()
     # One value for many, at either end.
-    far, near = far_end(values), near_end(values)
+    far = far_end(values)
+    near = near_end(values)
     for found, what, most in (
         (far, "of the sky or a far plane", f"at most {metres(far.rest)}"),
         (near, "of no surface", f"at least {metres(near.rest)}"),
@@ -102,14 +122,15 @@ def repeated_ends(values: NDArray[np.float32]) -> list[tuple[float, int]]:
         return found
     distinct, counts = np.unique(values, return_counts=True)
     for step in (1, -1):  # from the smallest up, from the largest down
-        inwards, of_each = distinct[::step], counts[::step]
+        inwards = distinct[::step]
+        counts_inwards = counts[::step]
         at = 0
         # Behind one such value there may be another: unknown as -1, and a clip.
-        while len(distinct) - at > _VALUES and of_each[at] >= enough:
-            usual = np.sort(of_each[at + 1 : at + 1 + _NEXT])[-2]
-            if of_each[at] < _SPIKE * usual:
+        while len(distinct) - at > _VALUES and counts_inwards[at] >= enough:
+            usual = np.sort(counts_inwards[at + 1 : at + 1 + _NEXT])[-2]
+            if counts_inwards[at] < _SPIKE * usual:
                 break
-            found.append((float(inwards[at]), int(of_each[at])))
+            found.append((float(inwards[at]), int(counts_inwards[at])))
             at += 1
     return found
 
@@ -124,7 +145,9 @@ def _end(values: Floats, beyond: float) -> _End:
     none = _End(np.zeros(len(values), bool), 0.0, 0.0)
     if len(values) < _FEW:
         return none
-    largest, enough = float(values.max()), max(_LEAST_SAME, _SAME * len(values))
+    # Many are nearly the largest.
+    largest = float(values.max())
+    enough = max(_LEAST_SAME, _SAME * len(values))
     alike = values >= largest * (1 - _NOISY)
     if np.count_nonzero(alike) < enough:
         return none
@@ -136,13 +159,16 @@ def _end(values: Floats, beyond: float) -> _End:
     rest = others
     if len(distinct) >= _VALUES and np.count_nonzero(counts >= enough) <= _FEW:
         rest = values[~(alike | (counts[place] >= enough))]
-    if rest.size < len(others) / 2 or not rest.size:  # most are of few values, as of a drawing
+    # Most are of few values, as of a drawing.
+    if rest.size < len(others) / 2 or not rest.size:
         rest = others
     if not rest.size:
         return none
+    # Far beyond the others, also with the mixtures that a renderer makes at edges of the sky.
     most = float(np.quantile(rest, 0.98))
-    if largest >= _BEYOND * most:  # a renderer may mix the two at edges of the sky
+    if largest >= _BEYOND * most:
         return _End(values > math.sqrt(largest * most), largest, most)
+    # Exactly the same, and beyond the others.
     same = values >= largest * (1 - _EQUAL)
     rest = values[~same]
     if np.count_nonzero(same) < enough or not rest.size or largest < beyond:

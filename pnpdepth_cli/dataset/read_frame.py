@@ -1,9 +1,14 @@
-"""The files of a frame, read and checked against each other."""
+"""The files of a frame: read, then interpreted and checked against each other.
+
+Each file is read once, into what it holds. Functions that take what was read decide what it means.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,35 +17,68 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.completion.two_depths import compare_depths
-from pnpdepth_cli.dataset import arrays, sparse_depth
+from pnpdepth_cli.dataset import arrays, sparse_depth, stored_depth
 from pnpdepth_cli.dataset.agreement import check_order, unit_warning
 from pnpdepth_cli.dataset.frame_as_read import ReadFrame
-from pnpdepth_cli.dataset.frame_files import (
-    SCAN_ONLY_SUFFIXES,
-    FrameFiles,
-    ReadOptions,
-    ScanOptions,
-    inverse_factor,
-)
+from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions, inverse_factor
 from pnpdepth_cli.dataset.neighbours import read_neighbours
-from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
+from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.dataset.predicted_depth import read_predicted_depth
 from pnpdepth_cli.dataset.scan_points import read_scan_points
+from pnpdepth_cli.dataset.sparse_depth import SparseDepth
+from pnpdepth_cli.dataset.stored_depth import StoredDepth, StoredNumbers, StoredPoints
 from pnpdepth_cli.dataset.time_stamps import time_warning
 from pnpdepth_cli.errors import InputError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.frames.frame import registration_to_make, tensor_of
-from pnpdepth_cli.io.depth import describe_range, holds_integers, read_depth
-from pnpdepth_cli.io.formats import DepthFile, Reading
+from pnpdepth_cli.io.depth import depth_from_stored, describe_range
+from pnpdepth_cli.io.formats import DepthFile, Reading, check_scale
 from pnpdepth_cli.io.rgb import orientation_in, read_rgb
 from pnpdepth_cli.points import METRES, Size, SparsePoints
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.sensors.simulation import sample_points
 from pnpdepth_cli.settings import Settings
 
-# Of the ground truth's pixels equal to the sparse depth gives a warning. KITTI's ground truth holds
-# the points of its own scan by design, which is less than half of it.
 _LEAK_FRACTION = 0.5
+"""Fraction of the ground truth's pixels that are the sparse depth, from which there is a warning.
+KITTI's ground truth holds the points of its own scan by design, which is less than half of it."""
+
+
+class _Source(NamedTuple):
+    """What a record keeps of a file, and lines on it for a person."""
+
+    record: FileRecord
+    notes: Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """What the files of a frame hold. Nothing is decided of it."""
+
+    rgb: NDArray[np.float32] | None
+    """(H, W, 3) in 0…1. None without an image."""
+    image: _Source | None
+    truth: StoredDepth | None
+    sparse: StoredDepth | None
+
+    @property
+    def size(self) -> Size | None:
+        """(H, W) of the image. None without an image."""
+        return None if self.rgb is None else (self.rgb.shape[0], self.rgb.shape[1])
+
+
+class _Truth(NamedTuple):
+    """The ground truth of a frame, interpreted."""
+
+    values: NDArray[np.float32]
+    """(H, W) metres, 0 = unknown."""
+    reading: Reading
+    source: _Source
+
+    @property
+    def size(self) -> Size:
+        """(H, W)."""
+        return self.values.shape[0], self.values.shape[1]
 
 
 def read_frame(
@@ -65,69 +103,55 @@ def read_frame(
     """
     if files.min_confidence is not None and files.sparse_mask is None:
         raise UsageError("--min-confidence needs --sparse-mask, the confidence of the sparse depth")
-    # The image, and the ground truth, which has its size.
-    rgb, truth, found = _read_pixels(files, options)
-    whole = rgb if truth is None else truth.values
-    size = None if whole is None else (whole.shape[0], whole.shape[1])
-    # The sparse depth, from a file or sampled from the ground truth.
-    if files.sparse is None:
-        sparse = _sample_sparse(files, options, rgb, truth, seed)
-    else:
-        sparse = _read_sparse(files, options, size)
+    # Each file is read once.
+    stored = _read_stored(files, options)
+    # The ground truth, the sparse depth and the camera are made of what was read.
+    truth = _truth_of(files, options, stored)
+    size = stored.size if truth is None else truth.size
+    sparse = _sparse_of(files, options, stored, truth, size, seed)
     given = sparse.points.tensors()
-    gt, compared = None, list[str]()
-    if truth is not None:
-        gt = files.part.apply(truth.values)
-        compared = _compare(files, options, gt, truth.reading, sparse, given)
-    for depth in (files.sparse, files.gt):
-        if files.image_file is not None and depth is not None:
-            apart = time_warning(files.image_file, depth)
-            compared += [] if apart is None else [apart]
-    # The camera, and with it the points of neighbouring frames.
     size = size or given.size
+    gt = None if truth is None else files.part.apply(truth.values)
+    compared = list[str]()
+    if truth is not None and gt is not None:
+        compared = _compare(files, options, gt, truth.reading, sparse, given)
+    compared += _time_warnings(files)
     camera, of_camera = _camera_of(files, options, sparse.camera, size, needs_camera)
+    # Points are held out, and those of neighbouring frames join.
     used, held_out = _hold_out(given, holdout, seed)
-    points, neighbours, lost = read_neighbours(
-        files, used, camera, lambda other: _points_of(other, options, size, seed)
+    moved = read_neighbours(
+        files, used, camera, lambda neighbour: _points_of(neighbour, options, size, seed)
     )
     # Points that wrong poses moved say nothing of the image.
-    contradicted = any(each.contradicts_images for each in neighbours)
-    stated = sparse.camera is not None or files.one_view or options.registration == "off"
-    one_view = contradicted or stated
+    contradicted = any(neighbour.contradicts_images for neighbour in moved.records)
+    is_stated = sparse.camera is not None or files.one_view or options.registration == "off"
+    one_view = contradicted or is_stated
+    rgb = None if stored.rgb is None else files.part.apply(stored.rgb)
     if rgb is not None and not one_view and files.is_first:
-        compared += _orientation_warning(files, files.part.apply(rgb), given)
-    # Depth maps of networks, in pixels of the whole image.
-    predicted = list[NDArray[np.float32]]()
-    for number, path in enumerate(files.depths, 1):
-        whole_size = size if rgb is None else (rgb.shape[0], rgb.shape[1])
-        read = read_predicted_depth(path, whole_size, rgb)
-        predicted.append(np.ascontiguousarray(files.part.apply(read.values)))
-        name = "depth" if len(files.depths) == 1 else f"depth {number}"
-        found[name] = read.source, [*read.notes]
+        compared += _orientation_warning(files, rgb, given)
+    predicted = _read_predicted(files, stored, size)
     # What a record and a person should know.
-    found["sparse"] = sparse.record, [*sparse.notes]
-    in_order = ["image", "sparse", *(name for name in found if name.startswith("depth")), "gt"]
-    sources = {name: found[name] for name in in_order if name in found}
-    notes = [note for _, lines in sources.values() for note in lines]
-    notes += (*compared, *of_camera, *lost)
+    sources = _sources_of(stored, truth, sparse, predicted)
+    notes = [note for source in sources.values() for note in source.notes]
+    notes += [*compared, *of_camera, *moved.notes]
     if files.masks and truth is None:
         notes.append(
             f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
             " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
         )
     return ReadFrame(
-        rgb=None if rgb is None else tensor_of(np.ascontiguousarray(files.part.apply(rgb))),
-        points=points,
+        rgb=None if rgb is None else tensor_of(np.ascontiguousarray(rgb)),
+        points=moved.points,
         own=given,
         of_matches=sparse.record.kind == "colmap",
         held_out=held_out,
         register=None if one_view else registration_to_make(options.registration, Settings()),
         one_view=one_view,
         gt=None if gt is None else np.ascontiguousarray(gt),
-        predicted=tuple(torch.from_numpy(values) for values in predicted),
+        predicted=tuple(torch.from_numpy(network.values) for network in predicted),
         depth_scale=sparse.reading.scale,
-        sources={name: record for name, (record, _) in sources.items()},
-        neighbours=tuple(neighbours),
+        sources={name: source.record for name, source in sources.items()},
+        neighbours=tuple(moved.records),
         notes=tuple(notes),
         unit=sparse.unit,
         camera=camera,
@@ -135,90 +159,107 @@ def read_frame(
     )
 
 
-def _read_pixels(
-    files: FrameFiles, options: ReadOptions
-) -> tuple[NDArray[np.float32] | None, DepthFile | None, dict[str, tuple[FileRecord, list[str]]]]:
-    """The image (H, W, 3) in 0..1, ground truth of its size, and records and lines for a person."""
-    rgb = truth = size = None
-    found = dict[str, tuple[FileRecord, list[str]]]()
+def _time_warnings(files: FrameFiles) -> list[str]:
+    """Warnings where the image and its depth are of two moments by their names."""
+    if files.image_file is None:
+        return []
+    depths = [depth for depth in (files.sparse, files.gt) if depth is not None]
+    warnings = [time_warning(files.image_file, depth) for depth in depths]
+    return [warning for warning in warnings if warning is not None]
+
+
+def _read_stored(files: FrameFiles, options: ReadOptions) -> _Stored:
+    """What the files hold: the image, the ground truth and the sparse depth."""
+    rgb = image = truth = sparse = None
     if files.image is not None:
         notes = list[str]()
         if isinstance(files.image, Path):
-            image = read_rgb(files.image, upright=files.sparse is None or not files.sparse.is_dir())
-            rgb, notes = image.values, [f"image: {image.note}"] if image.note else []
+            # COLMAP reads photos as they are stored.
+            is_model = files.sparse is not None and files.sparse.is_dir()
+            picture = read_rgb(files.image, upright=not is_model)
+            rgb = picture.values
+            if picture.note:
+                notes.append(f"image: {picture.note}")
         else:
             rgb = arrays.read_image(files.image)
-        size = (rgb.shape[0], rgb.shape[1])
-        found["image"] = arrays.record_of(files.image, kind="image"), notes
+        image = _Source(arrays.record_of(files.image, kind="image"), notes)
     if files.gt is not None:
-        truth, record, lines = _read_ground_truth(files, options, files.gt, size)
-        found["gt"] = record, lines
-        own = truth.values.shape
-        if size is not None and size != own:
-            raise unequal_sizes(f"ground truth {files.gt}", own, "the image", size)
-        if not (truth.values > 0).any():
-            raise InputError(f"ground truth {files.gt} has no pixel with known depth")
-    return rgb, truth, found
+        truth = stored_depth.read_stored_truth(files.gt, files.image)
+    if files.sparse is not None:
+        sparse = stored_depth.read_stored_sparse(files.sparse, options.scan.over(files))
+    return _Stored(rgb=rgb, image=image, truth=truth, sparse=sparse)
 
 
-def _read_ground_truth(
-    files: FrameFiles, options: ReadOptions, source: Path, size: Size | None
-) -> tuple[DepthFile, FileRecord, list[str]]:
-    """The ground truth of an image (H, W): a projected scan, or a depth map."""
-    (scale, of_integers), of_scan = _scale_of(files, options, "gt"), options.scan.over(files)
-    if source.suffix.lower() in SCAN_ONLY_SUFFIXES:
-        if files.kind_of_gt is not None:
-            raise UsageError(f"{source} is a scan, so gt_kind does not apply")
-        scan = read_scan_points(
-            source, of_scan, size, files.image_file, scale=scale, of_integers=of_integers
+def _truth_of(files: FrameFiles, options: ReadOptions, stored: _Stored) -> _Truth | None:
+    """The ground truth, of the image's size: a projected scan, or a depth map."""
+    if stored.truth is None:
+        return None
+    if isinstance(stored.truth, StoredPoints):
+        truth = _truth_of_scan(files, options, stored, stored.truth.path)
+    else:
+        truth = _truth_of_map(files, options, stored, stored.truth)
+    if stored.size is not None and stored.size != truth.size:
+        raise unequal_sizes(f"ground truth {files.gt}", truth.size, "the image", stored.size)
+    if not (truth.values > 0).any():
+        raise InputError(
+            f"ground truth {files.gt} has no pixel with known depth; give another one, or none"
         )
-        notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
-        truth = DepthFile(values=as_depth_image(scan.points), reading=scan.reading)
-        return truth, scan.record, notes
-    # The option is of the scan or the floats beside it, unless the map has no scale of its own.
-    file = arrays.raw_depth(source, files.image) or read_depth(source, scale=scale)
-    if options.depth_scale and files.sparse is not None and _is_float(files.sparse, of_scan):
-        own = arrays.raw_depth(source, files.image) or read_depth(source, scale=files.gt_scale)
-        file = file if own.reading.assumed else own
-    if (factor := inverse_factor("gt_kind", files.kind_of_gt)) is not None:
-        file, scale = arrays.depth_of_inverse(file, factor, scale), None
+    return truth
+
+
+def _truth_of_scan(files: FrameFiles, options: ReadOptions, stored: _Stored, path: Path) -> _Truth:
+    """The ground truth that the points of a scan are, projected into the image."""
+    if files.kind_of_gt is not None:
+        raise UsageError(f"{path} is a scan, so gt_kind does not apply; leave it out")
+    stated = stored_depth.scale_of_truth(files, options, stored.sparse)
+    scan = read_scan_points(
+        path,
+        options.scan.over(files),
+        stored.size,
+        files.image_file,
+        rgb=_rgb_of_file(files, stored),
+        scale=stated.scale,
+        of_integers=stated.of_integers,
+    )
+    notes = [note.replace("sparse:", "gt:", 1) for note in scan.notes]
+    return _Truth(as_depth_image(scan.points), scan.reading, _Source(scan.record, notes))
+
+
+def _truth_of_map(
+    files: FrameFiles, options: ReadOptions, stored: _Stored, truth: StoredNumbers
+) -> _Truth:
+    """The ground truth of a depth map, in metres, without what masks and checks rule out."""
+    # The numbers by their scale.
+    stated = stored_depth.scale_of_truth(files, options, stored.sparse)
+    scale = stated.scale
+    depth = _map_by_scale(truth, scale)
+    if options.depth_scale is not None and stored.sparse and stored_depth.is_float(stored.sparse):
+        # The option is of the floats beside the map, unless the map has no scale of its own.
+        by_layout = _map_by_scale(truth, files.gt_scale)
+        if not by_layout.reading.assumed:
+            depth = by_layout
+    # Numbers of another kind than depth, as the user states.
+    factor = inverse_factor("gt_kind", files.kind_of_gt)
+    if factor is not None:
+        depth = arrays.depth_of_inverse(depth, factor, scale)
+        scale = None  # these are metres now
     # Pixels that a mask or the gate rules out are unknown.
-    values, reading = arrays.apply_masks(file.values, files.masks), file.reading
-    if files.gt_other_size and size is not None and values.shape != size:
-        values = arrays.move_depth(source, values, size)
-    option = "--depth-scale" if files.sparse is None else _gt_scale_option(files)
-    values, notes = plausible_map(values, reading, "gt", option, scale, of_integers=of_integers)
-    described = describe_range(values, reading, noun="pixels", option=option)
-    truth = DepthFile(values=values, reading=reading)
-    return truth, arrays.record_of(source, reading), [f"gt: {described}", *notes]
+    values = arrays.apply_masks(depth.values, files.masks)
+    if files.gt_other_size and stored.size is not None and values.shape != stored.size:
+        values = arrays.move_depth(truth.path, values, stored.size)
+    option = "--depth-scale" if stored.sparse is None else _gt_scale_option(files)
+    values, notes = plausible_map(
+        values, depth.reading, "gt", option, scale, of_integers=stated.of_integers
+    )
+    described = describe_range(values, depth.reading, noun="pixels", option=option)
+    record = arrays.record_of(truth.path, depth.reading)
+    return _Truth(values, depth.reading, _Source(record, [f"gt: {described}", *notes]))
 
 
-def _scale_of(files: FrameFiles, options: ReadOptions, part: str) -> tuple[float | None, str]:
-    """What is stated of a file's scale: numbers per metre, and whose integers these are.
-
-    `--depth-scale` is of both files of a frame, but of the integers alone if one of them holds
-    integers. What a layout states is of integers only.
-
-    Args:
-        files: The files of the frame.
-        options: What the user states.
-        part: Name of the file, "sparse" or "gt".
-    """
-    own, other = (files.sparse, files.gt) if part == "sparse" else (files.gt, files.sparse)
-    of_layout = files.sparse_scale if part == "sparse" else files.gt_scale
-    if options.depth_scale is None:
-        return of_layout, "" if files.scales_stated else OF_DATA_SET
-    if own is None or other is None or other.is_dir():
-        return options.depth_scale, ""
-    wanted = options.depth_scale if part == "sparse" else None
-    if other.suffix.lower() in SCAN_ONLY_SUFFIXES or not holds_integers(other, of_scale=wanted):
-        return options.depth_scale, ""
-    return options.depth_scale, str(other)
-
-
-def _is_float(sparse: Path, of_scan: ScanOptions) -> bool:
-    """Whether the sparse depth is a scan, or a map or list of floats."""
-    return not sparse.is_dir() and (of_scan.describes(sparse) or not holds_integers(sparse))
+def _map_by_scale(stored: StoredNumbers, scale: float | None) -> DepthFile:
+    """The map in metres, if its integers have this scale; None is the file's own."""
+    check_scale(scale)
+    return depth_from_stored(stored.path, stored.file, scale)
 
 
 def _gt_scale_option(files: FrameFiles) -> str:
@@ -226,91 +267,178 @@ def _gt_scale_option(files: FrameFiles) -> str:
     return "gt_scale of a list" if files.name else "--depth-scale (of both files)"
 
 
+def _rgb_of_file(files: FrameFiles, stored: _Stored) -> NDArray[np.float32] | None:
+    """The image, unless it is the frame of a video, whose edges no scan is compared with."""
+    return None if files.image_file is None else stored.rgb
+
+
+def _sparse_of(
+    files: FrameFiles,
+    options: ReadOptions,
+    stored: _Stored,
+    truth: _Truth | None,
+    size: Size | None,
+    seed: int,
+) -> SparseDepth:
+    """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
+    if stored.sparse is None:
+        return _sample_sparse(files, options, stored.rgb, truth, seed)
+    _check_sparse_options(files, options, stored.sparse)
+    # Its points in the image.
+    if isinstance(stored.sparse, StoredNumbers):
+        sparse = _points_of_numbers(files, options, stored, stored.sparse, size)
+    elif stored.sparse.kind == "model":
+        sparse = _points_of_model(files, options, stored.sparse.path, size)
+    else:
+        stated = stored_depth.scale_of_sparse(files, options, stored.truth)
+        sparse = read_scan_points(
+            stored.sparse.path,
+            options.scan.over(files),
+            size,
+            files.image_file,
+            rgb=_rgb_of_file(files, stored),
+            scale=stated.scale,
+            of_integers=stated.of_integers,
+            search=files.is_first,
+        )
+    # Those that are sure enough, in the part of the frame.
+    if files.sparse_mask is not None:
+        sparse = sparse.confident(files.sparse_mask, files.min_confidence)
+    return sparse.in_part(files.part)
+
+
 def _sample_sparse(
     files: FrameFiles,
     options: ReadOptions,
     rgb: NDArray[np.float32] | None,
-    truth: DepthFile | None,
+    truth: _Truth | None,
     seed: int,
-) -> sparse_depth.SparseDepth:
+) -> SparseDepth:
     """Points sampled from the ground truth."""
-    if options.sparse_range or options.sparse_kind is not None:
-        name = "--sparse-range" if options.sparse_range else "--sparse-kind"
-        raise UsageError(f"{name} is of sparse depth from a file, and there is none")
+    # What the user states must be of a sampled frame.
+    if options.sparse_range:
+        raise UsageError(
+            "--sparse-range is of sparse depth from a file, and there is none; leave it out"
+        )
+    if options.sparse_kind is not None:
+        raise UsageError(
+            "--sparse-kind is of sparse depth from a file, and there is none; leave it out"
+        )
     if options.sample is None:
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
+    # The points, of the part of the frame that the protocol keeps.
     seed = seed if options.sample.seed is None else options.sample.seed
-    gt, image = files.part.apply(truth.values), None if rgb is None else files.part.apply(rgb)
+    gt = files.part.apply(truth.values)
+    image = None if rgb is None else files.part.apply(rgb)
     try:
         points = sample_points(gt, options.sample, seed, image=image)
     except UsageError as error:  # the pattern itself is good, this frame is too poor for it
         raise InputError(f"{files.gt}: {error}") from error
     how = f"{options.sample.kind} of the ground truth, seed {seed}"
     reading = Reading(how, truth.reading.scale)
-    return sparse_depth.SparseDepth(
+    sampled = replace(options.sample, seed=seed)
+    return SparseDepth(
         points=points,
         reading=reading,
-        record=FileRecord(
-            path=str(files.gt), kind="sampled", sampled=replace(options.sample, seed=seed)
-        ),
+        record=FileRecord(path=str(files.gt), kind="sampled", sampled=sampled),
         notes=(f"sparse: {describe_range(points.depth, reading)}",),
     )
 
 
-def _read_sparse(
-    files: FrameFiles, options: ReadOptions, size: Size | None
-) -> sparse_depth.SparseDepth:
-    """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
-    path, image, scan = files.sparse, files.image_file, options.scan.over(files)
-    assert path is not None
-    # What it is: a COLMAP model, a scan, or else a map or a list.
-    is_model, (scale, of_integers) = path.is_dir(), _scale_of(files, options, "sparse")
-    is_scan = not is_model and scan.describes(path)
+def _check_sparse_options(files: FrameFiles, options: ReadOptions, sparse: StoredDepth) -> None:
+    """Raises UsageError for an option that is of another kind of file than the sparse depth."""
+    path = sparse.path
+    is_model = isinstance(sparse, StoredPoints) and sparse.kind == "model"
+    kind = options.sparse_kind or files.kind_of_sparse
     if options.depth_scale is not None and is_model and files.gt is None:
         raise UsageError(f"{path} is a COLMAP model; --unit-scale is its scale, not --depth-scale")
     if options.unit_scale is not None and not is_model:
-        raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply")
-    kind = options.sparse_kind or files.kind_of_sparse
-    if kind is not None and (is_model or is_scan):
-        raise UsageError(f"{path} is no depth map or list, so --sparse-kind does not apply")
+        raise UsageError(f"{path} is no COLMAP model, so --unit-scale does not apply; leave it out")
+    if kind is not None and isinstance(sparse, StoredPoints):
+        raise UsageError(
+            f"{path} is no depth map or list, so --sparse-kind does not apply; leave it out"
+        )
     if options.sparse_range and kind is not None:
-        raise UsageError("--sparse-range is of distances, and --sparse-kind of another kind")
-    if options.sparse_range and (is_model or is_scan):
-        raise UsageError(f"{path} is no depth map or list, so --sparse-range does not apply")
-    # Its points in the image.
-    if is_model:
-        if size is None or image is None:
-            raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
-        if replace(options.scan, keep_occluded=False) != ScanOptions():
-            raise UsageError(f"{path} is a COLMAP model, so the options of a scan do not apply")
-        sparse = sparse_depth.read_colmap_points(path, image, size, unit_scale=options.unit_scale)
-    elif is_scan:
-        sparse = read_scan_points(
-            path,
-            scan,
-            size,
-            image,
-            scale=scale,
-            of_integers=of_integers,
-            search=files.is_first,
+        raise UsageError(
+            "--sparse-range is of distances, and --sparse-kind of another kind; give one of them"
         )
-    else:
-        sparse = sparse_depth.read_map_points(
-            path,
-            options,
-            size,
-            scale,
-            of_integers=of_integers,
-            inverse=inverse_factor("--sparse-kind", kind),
+    if options.sparse_range and isinstance(sparse, StoredPoints):
+        raise UsageError(
+            f"{path} is no depth map or list, so --sparse-range does not apply; leave it out"
         )
-        if options.sparse_range:
-            sparse = sparse_depth.depth_of_distances(sparse, scan, image)
-    # Those that are sure enough, in the part of the frame.
-    if files.sparse_mask is not None:
-        sparse = sparse.confident(files.sparse_mask, files.min_confidence)
-    return sparse.in_part(files.part)
+
+
+def _points_of_model(
+    files: FrameFiles, options: ReadOptions, path: Path, size: Size | None
+) -> SparseDepth:
+    """The points of a COLMAP model that the image shows."""
+    if size is None or files.image_file is None:
+        raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
+    if replace(options.scan, keep_occluded=False) != ScanOptions():
+        raise UsageError(
+            f"{path} is a COLMAP model, so the options of a scan do not apply; leave them out"
+        )
+    return sparse_depth.read_colmap_points(
+        path, files.image_file, size, unit_scale=options.unit_scale
+    )
+
+
+def _points_of_numbers(
+    files: FrameFiles,
+    options: ReadOptions,
+    stored: _Stored,
+    sparse: StoredNumbers,
+    size: Size | None,
+) -> SparseDepth:
+    """The points of a depth map or a list."""
+    stated = stored_depth.scale_of_sparse(files, options, stored.truth)
+    kind = options.sparse_kind or files.kind_of_sparse
+    points = sparse_depth.read_map_points(
+        sparse,
+        options,
+        size,
+        stated.scale,
+        of_integers=stated.of_integers,
+        inverse=inverse_factor("--sparse-kind", kind),
+    )
+    if not options.sparse_range:
+        return points
+    return sparse_depth.depth_of_distances(points, options.scan.over(files), files.image_file)
+
+
+class _Predicted(NamedTuple):
+    """A depth map of a network, in the part of the frame that the protocol keeps."""
+
+    values: NDArray[np.float32]
+    source: _Source
+
+
+def _read_predicted(files: FrameFiles, stored: _Stored, size: Size) -> list[_Predicted]:
+    """The depth maps of networks, which are resized to the whole image."""
+    found = list[_Predicted]()
+    for path in files.depths:
+        network = read_predicted_depth(path, stored.size or size, stored.rgb)
+        values = np.ascontiguousarray(files.part.apply(network.values))
+        found.append(_Predicted(values, _Source(network.source, network.notes)))
+    return found
+
+
+def _sources_of(
+    stored: _Stored, truth: _Truth | None, sparse: SparseDepth, predicted: Sequence[_Predicted]
+) -> Mapping[str, _Source]:
+    """The files of a frame by what they are of, in the order of records and lines."""
+    sources = dict[str, _Source]()
+    if stored.image is not None:
+        sources["image"] = stored.image
+    sources["sparse"] = _Source(sparse.record, sparse.notes)
+    for number, network in enumerate(predicted, 1):
+        name = "depth" if len(predicted) == 1 else f"depth {number}"
+        sources[name] = network.source
+    if truth is not None:
+        sources["gt"] = truth.source
+    return sources
 
 
 def _orientation_warning(
@@ -334,7 +462,8 @@ def _camera_of(
     files: FrameFiles, options: ReadOptions, known: Camera | None, size: Size, is_needed: bool
 ) -> tuple[Camera | None, list[str]]:
     """The camera of a frame's part, None if unknown; it is from EXIF only where it is needed."""
-    image, scan = files.image_file, options.scan.over(files)
+    image = files.image_file
+    scan = options.scan.over(files)
     notes = list[str]()
     if known is None and scan.calib is not None:
         known, notes = arrays.camera_of_file(scan.calib, scan.camera, size, image)
@@ -346,10 +475,23 @@ def _camera_of(
 
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
     """The points of another frame of the sequence, read or sampled as it does itself."""
-    if files.sparse is not None:
-        return _read_sparse(replace(files, is_first=False), options, size).points
-    rgb, truth, _ = _read_pixels(files, options)
-    return _sample_sparse(files, options, rgb, truth, seed).points
+    if files.sparse is None:
+        stored = _read_stored(files, options)
+        return _sample_sparse(
+            files, options, stored.rgb, _truth_of(files, options, stored), seed
+        ).points
+    # Of its other files, nothing is needed but whether a scale is of the ground truth's integers.
+    truth = None
+    if options.depth_scale is not None and files.gt is not None:
+        truth = stored_depth.read_stored_truth(files.gt, files.image)
+    stored = _Stored(
+        rgb=None,
+        image=None,
+        truth=truth,
+        sparse=stored_depth.read_stored_sparse(files.sparse, options.scan.over(files)),
+    )
+    later = replace(files, is_first=False)
+    return _sparse_of(later, options, stored, None, size, seed).points
 
 
 def _hold_out(
@@ -373,7 +515,7 @@ def _compare(
     options: ReadOptions,
     gt: NDArray[np.float32],
     reading: Reading,
-    sparse: sparse_depth.SparseDepth,
+    sparse: SparseDepth,
     points: SparsePoints,
 ) -> list[str]:
     """Warnings on ground truth and sparse depth that seem to be of two scales, or one."""
@@ -392,7 +534,8 @@ def _compare(
             f" {reading.scale:g} if it is right"
         ]
     notes = list[str]()
-    depth, known = points.scatter()[0, 0].numpy(), int((gt > 0).sum())
+    depth = points.scatter()[0, 0].numpy()
+    known = int((gt > 0).sum())
     leaked = int(((gt > 0) & (depth == gt)).sum())
     if leaked >= _LEAK_FRACTION * known:
         notes.append(

@@ -23,26 +23,44 @@ from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.edge_fit import EdgeMap, Jumps, edge_map, jumps_of
 from pnpdepth_cli.sensors.projection import points_in_image
 
-_MOST_TURN_DEG = 9.0  # about the camera's x and y
-_LEAST_TURN_DEG = 1.0  # below, a calibration is taken for inexact
+_MOST_TURN_DEG = 9.0
+"""About the camera's x and y."""
+_LEAST_TURN_DEG = 1.0
+"""Below, a calibration is taken for inexact."""
 _MOST_ROLL_DEG = 10.0
-_MOST_AHEAD_M = 3.0  # 0.1 s at 30 m/s
-_LEAST_AHEAD_M = 0.5  # 0.1 s at 5 m/s
-_TALLEST = 1 / 3  # of the image's height, by which points are shifted at most
+"""About the camera's axis."""
+_MOST_AHEAD_M = 3.0
+"""0.1 s at 30 m/s."""
+_LEAST_AHEAD_M = 0.5
+"""0.1 s at 5 m/s."""
+_TALLEST = 1 / 3
+"""Of the image's height, by which points are shifted at most."""
 _ROLLS_DEG = np.arange(-5.0, 5.1, 0.5)
-_RESIZED = 0.1  # log ratio of the image's size and twice the principal point
-_SAME_RATIO = 0.12  # of the two sides' such ratios, where an image was resized
-_ABOUT = np.linspace(0.88, 1.12, 97)  # times that ratio, as principal points are not in the middle
+"""Turns about the camera's axis that are tried with each turn about x and y."""
+_RESIZED = 0.1
+"""Log ratio of the image's size and twice the principal point, of an image that was resized."""
+_SAME_RATIO = 0.12
+"""Difference of the two sides' such log ratios, where an image was resized."""
+_ABOUT = np.linspace(0.88, 1.12, 97)
+"""Times that ratio, as principal points are not in the middle."""
 
-_COARSE = 0.4  # of the largest weight, of jumps that are looked at first
-_AS_IT_IS = np.zeros(4)  # a pose: degrees about x, y and z, and m ahead
-_INEXACT = np.array([0.5, 0.5, 0.5, 0.3])  # of such a pose, which a right calibration may be off
+_COARSE = 0.4
+"""Of the largest weight, of jumps that are looked at first."""
+_AS_IT_IS = np.zeros(4)
+"""A pose: degrees about the camera's x, y and z, and metres ahead."""
+_INEXACT = np.array([0.5, 0.5, 0.5, 0.3])
+"""Such a pose, which a right calibration may be off."""
 _PEAKS = 3
-_GOOD = 5.0  # score from which axes, cameras and mirrors are not looked at
+"""Best shifts, from which turns are looked for."""
+_GOOD = 5.0
+"""Score from which axes, cameras and mirrors are not looked at."""
 
-_SOME_JUMPS = 60  # fewer tell nothing
+_SOME_JUMPS = 60
+"""Jumps of depth; fewer tell nothing."""
 _MANY_JUMPS = 250
-_BY_CHANCE = 2.5  # a scan of many jumps that belongs to its image has more
+"""Jumps of depth, from which less is needed."""
+_BY_CHANCE = 2.5
+"""Score; a scan of many jumps that belongs to its image has more."""
 
 
 class _Needed(NamedTuple):
@@ -65,7 +83,8 @@ _NEEDED = {
     "other": _Needed(score=4.5, more=1.5),
     "size": _Needed(score=4.5, more=1.5),
 }
-_NEEDED_OF_FEW = {  # by scans of less than many jumps
+# By scans of less than many jumps:
+_NEEDED_OF_FEW = {
     "turn": _Needed(score=7.0, more=4.5),
     "roll": _Needed(score=6.0, more=3.0),
     "late": _Needed(score=5.5, more=3.0),
@@ -350,8 +369,8 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
 
 def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
     """Calibrations of other axes of the scan, of the inverse pose, and the others."""
-    assert own.scanner is not None
-    readings = {"with the extrinsics inverted": replace(own, scanner=own.scanner.inverse())}
+    scanner = own.known_scanner
+    readings = {"with the extrinsics inverted": replace(own, scanner=scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (
@@ -362,8 +381,8 @@ def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict
         ("with x and y of the scan exchanged", np.eye(3)[[1, 0, 2]]),
         ("with the scan turned by 180° about z", np.diag([-1.0, -1.0, 1.0])),
     ):
-        scanner = own.scanner @ Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
-        readings[text] = replace(own, scanner=scanner)
+        changed = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
+        readings[text] = replace(own, scanner=scanner @ changed)
     return readings | dict(others)
 
 
@@ -371,12 +390,11 @@ def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) 
     """Returns how many points of a scan (N, 3) are in the image (H, W), by other axes of it."""
     found = dict[str, int]()
     for text, reading in _other_readings(own, {}).items():
-        assert reading.scanner is not None
-        found[text] = len(points_in_image(reading.scanner.apply(scan), reading.camera, size)[0])
+        seen = reading.known_scanner.apply(scan)
+        found[text] = len(points_in_image(seen, reading.camera, size)[0])
     return found
 
 
 def _jumps(scan: NDArray[np.floating], reading: Calibration, size: Size) -> Jumps | None:
     """The jumps of depth of the scan (N, 3) that are in the image (H, W)."""
-    assert reading.scanner is not None
-    return jumps_of(scan, reading.camera, reading.scanner, size)
+    return jumps_of(scan, reading.camera, reading.known_scanner, size)

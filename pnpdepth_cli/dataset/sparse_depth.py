@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from pnpdepth_cli.dataset.plausible import (
     named,
 )
 from pnpdepth_cli.dataset.range_ends import far_values
+from pnpdepth_cli.dataset.stored_depth import StoredNumbers
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.colmap_model import (
@@ -28,7 +30,7 @@ from pnpdepth_cli.io.colmap_model import (
     name_in_model,
     read_model,
 )
-from pnpdepth_cli.io.depth import describe_range, read_sparse
+from pnpdepth_cli.io.depth import describe_range, points_from_stored
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, DepthFile, Reading
 from pnpdepth_cli.points import METRES, MODEL_UNITS, Size, in_frame
@@ -36,6 +38,7 @@ from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.projection import (
     DropCounter,
+    Mask,
     Points,
     as_depth_image,
     behind_foreground,
@@ -45,8 +48,8 @@ from pnpdepth_cli.sensors.projection import (
     pixel_index,
 )
 
-# A 16-bit file in model units holds depths up to at least so many times the model's extent.
 _SIZES_IN_RANGE = 8.0
+"""A 16-bit file in model units holds depths up to at least so many times the model's extent."""
 _FEW_TO_HIDE = 100  # points; so few are no surface that could hide others
 _LEAST_TRACK = 3  # images that observe a point: two rays meet anywhere along one of them
 _MOST_REPROJECTION_PX = 2.0  # mean error of a point; COLMAP itself keeps up to 4 pixels
@@ -79,22 +82,22 @@ class SparseDepth:
         size = (levels.shape[0], levels.shape[1])
         arrays.check_same_view(str(path), size, self.points.size)
         pixel = pixel_index(self.points.resized(*size).xy, (size[0], size[1]))
-        own = levels.ravel()[pixel.clip(0, levels.size - 1)]
-        kept = own > 0 if least is None else own >= least
-        numbers = own[~np.isnan(own)]
-        given = f"{numbers.min():g} to {numbers.max():g}" if len(numbers) else "no number"
-        if 0 < len(numbers) < len(own):
-            given += f", and no number to {len(own) - len(numbers):,} of them"
+        levels_of_points = levels.ravel()[pixel.clip(0, levels.size - 1)]
+        kept = levels_of_points > 0 if least is None else levels_of_points >= least
+        # How many there are, of which confidence: a line for a person, or why none is left.
+        numbers = levels_of_points[~np.isnan(levels_of_points)]
+        extent = f"{numbers.min():g} to {numbers.max():g}" if len(numbers) else "no number"
+        if 0 < len(numbers) < len(kept):
+            extent += f", and no number to {len(kept) - len(numbers):,} of them"
         fact = (
-            f"{np.count_nonzero(kept):,} of {len(own):,} points have a confidence"
+            f"{np.count_nonzero(kept):,} of {len(kept):,} points have a confidence"
             f" {'above 0' if least is None else f'of {least:g} or more'} in {path},"
-            f" which gives them {given}"
+            f" which gives them {extent}"
         )
+        if not kept.any() and (least is None or not len(numbers)):
+            raise NoPointsError(f"{fact}; use another mask")
         if not kept.any():
-            way_out = "lower --min-confidence"
-            if least is None or not len(numbers):
-                way_out = "use another mask"
-            raise NoPointsError(f"{fact}; {way_out}")
+            raise NoPointsError(f"{fact}; lower --min-confidence")
         dropped = self.record.dropped | {"of low confidence": int((~kept).sum())}
         record = replace(self.record, mask=str(path), least=least, dropped=dropped)
         notes = (*self.notes, f"sparse: {fact}")
@@ -104,13 +107,24 @@ class SparseDepth:
         """Returns the points in a part of the frame. Raises NoPointsError if there is none."""
         points = part.points_in_crop(self.points)
         if not len(points):
-            fact = f"none of its {len(self.points)} points lies in the image"
-            raise NoPointsError(f"{self.record.path}: {fact}")
+            raise NoPointsError(
+                f"{self.record.path}: none of its {len(self.points)} points lies in the image"
+            )
         return replace(self, points=points)
 
 
+class _Visible(NamedTuple):
+    """The points of a map that the camera sees."""
+
+    points: Points
+    dropped: dict[str, int]
+    """Number of the others, by the reason."""
+    lines: list[str]
+    """Lines on these, for a person."""
+
+
 def read_map_points(
-    path: Path,
+    stored: StoredNumbers,
     options: ReadOptions,
     size: Size | None,
     scale: float | None,
@@ -121,7 +135,7 @@ def read_map_points(
     """Returns the points of a depth map or a list that the camera sees.
 
     Args:
-        path: The file.
+        stored: The file, and the numbers in it.
         options: Which occluded points go.
         size: (H, W) of the image; None for the map's own.
         scale: Numbers per metre that the user states. None: the file's own.
@@ -129,44 +143,37 @@ def read_map_points(
         inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
 
     Raises:
-        InputError: The file cannot be read, or its numbers are no depth of this image.
+        InputError: Its numbers are no depth of this image.
     """
     # The points as they are stored, without far values.
-    points, reading = read_sparse(path, size=size, scale=scale)
+    path = stored.path
+    points, reading = points_from_stored(path, stored.file, size=size, scale=scale)
     if inverse is not None:
-        stored = DepthFile(values=points.depth, reading=reading)
-        of_kind = arrays.depth_of_inverse(stored, inverse, scale)
-        # these are metres now, of which no scale is stated
-        scale, reading = None, of_kind.reading
+        numbers = DepthFile(values=points.depth, reading=reading)
+        of_kind = arrays.depth_of_inverse(numbers, inverse, scale)
+        # These are metres now, of which no scale is stated.
+        scale = None
+        reading = of_kind.reading
         points = replace(points, depth=of_kind.values).select(of_kind.values > 0)
     far, lines = far_values(points.depth)
     points = points.select(~far)
-    depth, own = points.depth, points.size
-    is_map = bool((points.xy == np.floor(points.xy)).all() and in_frame(points.xy, own).all())
-    size = size or own
-    arrays.check_same_view(str(path), own, size)
+    size_of_file = points.size
+    size = size or size_of_file
+    arrays.check_same_view(str(path), size_of_file, size)
     # What a person should know of them.
-    lines = [describe_range(depth, reading), *lines]
-    lines += [arrays.moved_note(own, size)] if own != size else []
-    if inverse is None and is_map:
+    lines = [describe_range(points.depth, reading), *lines]
+    if size_of_file != size:
+        lines.append(arrays.moved_note(size_of_file, size))
+    if inverse is None and _is_map(points):
         blurred = interpolation_warning(as_depth_image(points))
-        lines += [] if blurred is None else [blurred]
+        if blurred is not None:
+            lines.append(blurred)
     # Points that the camera does not see go.
-    hidden, dropped = None, dict[str, int]()
-    if options.foreground is not None:
-        hidden, why = behind_foreground(points, *options.foreground), "behind the foreground"
-        said = "dropped {:,} points behind others, as the protocol does"
-    elif not options.scan.keep_occluded:
-        hidden, why = occluded_in_map(points), "hidden by foreground"
-        said = (
-            "a projected LiDAR scan; dropped {:,} points occluded from the camera by nearer ones;"
-            " --method paper keeps them"
-        )
-    if hidden is not None and hidden.any():
-        points, dropped = points.select(~hidden), {why: int(hidden.sum())}
-        lines.append(said.format(dropped[why]))
-    # The others must be pixels of the image, and plausible in metres.
-    points = points.resized(*size)
+    visible = _visible_points(points, options)
+    lines += visible.lines
+    # The others must be pixels of the image, and all of them plausible in metres.
+    depth = points.depth
+    points = visible.points.resized(*size)
     inside, of_pixels = check_pixels(path, points.xy, size)
     divisor, warnings = divisor_to_metres(
         depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
@@ -177,9 +184,39 @@ def read_map_points(
     return SparseDepth(
         points=replace(points, depth=points.depth / np.float32(divisor)),
         reading=reading,
-        record=replace(arrays.record_of(path, reading), dropped=dropped),
+        record=replace(arrays.record_of(path, reading), dropped=visible.dropped),
         notes=(*(named("sparse", line) for line in lines), *of_pixels, *warnings),
     )
+
+
+def _is_map(points: Points) -> bool:
+    """Whether all points are pixels of the image."""
+    are_whole = bool((points.xy == np.floor(points.xy)).all())
+    return are_whole and bool(in_frame(points.xy, points.size).all())
+
+
+def _visible_points(points: Points, options: ReadOptions) -> _Visible:
+    """The points without those that nearer ones hide from the camera."""
+    if options.foreground is not None:
+        hidden: Mask | None = behind_foreground(points, *options.foreground)
+        reason = "behind the foreground"
+    elif not options.scan.keep_occluded:
+        hidden = occluded_in_map(points)
+        reason = "hidden by foreground"
+    else:
+        return _Visible(points, {}, [])
+    # Only maps of projected scans have hidden points.
+    if hidden is None or not hidden.any():
+        return _Visible(points, {}, [])
+    count = int(hidden.sum())
+    if options.foreground is not None:
+        line = f"dropped {count:,} points behind others, as the protocol does"
+    else:
+        line = (
+            f"a projected LiDAR scan; dropped {count:,} points occluded from the camera by nearer"
+            " ones; --method paper keeps them"
+        )
+    return _Visible(points.select(~hidden), {reason: count}, [line])
 
 
 def depth_of_distances(sparse: SparseDepth, scan: ScanOptions, image: Path | None) -> SparseDepth:
@@ -229,9 +266,10 @@ def read_colmap_points(
     # The image in the model, whose camera must have the photo's view.
     model = read_model(path)
     name = name_in_model(model, image)
-    camera, pose = model.images[name].camera, model.images[name].pose.inverse()
-    assert camera.size is not None  # of every camera of a model
-    arrays.check_same_view(f"the camera of {image} in {model.folder}", camera.size, size)
+    camera = model.images[name].camera
+    pose = model.images[name].pose.inverse()
+    camera_size = _size_of(camera)
+    arrays.check_same_view(f"the camera of {image} in {model.folder}", camera_size, size)
     # Its points, without far values.
     points, notes = _points_in(model, name, unit_scale or 1.0)
     dropped = points.dropped
@@ -244,8 +282,8 @@ def read_colmap_points(
         scale=_output_scale(model) if unit == MODEL_UNITS else None,
     )
     notes = [f"sparse: {describe_range(points.depth, reading, unit=unit)}", *notes]
-    if camera.size != size:
-        notes.append(f"sparse: {arrays.moved_note(camera.size, size)}")
+    if camera_size != size:
+        notes.append(f"sparse: {arrays.moved_note(camera_size, size)}")
     if camera.has_lens:
         notes.append("sparse: lens distortion is applied to the points; the image stays distorted")
     if lost := describe_dropped(dropped):
@@ -272,18 +310,27 @@ def read_colmap_points(
     )
 
 
+def _size_of(camera: Camera) -> Size:
+    """The size (H, W) of the images of a camera of a model, of which each states one."""
+    if camera.size is None:
+        raise InputError(f"{camera.source} states no size of its images; export the model again")
+    return camera.size
+
+
 def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points, list[str]]:
     """The points of an image, in its camera's size, that pass the filters; lines for a person."""
-    image, points = model.images[name], model.points
+    image = model.images[name]
+    points = model.points
     camera = image.camera
-    assert camera.size is not None
+    camera_size = _size_of(camera)
     # The points of the image's tracks, else all.
     row = np.flatnonzero(np.isin(points["number"], image.points))
     untracked = not len(row)
     if untracked:
         row = np.arange(len(points["number"]))
     # Points of short tracks and with large reprojection errors go.
-    total, drops = len(row), DropCounter()
+    total = len(row)
+    drops = DropCounter()
     least = min(_LEAST_TRACK, len(model.images))
     if points["track"].any():
         row = row[drops.keep(points["track"][row] >= least, f"seen in fewer than {least} images")]
@@ -298,7 +345,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
             " model is damaged, or its poses are inverted"
         )
     seen = seen[front]
-    seen, xy = drops.keep_seen(seen, camera, camera.size)
+    seen, xy = drops.keep_seen(seen, camera, camera_size)
     # Without tracks, nothing else tells which points the camera sees.
     notes = list[str]()
     if untracked and len(xy) < _FEW_TO_HIDE:
@@ -307,7 +354,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
             " hidden by others, so all are used"
         ]
     elif untracked:
-        visible = drops.keep(~hidden_among(xy, seen[:, 2], camera.size), "hidden by foreground")
+        visible = drops.keep(~hidden_among(xy, seen[:, 2], camera_size), "hidden by foreground")
         seen, xy = seen[visible], xy[visible]
         notes = [f"sparse: {name} has no tracks; all {total:,} points of the model are projected"]
     # What is left must be some.
@@ -316,7 +363,7 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
             f"none of the {total:,} points of {name!r} in {model.folder} is left ({drops});"
             " register it with more matches"
         )
-    return drops.points(seen * unit_scale, xy, camera.size), notes
+    return drops.points(seen * unit_scale, xy, camera_size), notes
 
 
 def _output_scale(model: ColmapModel) -> float:

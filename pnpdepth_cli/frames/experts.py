@@ -21,26 +21,20 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW, OpenNetwork
-from pnpdepth_cli.frames.validation import MIN_POINTS, ValidatedFrame, log_of
+from pnpdepth_cli.frames.strength import Judged, strength_of, trust_in_image, unexplained_by
+from pnpdepth_cli.frames.validation import ValidatedFrame
 from pnpdepth_cli.measures import LINEAR
 from pnpdepth_cli.points import SparsePoints
 
 # Prior weights were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms and streets with
-# each set left out in turn (docs/notes/fusion.md).
+# each set left out in turn (docs/notes/fusion.md). What a network is worth is in `strength`.
 OWN = 0.15
 """Prior weight of a network that explains the points."""
 OWN_STRONG = 0.5
 """The same of a strong network."""
-STRONG = 0.5
-"""Leave-one-out error at the points of a network's depth, its residual propagated, over that of a
-constant depth, up to which a network is strong. Networks of 2 to 9 % error have 0.1 to 0.4 in the
-median, FastDepth 0.95, random weights 1.1."""
-WEAK = 0.8
-"""The same quotient, from which on a network is not strong at all."""
 LEAST_UNEXPLAINED = 0.02
-"""Least such quotient. Several networks share the prior weights by its inverse square."""
-FITTED = 2
-"""Parameters of an alignment, which explain so many points by themselves."""
+"""Least part that a network leaves unexplained (`strength.unexplained_by`). Several networks share
+the prior weights by its inverse square."""
 HARMFUL = 1.05
 """Error at the validation points with updates of z, over that without, from which on updates that
 the user states are not used."""
@@ -48,12 +42,6 @@ WITH_PRIOR = 0.45
 """Prior weight of `compact` with that network's depth as a prior. Without one it has the rest."""
 WITHOUT_IMAGE = 0.05
 """Prior weight of every expert that leaves the image out."""
-USELESS = 0.25
-"""Fraction of the variance of log depth that a network explains at points that its alignment was
-not fitted to, up to which it has no prior weight. A network of random weights has less than this in
-86 % of the runs with 20 points, 97 % with more."""
-USEFUL = 0.75
-"""The same fraction, from which on it has all of its prior weight."""
 DOUBT = 2.0
 """Standard errors by which the image lowers the error at the validation points, from which on no
 expert that leaves the image out joins."""
@@ -107,24 +95,6 @@ class NetworkExpert(Expert):
         if self.mirrored is None:
             return _mix_with_aligned(self.whole, self.not_updated)
         return weighted_mean([(self.whole.updated, 1), (self.mirrored, 1)])
-
-
-class Judged(NamedTuple):
-    """A frame without its outliers, as one of its networks told them."""
-
-    network: OpenNetwork
-    """The network that judged."""
-    inliers: Frame
-    prediction: Prediction
-    """What that network gives for them."""
-    field: ResidualField | None = None
-    """Residual field of its aligned depth at all points. None: outliers were not sought."""
-    constant: ResidualField | None = None
-    """Residual field of a constant depth at all points, likewise."""
-
-    def by(self, network: OpenNetwork) -> Prediction | None:
-        """Returns what this network gives for the inliers, if it judged."""
-        return self.prediction if network is self.network else None
 
 
 class Experts(NamedTuple):
@@ -193,18 +163,16 @@ def expert_of(
     if len(split.points):
         again = network.tuned or network.always_updated or not network.takes_points
         of_kept = network.refine(kept, updates=updates and again and not_updated < 1)
-        field = ResidualField(_mix_with_aligned(of_kept, not_updated), kept.points, kept.rgb)
-        at = field.depth(split.points.xy, kind=split.propagation)
+        at = _at_validation_points(_mix_with_aligned(of_kept, not_updated), split, kept)
         updated = split.points.sample(of_kept.updated)
         # Updates that the user states may do harm, such as at a layer near to the depth.
         if network.tuned and of_kept.updates and not_updated < 1:
-            field_without = ResidualField(of_kept.aligned, kept.points, kept.rgb)
-            at_without = field_without.depth(split.points.xy, kind=split.propagation)
-            error_without = split.error(at_without)
+            without = _at_validation_points(of_kept.aligned, split, kept)
+            error_without = split.error(without)
             error_with = split.error(at)
             if error_with > HARMFUL * error_without:
                 harm = (error_without, error_with)
-                at = at_without
+                at = without
                 not_updated = 1.0
     return NetworkExpert(
         name=name,
@@ -220,6 +188,12 @@ def expert_of(
         not_updated=not_updated,
         harm=harm,
     )
+
+
+def _at_validation_points(dense: Tensor, split: ValidatedFrame, kept: Frame) -> Tensor:
+    """(M,) a depth (H, W) at the validation points, its residual at the others propagated."""
+    field = ResidualField(dense, kept.points, kept.rgb)
+    return field.depth(split.points.xy, kind=split.propagation)
 
 
 def expert_of_user(
@@ -256,51 +230,6 @@ def expert_of_user(
         updates=updates,
         unexplained=unexplained,
     )
-
-
-def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
-    """Returns what a network that takes the image alone leaves unexplained, by all points.
-
-    It is the error with which its aligned depth, the residual propagated, predicts each point from
-    the others, over that of a constant depth, whose residual follows position and colour alone. It
-    is 1 on scan lines, where each point has a neighbour on its line, so that it says nothing.
-
-    The alignment was fitted to all points. So the error of N points is multiplied by
-    (N − 1) / (N − 1 − FITTED), as in the unbiased estimate of a variance.
-
-    Args:
-        aligned: (H, W) metres, 0 = unknown, the network's depth.
-        split: The frame and its validation points.
-        judged: How its outliers were told.
-    """
-    points = split.whole.points
-    known = int((points.sample(aligned) > 0).sum())
-    if split.has_scan_lines or known < MIN_POINTS or judged.constant is None:
-        return 1.0
-    field = judged.field
-    if field is None or not field.is_of(aligned, points):
-        field = ResidualField(aligned, points, split.whole.rgb)
-    return unexplained_of(field, judged.constant)
-
-
-def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
-    """Returns what a depth leaves unexplained, see `unexplained_by`; 1 with too few points.
-
-    Args:
-        field: Residual field of the depth.
-        constant: Residual field of a constant depth at the same points.
-    """
-    count = len(field.at_points.points)
-    if count < MIN_POINTS:
-        return 1.0
-    of_depth = field.at_inliers.leave_one_out_error
-    of_constant = constant.at_inliers.leave_one_out_error
-    return of_depth / max(of_constant, 1e-9) * (count - 1) / (count - 1 - FITTED)
-
-
-def strength_of(unexplained: float) -> float:
-    """Returns 0…1, how strong a network is that leaves so much unexplained."""
-    return min(1.0, max(0.0, (WEAK - unexplained) / (WEAK - STRONG)))
 
 
 def _mix_with_aligned(prediction: Prediction, not_updated: float) -> Tensor:
@@ -407,36 +336,6 @@ def trust(
         return 0.0
     ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
     return min(1.0, max(0.0, 2.0 - ratio))
-
-
-def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
-    """Returns 0…1, the trust in a network that takes the image alone, by what it explains.
-
-    Its aligned depth explains a fraction of the variance of log depth. The fraction is
-    1 − PRESS / SS, by a line through the other points (Allen, "The relationship between variable
-    selection and data augmentation and a method for prediction", 1974).
-
-    Args:
-        aligned: (H, W) metres, 0 = unknown, the network's depth, z not updated.
-        points: The frame's points without outliers.
-    """
-    # x is its log depth at the points, y theirs.
-    at = points.sample(aligned).double()
-    x = log_of(at[at > 0])
-    y = log_of(points.depth[at > 0].double())
-    count = len(x)
-    if count < MIN_POINTS:
-        return 0.0
-    x = x - x.mean()
-    y = y - y.mean()
-    slope = (x @ y) / (x @ x).clamp_min(1e-12)
-    if slope <= 0:
-        return 0.0  # it says that far is near
-    # Errors at each point of a line through the others, and of their mean.
-    left_out = (y - slope * x) / (1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12))
-    total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
-    explained = float(1 - left_out.square().sum() / total)
-    return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))
 
 
 def _with_blind_expert(fusing: OpenNetwork, split: ValidatedFrame, experts: Experts) -> Experts:

@@ -14,11 +14,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli import errors
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.refine_z import Refinement, refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.core.split.replay import Run, intercepted
+from pnpdepth_cli.errors import (
+    DivergedError,
+    NoPointsError,
+    out_of_memory_is_a_device_error,
+    wrap_user_errors,
+)
 from pnpdepth_cli.frames.frame import Frame, Prediction, is_dense
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import AlignedDepth, Network
@@ -145,13 +150,17 @@ class OpenNetwork:
         network = self.network
         settings = self.settings
         diverged = None
-        with errors.out_of_memory_is_a_device_error(network.device):
+        with out_of_memory_is_a_device_error(network.device):
             # The frame is made the network's input, and its output is read as metres.
             prepared = prepare(network, frame)
             if not len(prepared.points):
-                seen = f"{prepared.map.crop}, the rows and columns that network {self.name!r} sees"
-                fact = f"none of the {len(frame.points)} sparse points lies in {seen}"
-                raise errors.NoPointsError(fact)
+                top, left, height, width = prepared.map.crop
+                raise NoPointsError(
+                    f"none of the {len(frame.points)} sparse points lies in rows {top} to"
+                    f" {top + height - 1} and columns {left} to {left + width - 1}, which is what"
+                    f" network {self.name!r} sees of the image; use another network, or crop the"
+                    " image"
+                )
             reader = AlignedDepth(network, prepared.points, settings.align)
             try:
                 # Without updates one pass of the whole network is enough.
@@ -167,13 +176,15 @@ class OpenNetwork:
                             depth_of=reader, z0=z0,
                         )  # fmt: skip
                     if at_full_size:
-                        before, after = reader(at_full_size[0]), reader(at_full_size[-1])
+                        before = reader(at_full_size[0])
+                        after = reader(at_full_size[-1])
                         result = replace(result, before=before, after=after)
-            except errors.DivergedError as error:
+            except DivergedError as error:
                 # A refinement that diverges ends with its last good depth.
                 if error.last_good is None:
                     raise
-                diverged, result = error, error.last_good
+                diverged = error
+                result = error.last_good
         aligned = updated = prepared.to_image(result.before)
         if result.after is not result.before:
             updated = prepared.to_image(result.after)
@@ -205,7 +216,7 @@ class OpenNetwork:
             output = self.cut().rear(self._front(prepared))
         elif output is None:
             # A network whose z is never updated need not be cut.
-            with errors.wrap_user_errors("the network's forward"):
+            with wrap_user_errors("the network's forward"):
                 output = self.network.module(*prepared.arguments)
         self._output = output if self._of_image_only else None
         return output
@@ -229,7 +240,8 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
-    prior, camera = None, frame.camera
+    prior = None
+    camera = frame.camera
     if frame.prior is not None and network.definition.takes_prior:
         prior = to_network.prior_to_network(frame.prior[None, None]).to(network.device)
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)

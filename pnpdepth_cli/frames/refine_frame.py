@@ -18,17 +18,15 @@ from pnpdepth_cli.completion.outliers import far_points
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.experts import (
     Experts,
-    Judged,
     fused_experts,
     networks_alone,
-    strength_of,
-    unexplained_of,
     weighted_mean,
     with_mirrored,
 )
 from pnpdepth_cli.frames.frame import Frame, Refined, Validation, is_dense
 from pnpdepth_cli.frames.fuse import Share, fit_weights, shares_on_lines, with_shares
 from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
+from pnpdepth_cli.frames.strength import Judged, strength_of, unexplained_of
 from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
 from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 

@@ -11,9 +11,14 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from pnpdepth_cli import errors
 from pnpdepth_cli.core.influence import Field, influential_fields
 from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.errors import (
+    ModelError,
+    NoPointsError,
+    UsageError,
+    out_of_memory_is_a_device_error,
+)
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
 from pnpdepth_cli.models.decisions import recalled_layers
@@ -79,8 +84,9 @@ def resolve_definition(
     Raises:
         ModelError: The network's own check fails.
     """
-    definition, notes = network.definition, list(network.notes)
-    with errors.out_of_memory_is_a_device_error(network.device):
+    definition = network.definition
+    notes = list(network.notes)
+    with out_of_memory_is_a_device_error(network.device):
         if definition.normalisation is None and frame.rgb is not None:
             with spent_on("input range"):
                 network, note = _with_best_input_range(network, [frame, *more_frames()])
@@ -111,7 +117,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
     enough = min(wanted_field(frame.network, point_count), *frame.network)
 
     def decide() -> list[str]:
-        with errors.out_of_memory_is_a_device_error(network.device):
+        with out_of_memory_is_a_device_error(network.device):
             arguments = network.synthetic_arguments(frame)
             fields = fields_of(network, arguments, definition.layers)
             ordered = _by_preference(definition.layers, fields, enough)
@@ -128,7 +134,7 @@ def _first_usable(
 ) -> str | None:
     """The first of the layers that the network can be cut at."""
     for layer in layers:
-        with suppress(errors.ModelError), Split(module, layer) as split, torch.no_grad():
+        with suppress(ModelError), Split(module, layer) as split, torch.no_grad():
             split.rear(split.front(*arguments))
             return layer
     return None
@@ -179,7 +185,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """
     wanted = layer if layer is not None else definition.default_layer
     if wanted is None:
-        raise errors.UsageError(
+        raise UsageError(
             f"network {definition.name!r} has no default layer; name one of those that"
             " `pnpdepth layers` lists"
         )
@@ -188,8 +194,10 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     except ValueError:
         return wanted
     if not 0 <= fraction <= 1 or not definition.layers:
-        listed = f"the {len(definition.layers)} layers in the definition of {definition.name!r}"
-        raise errors.UsageError(f"layer {wanted!r}: a number is a fraction 0…1 of {listed}")
+        raise UsageError(
+            f"layer {wanted!r}: a number is a fraction 0…1 of the {len(definition.layers)} layers"
+            f" in the definition of {definition.name!r}; give one of these, or a layer's name"
+        )
     return definition.layers[round(fraction * (len(definition.layers) - 1))]
 
 
@@ -261,13 +269,17 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
+    """The network with the input range whose prediction fits the points best, and a line on it."""
     candidates = {name: with_input_range(network, name) for name in NORMALISATIONS}
-    misfits = {name: _mean_alignment_error(each, frames) for name, each in candidates.items()}
+    misfits = {
+        name: _mean_alignment_error(candidate, frames) for name, candidate in candidates.items()
+    }
     chosen, rival = choose_input_range(misfits)
     listed = ", ".join(f"{name} {error:.1%}" for name, error in misfits.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
-    unsure, hint = "", "`normalise` changes it"
+    unsure = ""
+    hint = "`normalise` changes it"
     if rival is not None:
         hint = f"`normalise` {chosen} confirms it, {rival} is the next likely"
         unsure = ", unsure"
@@ -296,7 +308,8 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
 
     Frames without points in the network's view are left out; infinite where the network fails.
     """
-    definition, misfits = network.definition, list[float]()
+    definition = network.definition
+    misfits = list[float]()
     for frame in frames:
         try:
             prepared = prepare(network, frame)
@@ -306,8 +319,8 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
             at_points = points.sample(network.raw_of(output).cpu())
             lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
             misfits.append(align_output(definition, at_points, points, "auto").error + lost)
-        except errors.NoPointsError:
+        except NoPointsError:
             continue
-        except errors.ModelError:
+        except ModelError:
             return float("inf")
     return sum(misfits) / len(misfits) if misfits else float("inf")

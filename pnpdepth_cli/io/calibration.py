@@ -82,6 +82,16 @@ class Calibration:
 
     Each has the pose of `camera` in its coordinates."""
 
+    @property
+    def known_scanner(self) -> Extrinsics:
+        """The pose of the scanner. Raises UsageError if it is not known."""
+        if self.scanner is None:
+            raise UsageError(
+                f"{self.camera.source} has no pose of the scanner; add it (R and t, Tr,"
+                " T_camera_lidar), or give --extrinsics FILE"
+            )
+        return self.scanner
+
 
 class _Fields:
     """The named values of a calibration file."""

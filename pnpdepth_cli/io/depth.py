@@ -146,17 +146,13 @@ def _scale_beside(path: Path) -> float | None:
     return float(scale)
 
 
-def holds_integers(path: Path, *, of_scale: float | None = None) -> bool:
-    """Returns whether a file holds depth as integers, which need a scale.
+def holds_integers(stored: DepthFile, *, of_scale: float | None = None) -> bool:
+    """Returns whether stored numbers are depth as integers, which need a scale.
 
     Args:
-        path: The file.
+        stored: The numbers, as `load_numbers` returns them.
         of_scale: A scale that is stated. Integers of another one that their file states need none.
-
-    Raises:
-        InputError: The file cannot be read.
     """
-    stored, _ = _load_list(path)
     own = stored.reading.scale
     return stored.values.dtype.kind in "iu" and (of_scale is None or own in (None, of_scale))
 
@@ -314,10 +310,44 @@ def read_sparse(
 ) -> tuple[Points, Reading]:
     """Returns the points with known depth of a depth image or a point list, and how it was read.
 
+    See `points_from_stored`.
+
+    Raises:
+        NoPointsError: No depth is known.
+        InputError: The file cannot be read, or is a list, and no size was given.
+    """
+    formats.check_scale(scale)
+    return points_from_stored(path, load_numbers(path), size=size, scale=scale)
+
+
+def load_numbers(path: Path) -> DepthFile:
+    """Returns the numbers that a file stores: an array of whatever shape, or the rows of a text.
+
+    Raises:
+        InputError: The file is missing, damaged, beyond the budget, or holds no numbers.
+    """
+    data = read_bytes(path)
+    if path.suffix.lower() not in _TEXT_SUFFIXES or formats.kind_of(data) is not None:
+        return load_stored(path)
+    rows, header = read_rows(path, data)
+    return DepthFile(values=rows, reading=Reading("text"), is_image=False, header=tuple(header))
+
+
+def points_from_stored(
+    path: Path,
+    stored: DepthFile,
+    *,
+    size: tuple[int, int] | None = None,
+    scale: float | None = None,
+) -> tuple[Points, Reading]:
+    """Returns the points with known depth of the numbers of a file, and how they are read.
+
     Points of an image are in row-major order. A list is a float array of shape (N, 3) in NPY or
     NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
 
     Args:
+        path: The file, for messages.
+        stored: Its numbers, as `load_numbers` returns them.
         size: (H, W) of the frame that a list belongs to. An image has its own; where they differ,
             integers are millimetres unless a scale is known.
         scale: Codes per metre of an integer image.
@@ -325,11 +355,11 @@ def read_sparse(
     Raises:
         NoPointsError: No depth is known.
         InputError: The file is a list, and no size was given.
+        UsageError: The scale is not above 0.
     """
     formats.check_scale(scale)
-    # A list: by its header, or an array with few columns and many rows.
-    stored, header = _load_list(path)
-    if header is not None:
+    # A list: a text, or an array with few columns and many rows.
+    if stored.header is not None:
         return _from_rows(path, stored.values, "point list", size)
     shape = stored.values.shape
     columns = 0 if stored.is_image or len(shape) != 2 else shape[1]
@@ -346,15 +376,6 @@ def read_sparse(
         xy=yx[:, ::-1].astype(np.float32), depth=image.values[known], size=(height, width)
     )
     return points, image.reading
-
-
-def _load_list(path: Path) -> tuple[DepthFile, list[str] | None]:
-    """What the file stores, rows of a text, too; and the words of a text's header, maybe none."""
-    data = read_bytes(path)
-    if path.suffix.lower() not in _TEXT_SUFFIXES or formats.kind_of(data) is not None:
-        return load_stored(path), None
-    rows, header = read_rows(path, data)
-    return DepthFile(values=rows, reading=Reading("text"), is_image=False), header
 
 
 def _from_rows(
@@ -381,23 +402,19 @@ def _from_rows(
     return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
 
 
-def holds_scan(path: Path, *, is_stated: bool = False) -> bool:
-    """Returns whether a list holds x y z of a scan, not x y depth of pixels.
+def holds_scan(stored: DepthFile, *, is_stated: bool = False) -> bool:
+    """Returns whether the numbers of a list are x y z of a scan, not x y depth of pixels.
 
     By its header or by more than three numbers a row, or as stated; else many x or y are no pixels:
     far below 0, beyond the largest image, or several points share most of them.
 
     Args:
-        path: The file.
+        stored: The numbers of the list.
         is_stated: Whether the user states of the list what only a scan has.
-
-    Raises:
-        InputError: The file cannot be read.
     """
-    stored, header = _load_list(path)
     rows = stored.values
-    if header:
-        return header[:3] != PIXELS
+    if stored.header:
+        return list(stored.header[:3]) != PIXELS
     if stored.is_image or rows.ndim != 2 or rows.dtype.kind != "f":
         return False
     if not 3 <= rows.shape[1] <= _MOST_COLUMNS:

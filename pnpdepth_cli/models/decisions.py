@@ -131,9 +131,9 @@ def _digest(module: nn.Module, file: Path) -> str | None:
     if not parts:
         return None
     digest = hashlib.sha256()
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
+    for content in parts:
+        digest.update(len(content).to_bytes(8, "little"))
+        digest.update(content)
     return digest.hexdigest()
 
 

@@ -162,7 +162,7 @@ class FileGraph(nn.Module):
             return _Runner(self, math.inf).run(*inputs)
         given = _elements([*inputs, *self.parameters(), *self.buffers()])
         largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
-        pixels = max([each.shape[-2:].numel() for each in inputs], default=0)
+        pixels = max([tensor.shape[-2:].numel() for tensor in inputs], default=0)
         work = _WORK_PER_PIXEL * max(pixels, _LEAST_PIXELS)
         with SizeLimit(largest, work=work, work_is="of any published depth network"):
             result = _Runner(self, 2 * largest).run(*inputs)

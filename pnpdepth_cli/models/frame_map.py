@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -105,8 +106,17 @@ def _resize(image: Tensor, size: tuple[int, int], *, antialias: bool = False) ->
     return F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=antialias)
 
 
-def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints, Camera]:
-    """A smooth random rgb image (1, 3, H, W), points on a slanted plane, and a camera.
+class SyntheticFrame(NamedTuple):
+    """A frame that a network is tried with."""
+
+    rgb: Tensor
+    """(1, 3, H, W) in 0…1."""
+    points: SparsePoints
+    camera: Camera
+
+
+def synthetic_frame(size: tuple[int, int]) -> SyntheticFrame:
+    """A smooth random image, points on a slanted plane, and a camera.
 
     The seed is fixed; the focal length is the width of the image.
     """
@@ -123,4 +133,4 @@ def synthetic_frame(size: tuple[int, int]) -> tuple[Tensor, SparsePoints, Camera
         size=size,
     )
     matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
-    return rgb, points, Camera(intrinsics=matrix, size=size)
+    return SyntheticFrame(rgb, points, Camera(intrinsics=matrix, size=size))

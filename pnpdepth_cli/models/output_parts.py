@@ -69,8 +69,9 @@ def _channel_of(output: Tensor, part: str, number: int | None) -> Tensor:
     if part in _AXES and len(maps) == len(_AXES):
         number = _AXES.index(part)
     if number is None or number >= len(maps):
-        axes = ", or x, y, z" if len(maps) == len(_AXES) else ""
+        named = ", or x, y, z" if len(maps) == len(_AXES) else ""
+        listed = f"0 to {len(maps) - 1}{named}"
         raise ModelError(
-            f"an output of {shape} has no channel {part!r}; it has 0 to {len(maps) - 1}{axes}"
+            f"an output of {shape} has no channel {part!r}; name one of those that it has: {listed}"
         )
     return maps[number][None, None]

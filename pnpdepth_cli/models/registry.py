@@ -108,8 +108,8 @@ def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDef
 
     def output(given: Any) -> Tensor:
         found = given if before is None else before(given)
-        for part in parts:
-            found = part_of(found, part)
+        for name in parts:
+            found = part_of(found, name)
         return cast("Tensor", found)
 
     return replace(definition, output=output)
@@ -117,6 +117,7 @@ def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDef
 
 def _from_file(spec: str) -> ModelDefinition | None:
     """The definition of a file or folder; None if `spec` looks like neither."""
+    # A Python or an ONNX file, perhaps with the name of a part behind a colon.
     file = spec
     part = None
     if (found := re.fullmatch(r"(.*\.(?:py|onnx)):([^:]*)", spec, re.DOTALL)) is not None:
@@ -127,16 +128,19 @@ def _from_file(spec: str) -> ModelDefinition | None:
         from pnpdepth_cli.models.onnx import onnx_definition
 
         return onnx_definition(Path(file), part)
+    # An exported program has one graph.
     if spec.endswith(".pt2"):
         from pnpdepth_cli.models.torch_export import exported_definition
 
         return exported_definition(Path(spec))
+    # Weights alone, and what would have to be run, are refused.
     if spec.endswith((*WEIGHT_SUFFIXES, ".ts", ".torchscript")):
         raise ModelError(
             f"model {spec} is a file of weights, a pickled module or a TorchScript archive, which"
             " is not run; name the network's Python file as the model and the weights as the"
             " checkpoint, or export the network by torch.export (.pt2) or to ONNX"
         )
+    # A folder of transformers has its configuration and weights.
     if Path(spec).is_dir():
         from pnpdepth_cli.models.hugging_face import hf_definition
 

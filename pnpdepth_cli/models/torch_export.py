@@ -137,6 +137,7 @@ def _function(target: str) -> Callable[..., object]:
 
 def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
     """An argument of a call, with the nodes of what the graph computes."""
+    # The kind of the argument, without what says how it may vary.
     ((kind, value),) = dict(stated).items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
@@ -147,6 +148,7 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return float(value)  # JSON has a text for an infinite one
         case "tensor" | "int" | "float" | "bool" | "string":
             return _argument(value, values) if isinstance(value, Mapping) else value
+        # A list, whose entries may be stated or computed.
         case "tensors" | "ints" | "floats" | "bools":
             kind = kind.removesuffix("s")
             entries = [
@@ -154,6 +156,7 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
                 for entry in value
             ]
             return [_argument(entry, values) for entry in entries]
+        # Names of torch's own constants.
         case "scalar_type":
             return _DTYPES[value]
         case "memory_format":

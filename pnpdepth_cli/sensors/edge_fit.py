@@ -21,19 +21,32 @@ from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.projection import points_in_image
 
-_LONGEST_PX = 1280  # the image is reduced to this size
-_BLUR = 1.0  # pixels of the reduced image, as the next three
-_SURROUNDINGS = 16.0  # in which an edge is compared with others
-_BAND = 12.0  # beyond which the strength of edges says nothing of a place
-_COARSER = 4  # times, in which blurs by more pixels than these are made
-_REACH = 1.0  # of an edge; jumps are no better known
-_DARK = 0.004  # gradient of noise, of the range of an image
-_NEIGHBOURS = 12  # nearest points, among which a jump of depth is looked for
-_JUMP = 1.3  # ratio of depths across a jump of weight 1
-_LEAST_WEIGHT = 0.15  # of a jump that counts; below are slopes, such as a road
-_TO_THE_FAR_SIDE = 0.3  # of the way, where the edge is: beams are wide, and the near side returns
+_LONGEST_PX = 1280
+"""Longer side of the image, to which it is reduced. The next five are pixels of that."""
+_BLUR = 1.0
+"""Standard deviation by which noise is smoothed."""
+_SURROUNDINGS = 16.0
+"""Standard deviation in which an edge is compared with others."""
+_BAND = 12.0
+"""Standard deviation beyond which the strength of edges says nothing of a place."""
+_COARSER = 4
+"""Times, in which blurs by more pixels than these are made."""
+_REACH = 1.0
+"""Standard deviation of an edge; jumps are no better known."""
+_DARK = 0.004
+"""Gradient of noise, of the range 0…1 of an image."""
+_NEIGHBOURS = 12
+"""Nearest points, among which a jump of depth is looked for."""
+_JUMP = 1.3
+"""Ratio of depths across a jump of weight 1."""
+_LEAST_WEIGHT = 0.15
+"""Of a jump that counts; below are slopes, such as a road."""
+_TO_THE_FAR_SIDE = 0.3
+"""Of the way, where the edge is: beams are wide, and the near side returns."""
 _LEAST_DEPTH_M = 0.1
-_LEAST_JUMPS = 30  # points; fewer tell too little
+"""Before the camera, at which a pixel is known."""
+_LEAST_JUMPS = 30
+"""Points; fewer tell too little."""
 
 
 class Jumps(NamedTuple):

@@ -10,19 +10,11 @@ import pytest
 import torch
 
 from pnpdepth_cli.completion.residual_field import ResidualField
-from pnpdepth_cli.frames.experts import (
-    Experts,
-    Judged,
-    NetworkExpert,
-    strength_of,
-    trust,
-    unexplained_by,
-    weighted_mean,
-    with_mirrored,
-)
+from pnpdepth_cli.frames.experts import Experts, NetworkExpert, trust, weighted_mean, with_mirrored
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
 from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
+from pnpdepth_cli.frames.strength import Judged, strength_of, unexplained_by
 from pnpdepth_cli.frames.validation import MIN_POINTS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings

@@ -19,6 +19,7 @@ from pnpdepth_cli.io.depth import (
     DEPTH_SUFFIXES,
     describe_range,
     holds_scan,
+    load_numbers,
     read_depth,
     read_sparse,
     write_depth,
@@ -285,7 +286,7 @@ def test_points_are_known_pixels_row_by_row_or_a_list_however_it_is_written(
 )
 def test_a_header_says_if_rows_are_of_a_scan(tmp_path: Path, header: str, of_scan: bool) -> None:
     (tmp_path / "rows.csv").write_text(f"{header}\n" + "5 6 7\n" * 20)
-    assert holds_scan(tmp_path / "rows.csv") is of_scan
+    assert holds_scan(load_numbers(tmp_path / "rows.csv")) is of_scan
 
 
 @pytest.mark.parametrize(

@@ -146,11 +146,32 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     if result.sigma is not None and fit is None:
         sigma = result.of_size(result.sigma, depth)
         scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
-    # The numbers of pixels, and how prediction and truth agree.
-    agreement = compare_depths(np.where(both, depth, 0), truth)
+    scores |= _counts_and_agreement(prediction.values, depth, truth, given)
+    scores["factor"] = None
+    scores["shift"] = None
+    if fit is not None:
+        factor, shift = fit
+        scores["factor"] = factor
+        scores["shift"] = shift + factor * prediction.added
+    return _Scored(scores, {"prediction": prediction.reading, "gt": gt.reading}, notes)
+
+
+def _counts_and_agreement(
+    prediction: Depth, depth: Depth, truth: Depth, given: NDArray[np.bool_] | None
+) -> Scores:
+    """The numbers of pixels, and how prediction and truth agree.
+
+    Args:
+        prediction: (H, W) as it was read.
+        depth: (H, W) the prediction as the protocol changes it.
+        truth: (H, W) the ground truth that is scored.
+        given: (H, W) where the sparse depth was. None: that is not known.
+    """
+    both = (truth > 0) & (depth > 0)
     known = int((truth > 0).sum())
-    predicted = int(((prediction.values > 0) & (truth > 0)).sum())
-    scores |= {
+    predicted = int(((prediction > 0) & (truth > 0)).sum())
+    agreement = compare_depths(np.where(both, depth, 0), truth)
+    return {
         "pixels": int(both.sum()),
         "known": known,
         "predicted": predicted,
@@ -158,15 +179,8 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
         "given": None if given is None else int((given & both).sum()),
         "median_ratio": agreement.ratio if both.any() else None,
         "ratio_spread": agreement.spread if both.any() else None,
-        "rank_correlation": compare_depths(prediction.values, truth).rank,
-        "factor": None,
-        "shift": None,
+        "rank_correlation": compare_depths(prediction, truth).rank,
     }
-    if fit is not None:
-        factor, shift = fit
-        scores["factor"] = factor
-        scores["shift"] = shift + factor * prediction.added
-    return _Scored(scores, {"prediction": prediction.reading, "gt": gt.reading}, notes)
 
 
 def scores_of(record: FrameRecord) -> Scores:

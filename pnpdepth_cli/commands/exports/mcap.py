@@ -27,6 +27,7 @@ from pnpdepth_cli.dataset.arrays import image_of_size
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions, ScanOptions
 from pnpdepth_cli.dataset.read_frame import read_frame
 from pnpdepth_cli.errors import InputError, PnpDepthError
+from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.bags.writing import OutgoingMessage, write_mcap
 from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.point_cloud import cloud_from_depth
@@ -190,20 +191,11 @@ def _cloud(xyz: NDArray[np.floating], rgb: NDArray[np.uint8] | None = None) -> _
     }
 
 
-def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | None:
-    """(N, 3) the frame's own points that were used, read again as its record says.
-
-    None, with a note, where their files are gone or give other points.
-    """
-    sparse = frame.result.record.inputs.get("sparse")
-    result = frame.result.record.result
-    if sparse is None or result is None:
-        return None
-    points = result.points
-    # The files and options that the record names.
+def _files_of_points(frame: ExportFrame, sparse: FileRecord) -> FrameFiles:
+    """The files of a frame from which its points were read."""
     source = Path(sparse.path)
     is_sampled = sparse.kind == "sampled"
-    files = FrameFiles(
+    return FrameFiles(
         name=frame.result.name,
         image=frame.image,
         sparse=None if is_sampled else source,
@@ -214,18 +206,41 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
         min_confidence=sparse.least,
         one_view=True,
     )
+
+
+def _options_of_points(sparse: FileRecord) -> ReadOptions:
+    """The options by which the points of a frame were read."""
     scan = ScanOptions(
         calib=None if sparse.calibration is None else Path(sparse.calibration),
         extrinsics=None if sparse.extrinsics is None else Path(sparse.extrinsics),
         camera=sparse.camera,
         keep_occluded=sparse.keep_occluded,
     )
-    options = ReadOptions(
+    return ReadOptions(
         unit_scale=sparse.unit_scale, registration="off", scan=scan, sample=sparse.sampled
     )
-    seed, holdout = result.settings.get("seed") or 0, result.settings.get("holdout") or 0.0
+
+
+def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | None:
+    """(N, 3) the frame's own points that were used, read again as its record says.
+
+    None, with a note, where their files are gone or give other points.
+    """
+    sparse = frame.result.record.inputs.get("sparse")
+    result = frame.result.record.result
+    if sparse is None or result is None:
+        return None
+    points = result.points
+    # The files are read as the record says.
+    seed = result.settings.get("seed") or 0
+    holdout = result.settings.get("holdout") or 0.0
     try:
-        read = read_frame(files, options, seed=int(seed), holdout=float(holdout))
+        read = read_frame(
+            _files_of_points(frame, sparse),
+            _options_of_points(sparse),
+            seed=int(seed),
+            holdout=float(holdout),
+        )
     except (PnpDepthError, ValueError) as error:
         notes.append(f"warning: {frame.result.name}: its points are left out: {error}")
         return None

@@ -142,6 +142,64 @@ class _Work:
             self.error = error
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Steps:
+    """What is done with each frame: it is read, refined and written."""
+
+    method: Method | None
+    """None: no frame could be read when the batch began."""
+    records: Records
+    worked: bool
+    """Whether a frame was refined with these settings before."""
+    stopped: Callable[[], bool]
+
+    def read(self, files: FrameFiles) -> _Work:
+        """Reads a frame, with what identifies its files; in a thread."""
+        work = _Work(request=request_of(self.records.request, files))
+        with work.step("read"):
+            work.state = self.records.state(work.request)
+            work.frame = read_requested(work.request)
+        return work
+
+    def refine(self, reading: Iterable[_Work]) -> Iterator[_Work]:
+        """Refines the frames, in this thread; an error may be of all until one was refined."""
+        proven = self.worked or self.method is None
+        for work in reading:
+            if self.stopped():
+                return
+            if work.frame is not None:
+                with work.step("refine"):
+                    if self.method is None:
+                        raise InputError("no frame could be read when the batch began; try again")
+                    with_stages = work.frame.gt is not None
+                    work.refined = self.method.refine(work.frame, with_stages=with_stages)
+            proven |= work.refined is not None
+            fatal = StorageError if proven else (StorageError, ModelError, UsageError)
+            if isinstance(work.error, fatal):
+                raise work.error
+            yield work
+
+    def write(self, work: _Work) -> FrameRecord:
+        """Writes the result of a frame, or why there is none; in a thread."""
+        if work.refined is None or work.frame is None or self.method is None:
+            return self.records.fail(work.request, work.error)
+        try:
+            return write_refined(
+                work.request,
+                self.records.outputs_of(work.request.files),
+                self.method,
+                work.frame,
+                work.refined,
+                work.seconds,
+                batch=work.state,
+                folder=self.records.request.output,
+            )
+        except StorageError:
+            raise
+        except Exception as error:  # concerns this frame only
+            return self.records.fail(work.request, error)
+
+
 def _refine_frames(
     frames: Iterable[FrameFiles],
     method: Method | None,
@@ -154,50 +212,10 @@ def _refine_frames(
     An error is of its frame alone, unless nothing more can be written, or it is of the network or
     the settings before any frame was refined.
     """
-
-    # In threads: read a frame, with what identifies its files.
-    def read(files: FrameFiles) -> _Work:
-        work = _Work(request=request_of(records.request, files))
-        with work.step("read"):
-            work.state = records.state(work.request)
-            work.frame = read_requested(work.request)
-        return work
-
-    # In this thread: refine it. Once a frame was refined, no error of another is of all.
-    def refine(reading: Iterable[_Work]) -> Iterator[_Work]:
-        proven = worked or method is None
-        for work in reading:
-            if stopped():
-                return
-            if work.frame is not None:
-                with work.step("refine"):
-                    if method is None:
-                        raise InputError("no frame could be read when the batch began; try again")
-                    work.refined = method.refine(work.frame, with_stages=work.frame.gt is not None)
-            proven |= work.refined is not None
-            fatal = StorageError if proven else (StorageError, ModelError, UsageError)
-            if isinstance(work.error, fatal):
-                raise work.error
-            yield work
-
-    # In threads again: write the result, or why there is none.
-    def write(work: _Work) -> FrameRecord:
-        request, error = work.request, work.error
-        if work.refined is not None and work.frame is not None and method is not None:
-            try:
-                return write_refined(
-                    request, records.outputs_of(request.files), method, work.frame, work.refined,
-                    work.seconds, batch=work.state, folder=records.request.output,
-                )  # fmt: skip
-            except StorageError:
-                raise
-            except Exception as failure:
-                error = failure
-        return records.fail(request, error)
-
+    steps = _Steps(method=method, records=records, worked=worked, stopped=stopped)
     with (
-        closing(in_order(read, frames, THREADS)) as reading,
-        closing(in_order(write, refine(reading), THREADS)) as done,
+        closing(in_order(steps.read, frames, THREADS)) as reading,
+        closing(in_order(steps.write, steps.refine(reading), THREADS)) as done,
     ):
         yield from done
 
@@ -261,41 +279,78 @@ def _refine_on_workers(
         devices, start = _plan(ray, deciding, records)
         count = min(devices, len(to_do))
         listener.say(f"Ray: {count:,} workers")
-        waiting = deque(_calls(to_do, count))
-        idle = [start() for _ in range(count)]
-        running = dict[Any, tuple[Any, _Call]]()
-        deaths = 0
-        while True:
-            # Until a frame is refined, only one worker has a call, as its error may be of all.
-            while idle and waiting and (worked or not running) and not listener.stopped():
-                worker = idle.pop()
-                call = waiting.popleft()
-                running[worker.refine.remote(call.frames, worked)] = worker, call
-            if not running:
-                return
-            # Workers without a call end, and leave their device to those that have one.
-            while idle and worked:
-                ray.kill(idle.pop())
-            # The end of any call.
-            (ended, *_), _ = ray.wait([*running])
-            worker, call = running.pop(ended)
-            try:
-                done = ray.get(ended)
-            except ray.exceptions.RayTaskError as error:
-                raise error.cause from None
-            except ray.exceptions.RayError as error:
-                # The worker died: another one takes its place, and its frames wait again.
-                reason = one_line(error)
-                deaths += 1
-                if deaths == _DEATHS and not worked:
-                    raise DeviceError(f"Ray workers die: {reason}") from None
-                listener.say(f"warning: a worker died ({reason})")
-                worker = start()
-                again, done = _after_death(call, records, reason)
-                waiting.extend(again)
-            idle.append(worker)
-            worked |= any(record.status != "failed" for record in done)
-            yield from done
+        workers = _Workers(
+            ray=ray,
+            start=start,
+            records=records,
+            listener=listener,
+            worked=worked,
+            waiting=deque(_calls(to_do, count)),
+            idle=[start() for _ in range(count)],
+        )
+        while workers.hand_out():
+            yield from workers.next_records()
+
+
+@dataclass(kw_only=True)
+class _Workers:
+    """The workers of a cluster, the calls that they run, and those that wait."""
+
+    ray: ModuleType
+    start: Callable[[], Any]
+    """Starts a worker, a Ray actor."""
+    records: Records
+    listener: Listener
+    worked: bool
+    """Whether a frame was refined, so that no error of another is of all."""
+    waiting: deque[_Call]
+    idle: list[Any]
+    running: dict[Any, tuple[Any, _Call]] = field(default_factory=dict)
+    """The worker and the call of each result that Ray will have."""
+    deaths: int = 0
+
+    def hand_out(self) -> bool:
+        """Gives calls to the workers. False: none runs, so that all is done."""
+        # Until a frame is refined, only one worker has a call, as its error may be of all.
+        while self.idle and self.waiting and (self.worked or not self.running):
+            if self.listener.stopped():
+                break
+            worker = self.idle.pop()
+            call = self.waiting.popleft()
+            self.running[worker.refine.remote(call.frames, self.worked)] = worker, call
+        if not self.running:
+            return False
+        # Workers without a call end, and leave their device to those that have one.
+        while self.idle and self.worked:
+            self.ray.kill(self.idle.pop())
+        return True
+
+    def next_records(self) -> list[FrameRecord]:
+        """Waits for the end of any call, and returns the records of its frames.
+
+        Raises:
+            DeviceError: Workers die before any frame is refined.
+            Exception: What the call raised, which is of all frames.
+        """
+        (ended, *_), _ = self.ray.wait([*self.running])
+        worker, call = self.running.pop(ended)
+        try:
+            done: list[FrameRecord] = self.ray.get(ended)
+        except self.ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        except self.ray.exceptions.RayError as error:
+            # The worker died: another one takes its place, and its frames wait again.
+            reason = one_line(error)
+            self.deaths += 1
+            if self.deaths == _DEATHS and not self.worked:
+                raise DeviceError(f"Ray workers die: {reason}") from None
+            self.listener.say(f"warning: a worker died ({reason})")
+            worker = self.start()
+            again, done = _after_death(call, self.records, reason)
+            self.waiting.extend(again)
+        self.idle.append(worker)
+        self.worked |= any(record.status != "failed" for record in done)
+        return done
 
 
 def _calls(to_do: Sequence[FrameFiles], workers: int) -> Iterator[_Call]:

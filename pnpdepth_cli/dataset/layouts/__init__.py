@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, check_path
@@ -126,10 +127,19 @@ VOID = row(
 )
 
 
-def list_frames(
-    root: Path, name: str | None = None
-) -> tuple[str, list[FrameFiles], list[Unmatched]]:
-    """Returns the name of a data set's layout, its frames in a fixed order, and what is in none.
+class DataSet(NamedTuple):
+    """The frames of a data set."""
+
+    layout: str
+    """Name of its layout."""
+    frames: list[FrameFiles]
+    """In a fixed order."""
+    unmatched: list[Unmatched]
+    """Files and folders that belong to no frame."""
+
+
+def list_frames(root: Path, name: str | None = None) -> DataSet:
+    """Returns the frames of a data set.
 
     Args:
         root: The data set, or a folder with several of one layout.
@@ -146,19 +156,20 @@ def list_frames(
                 f"{root} holds folders of several layouts ({', '.join(layouts)}); give one of them,"
                 " or name the layout"
             )
-        found = [(path, each) for path in folders for each in LAYOUTS[layouts[0]].frames(path)]
+        layout = layouts[0]
+        found = [(path, entry) for path in folders for entry in LAYOUTS[layout].frames(path)]
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
     frames = [
-        each if folder == root else replace(each, name=f"{folder.name}/{each.name}")
-        for folder, each in found
-        if isinstance(each, FrameFiles)
+        frame if folder == root else replace(frame, name=f"{folder.name}/{frame.name}")
+        for folder, frame in found
+        if isinstance(frame, FrameFiles)
     ]
-    lost = dict.fromkeys(each for _, each in found if isinstance(each, tuple))
+    lost = dict.fromkeys(entry for _, entry in found if isinstance(entry, tuple))
     for path, _ in lost:
         check_path(path)
-    return layouts[0], frames, list(lost)
+    return DataSet(layout, frames, list(lost))
 
 
 def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
@@ -170,18 +181,26 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
             f"{root}: the depth in it is compressed with LZFSE, which is not read; export 'EXR +"
             " RGB' in Record3D, and give the folder EXR_RGBD"
         )
+    # The folder itself, else those in it.
     inside = sorted(root.iterdir()) if root.is_dir() else []
     below = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     for folders in ([root], below):
-        layouts = {p: next((n for n in names if LAYOUTS[n].matches(p)), None) for p in folders}
-        if found := {path: name for path, name in layouts.items() if name is not None}:
+        found = dict[Path, str]()
+        for folder in folders:
+            matching = next((name for name in names if LAYOUTS[name].matches(folder)), None)
+            if matching is not None:
+                found[folder] = matching
+        if found:
             return found
+    # It is none. What a folder lacks is said where one layout is wanted.
     if root.is_file():
         raise InputError(
             f"{root} is one file; give a folder, a CSV list of frames or a bag, or refine one image"
         )
-    if len(names) == 1 and (lacked := LAYOUTS[names[0]].lacks(root)):
-        raise InputError("{} has no {}, which {} needs; add it".format(*lacked, names[0]))
+    lacked = LAYOUTS[names[0]].lacks(root) if len(names) == 1 else None
+    if lacked is not None:
+        place, pattern = lacked
+        raise InputError(f"{place} has no {pattern}, which {names[0]} needs; add it")
     raise InputError(
         f"{root} does not look like {', '.join(names)}, whose folders docs/guides/many-frames.md"
         " lists, and --layout NAME says what is missing; put images into rgb/ and their sparse"

@@ -42,8 +42,10 @@ from pnpdepth_cli.io.poses import LONGEST_GAP_S, read_trajectory, rotation_of
 
 _OF_ETH3D = "dslr_calibration_undistorted"
 _ASSOCIATIONS = "associations.txt"
-_ODOMETRY, _METADATA = "odometry.csv", "metadata.json"
-_LONGEST_POSE_GAP_S = 0.1  # between poses; motion capture takes them at 100 Hz
+_ODOMETRY = "odometry.csv"
+_METADATA = "metadata.json"
+_LONGEST_POSE_GAP_S = 0.1
+"""Between poses; motion capture takes them at 100 Hz."""
 
 Timed = tuple[float, Path]
 
@@ -91,8 +93,10 @@ def _timed_files(path: Path, count: int) -> list[list[Timed]]:
             row = []
         finite = all(math.isfinite(time_s) for time_s, _ in row)
         if len(row) != count or not finite or (count == 2 and sum(map(_is_depth, row)) != 1):
-            fact = f"{one_line(line)[:60]!r} is not a time and a path for each image and depth"
-            raise InputError(f"{path}, line {number}: {fact}")
+            raise InputError(
+                f"{path}, line {number}: {one_line(line)[:60]!r} is not a time and a path for each"
+                " image and depth; correct it"
+            )
         rows.append(row)
     return rows
 
@@ -135,17 +139,19 @@ def _photos(root: Path) -> Path | None:
 def _of_colmap(root: Path) -> Iterator[FrameFiles | Unmatched]:
     """One frame for each registered image that exists."""
     models = [read_model(folder) for folder in _colmap_models(root)]
-    model, photos = max(models, key=lambda other: len(other.images)), _photos(root)
-    assert photos is not None
+    model = max(models, key=lambda model: len(model.images))
+    photos = _photos(root)
+    if photos is None:
+        raise InputError(f"{root} has no folder images with the photos of its model; add it")
     files, unreadable = find_files(photos, IMAGE_SUFFIXES)
     yield from unreadable
     for path in files.values():
         if path.relative_to(photos).as_posix() not in model.images:
             yield path, f"is not registered in {model.folder}"
-    for other in models:
-        if other is not model:
-            why = f"is another model, of {len(other.images):,} images, in a unit of its own"
-            yield other.folder, why
+    for smaller in models:
+        if smaller is not model:
+            why = f"is another model, of {len(smaller.images):,} images, in a unit of its own"
+            yield smaller.folder, why
     for name, image in sorted(model.images.items()):
         path = photos / name
         if not path.is_file():
@@ -162,31 +168,38 @@ COLMAP = Layout(
 
 
 def _of_stray_scanner(place: Path) -> Callable[[FrameFiles], FrameFiles]:
+    """Gives frames the poses of Stray Scanner, by their number."""
     path = place / _ODOMETRY
     try:
         rows = np.loadtxt(io.BytesIO(read_bytes(path)), delimiter=",", skiprows=1, usecols=range(9))
         poses = {int(row[1]): _pose(row[2:5], row[5:]) for row in np.atleast_2d(rows)}
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"{path}: not timestamp, frame, x, y, z, qx, qy, qz, qw ({one_line(error)})"
+            f"{path}: a row is not timestamp, frame, x, y, z, qx, qy, qz, qw ({one_line(error)});"
+            " export the recording again"
         ) from error
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
 def _of_record3d(place: Path) -> Callable[[FrameFiles], FrameFiles]:
+    """Gives frames the poses of Record3D, by their number."""
     path = place / _METADATA
     try:
         rows = [np.array(row, np.float64) for row in read_json(path).get("poses", [])]
         poses = {n: _pose(row[4:], row[:4], y_up=True) for n, row in enumerate(rows)}
     except (TypeError, ValueError):
-        raise InputError(f"{path}: poses are not rows of qx qy qz qw x y z") from None
+        raise InputError(
+            f"{path}: poses are not rows of qx qy qz qw x y z; export the recording again"
+        ) from None
     return lambda frame: replace(frame, pose=poses.get(int(frame.name)))
 
 
 def _pose(position: Floats, xyzw: Floats, y_up: bool = False) -> Pose:
     """The pose with the axes x right, y down, z forward. ValueError for none."""
     turn = rotation_of(np.roll(xyzw, 1))
-    pose = np.column_stack([turn * (1, -1, -1) if y_up else turn, position])
+    if y_up:  # y and z of the camera have the other direction
+        turn = turn * np.array([1, -1, -1])
+    pose = np.column_stack([turn, position])
     if pose.shape != (3, 4) or not np.isfinite(pose).all():
         raise ValueError
     return as_pose(pose)

@@ -27,9 +27,13 @@ from pnpdepth_cli.io.calibration import read_calibration, read_inertial_pose
 from pnpdepth_cli.io.poses import read_oxts, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 
-_CAMERAS, _SCANS, _CALIBRATION = "image_0[23]", "velodyne_points/data", "calib_cam_to_cam.txt"
-_PACKETS, _INERTIAL = "oxts/data", "calib_imu_to_velo.txt"
-_RAW = ("", "raw/", "kitti_raw/")  # folders of the raw data's dates
+_CAMERAS = "image_0[23]"
+_SCANS = "velodyne_points/data"
+_CALIBRATION = "calib_cam_to_cam.txt"
+_PACKETS = "oxts/data"
+_INERTIAL = "calib_imu_to_velo.txt"
+_RAW = ("", "raw/", "kitti_raw/")
+"""Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
 _OF_MAPS = FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True)
@@ -47,7 +51,7 @@ def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
         if not frame.name.isdecimal() or int(frame.name) >= len(poses):
             raise InputError(
                 f"{frame.image} has no pose: its sequence's file holds {len(poses):,} poses, by"
-                " frame number"
+                f" frame number; complete or remove {path}"
             )
         return replace(frame, pose=poses[int(frame.name)])
 
@@ -72,11 +76,13 @@ def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
 
 
 def _truth_of(drive: Path, camera: str) -> Path:
-    beside = (f"data_depth_annotated/{part}" for part in ("train", "val"))
+    """The folder of the annotated depth of a drive's camera; it may not exist."""
+    beside = [f"data_depth_annotated/{split}" for split in ("train", "val")]
     return _of_drive(drive, Path("proj_depth/groundtruth", camera), *beside)
 
 
 def _calibration_of(drive: Path) -> Path | None:
+    """The folder with the calibration of a drive. None: there is none."""
     return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
 
 
@@ -100,16 +106,19 @@ def _folders(root: Path, starts: tuple[str, ...], inside: str) -> list[Path]:
 
 
 def _scans_of_tree(root: Path) -> list[Path]:
+    """The folders of projected scans, one a camera, of the benchmark's tree."""
     starts = ("", "*/", "*/*/", "data_depth_velodyne/*/*/")
     return _folders(root, starts, f"proj_depth/velodyne_raw/{_CAMERAS}")
 
 
 def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
+    """The frames of the benchmark's selection, or of its tree."""
     if _SELECTION.matches(root):
         yield from _SELECTION.frames(root)
         return
     for scans in _scans_of_tree(root):
-        drive, camera = scans.parents[2], scans.name
+        drive = scans.parents[2]
+        camera = scans.name
         dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)
         images = _of_drive(drive, Path(camera, "data"), *dates)
         parts = {
@@ -136,8 +145,10 @@ def _raw_cameras(root: Path) -> list[Path]:
 
 
 def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
+    """The frames of raw drives, with poses where a drive has them."""
     for camera in _raw_cameras(root):
-        drive, calibration = camera.parent, _calibration_of(camera.parent)
+        drive = camera.parent
+        calibration = _calibration_of(camera.parent)
         if calibration is None:
             yield drive, f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
             continue
@@ -148,10 +159,10 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
         }
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
         found = list(_frames_of_camera(drive, camera.name, parts, shared))
-        poses = _poses_of_drive(drive, [each for each in found if isinstance(each, FrameFiles)])
-        yield from (
-            poses.get(each, each) if isinstance(each, FrameFiles) else each for each in found
-        )
+        frames = [entry for entry in found if isinstance(entry, FrameFiles)]
+        poses = _poses_of_drive(drive, frames)
+        for entry in found:
+            yield poses.get(entry, entry) if isinstance(entry, FrameFiles) else entry
 
 
 def _poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:

@@ -66,6 +66,7 @@ def _video(folder: Path, names: str) -> Path | None:
 
 
 def _exists(part: Part) -> bool:
+    """Whether the folder of a part, or the video instead of it, is there."""
     return part[0].is_dir() or _video(*part) is not None
 
 
@@ -99,22 +100,25 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
     """
     # The images may be a video, which has each frame by its number.
     video = _video(*parts["image"])
-    parts = {field: part for field, part in parts.items() if field != "image" or video is None}
+    if video is not None:
+        parts = {field: parts[field] for field in parts if field != "image"}
     first, *others = parts
     needed = [field for field in others if not parts[field][1].endswith("?")]
     for field in needed:
-        if not (folder := parts[field][0]).is_dir():
+        folder = parts[field][0]
+        if not folder.is_dir():
             yield parts[first][0], f"has no {folder}; add it"
             return
     files = dict[str, dict[str, Path]]()
-    for field, part in parts.items():
-        files[field], unreadable = _files(*part)
+    for field, (folder, names) in parts.items():
+        files[field], unreadable = _files(folder, names)
         yield from unreadable
     # Files without a partner.
-    for field, other in [*((first, each) for each in needed), *((each, first) for each in others)]:
-        for stem in (stem for stem in files[field] if stem not in files[other]):
-            why = f"has no partner {stem}.* in {parts[other][0]}; add or remove one"
-            yield files[field][stem], why
+    pairs = [(first, field) for field in needed] + [(field, first) for field in others]
+    for field, partner in pairs:
+        for stem, path in files[field].items():
+            if stem not in files[partner]:
+                yield path, f"has no partner {stem}.* in {parts[partner][0]}; add or remove one"
     # The frames.
     for stem in files[first]:
         own = {field: found[stem] for field, found in files.items() if stem in found}
@@ -139,6 +143,7 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
 
 
 def _path_below(root: Path, place: Path, stem: str) -> str:
+    """The path of a frame's files below the root."""
     return (place.relative_to(root) / stem).as_posix()
 
 
@@ -167,18 +172,22 @@ def row(
             it with further fields, or None for one that is not wanted.
         shared: A frame whose fields all frames have.
     """
+    # What a place of the data set has, and by what it is found.
     needed = [_places(text) for text in parts.values() if "/" in text and not text.endswith("?")]
     needs = (*needed, *marks)
     probe = marks[0] if marks else needed[-1].split("|")[0]
 
     def find(root: Path) -> list[Path]:
+        """The places below a root that have all that is needed."""
         found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
         return sorted(place for place in found if not lacking(place, needs))
 
     def parts_in(place: Path) -> dict[str, Part]:
+        """The parts of the frames of a place."""
         return {field: _part(place, text) for field, text in parts.items()}
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
+        """The frames of all places, and what is in none."""
         for place in find(root):
             own = place / calib if calib and (place / calib).is_file() else None
             complete = more(place) if more else replace

@@ -27,8 +27,15 @@ from pnpdepth_cli.protocols import WHOLE, find_protocol
 
 _PATHS = ("image", "sparse", "sparse_mask", "depth", "gt", "calib", "mask")
 _OTHERS = (
-    *("camera", "sparse_scale", "sparse_kind", "min_confidence", "gt_scale", "gt_kind"),
-    *("gt_size_ok", "name", "group"),
+    "camera",
+    "sparse_scale",
+    "sparse_kind",
+    "min_confidence",
+    "gt_scale",
+    "gt_kind",
+    "gt_size_ok",
+    "name",
+    "group",
 )
 _COLUMNS = (*_PATHS, *_OTHERS, "protocol")
 _FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
@@ -53,10 +60,14 @@ def _frames(root: Path) -> list[FrameFiles | Unmatched]:
     first: dict[str, FrameFiles] = {}
     for number, frame in zip(frames, named, strict=True):
         if first.setdefault(frame.name.casefold(), frame) is not frame:
-            but = "" if first[frame.name.casefold()].name == frame.name else ", but for capitals"
+            if first[frame.name.casefold()].name != frame.name:
+                raise InputError(
+                    f"{root}, line {number}: a second frame {one_line(frame.name)!r}, but for"
+                    " capitals; give it a name of its own"
+                )
             raise InputError(
-                f"{root}, line {number}: a second frame {one_line(frame.name)!r}{but}; give it a"
-                " name of its own"
+                f"{root}, line {number}: a second frame {one_line(frame.name)!r}; give it a name of"
+                " its own"
             )
     return [*broken, *named]
 
@@ -79,9 +90,15 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
         for name in filter(None, header):
-            if name not in _COLUMNS or header.count(name) > 1:
-                why = "comes twice" if name in _COLUMNS else f"is not one of {', '.join(_COLUMNS)}"
-                raise InputError(f"{path}, line {reader.line_num}: column {name!r} {why}")
+            if name not in _COLUMNS:
+                raise InputError(
+                    f"{path}, line {reader.line_num}: column {name!r} is not one of"
+                    f" {', '.join(_COLUMNS)}"
+                )
+            if header.count(name) > 1:
+                raise InputError(
+                    f"{path}, line {reader.line_num}: column {name!r} comes twice; keep one"
+                )
         for row in reader:
             texts = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None}
             yield reader.line_num, {k: v for k, v in texts.items() if v}
@@ -91,8 +108,9 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 
 def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
     """The frame of a line; ValueError and our errors say what is wrong with it."""
+    # What the line says is checked where no type does.
     if not row.keys() <= {*_COLUMNS}:
-        raise ValueError("has more cells than the header")
+        raise ValueError("has more cells than the header; quote a comma in a cell")
     if "image" not in row and "sparse" not in row:
         raise ValueError("has neither image nor sparse; give one")
     if (flag := row.get("gt_size_ok", "no")).lower() not in _FLAGS:
@@ -100,6 +118,7 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
     for column in ("sparse_kind", "gt_kind"):
         inverse_factor(column, row.get(column))
     part = find_protocol(row["protocol"]).part if "protocol" in row else None
+    # Cells that are empty leave the fields of a frame as they are without them.
     return FrameFiles(
         name=PurePosixPath(row["name"]).as_posix() if "name" in row else "",
         image=paths.get("image"),
@@ -123,6 +142,7 @@ def _frame(row: dict[str, str], paths: dict[str, Path]) -> FrameFiles:
 
 
 def _number(row: dict[str, str], column: str) -> float | None:
+    """The number in a cell; None of an empty one."""
     return float(row[column]) if column in row else None
 
 

@@ -91,6 +91,8 @@ class DepthFile:
     reading: Reading
     """How the file was read; of stored values, the scale is the one that the file itself states."""
     is_image: bool = True  # false for NPY and NPZ, whose arrays may also be lists of points
+    header: tuple[str, ...] | None = None
+    """Words of the header of a text, none without a header. None: the file is no text."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,9 +163,9 @@ def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
     if wanted is not None and wanted in outputs:
         return wanted
     listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
-    fact = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
+    found = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
     raise ModelError(
-        f"ONNX file {file} has {fact}; name the depth as {file}:{next(iter(outputs), 'OUTPUT')};"
+        f"ONNX file {file} has {found}; name the depth as {file}:{next(iter(outputs), 'OUTPUT')};"
         f" it has {listed}"
     )
 
@@ -310,17 +310,11 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
             results = result if isinstance(result, tuple) else (result,)
             constants.update(zip(proto.output, results, strict=False))
             continue
+        # Anything else is a node of the module.
         on_shapes = node.op in _TO_SHAPES or shapes.issuperset(handed_in)
-        shapes.update(filter(None, proto.output if on_shapes else ()))
-        # Constants become weights, but for those that stay on the CPU.
-        inputs: list[Argument] = []
-        for index, n in enumerate(proto.input):
-            if n in constants and (on_shapes or index in HOST_INPUTS[node.op]):
-                inputs.append(constants[n])
-            elif n in constants and n not in graph.values:
-                inputs.append(graph.add_tensor(n, constants[n]))
-            else:
-                inputs.append(graph.values.get(n))
+        if on_shapes:
+            shapes.update(filter(None, proto.output))
+        inputs = _arguments_of(proto, graph, constants, on_shapes=on_shapes)
         outputs = proto.output if node.op == "Split" else proto.output[0]
         graph.add_operation(name, operation, inputs, {}, outputs, is_layer=not on_shapes)
     output = model.graph.output[0].name
@@ -328,6 +322,28 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
         raise ModelError(f"ONNX file {path}: its output depends on no input")
     graph.set_outputs([output])
     return graph
+
+
+def _arguments_of(
+    proto: NodeProto, graph: FileGraph, constants: Mapping[str, Tensor], *, on_shapes: bool
+) -> list[Argument]:
+    """The inputs of a node of the module: constants become weights, but for those of the CPU.
+
+    Args:
+        proto: The node.
+        graph: The module, with the nodes before it.
+        constants: Tensors that are known, by name.
+        on_shapes: Whether the node computes with shapes, which stay on the CPU.
+    """
+    arguments = list[Argument]()
+    for index, name in enumerate(proto.input):
+        if name in constants and (on_shapes or index in HOST_INPUTS[proto.op_type]):
+            arguments.append(constants[name])
+        elif name in constants and name not in graph.values:
+            arguments.append(graph.add_tensor(name, constants[name]))
+        else:
+            arguments.append(graph.values.get(name))
+    return arguments
 
 
 def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:

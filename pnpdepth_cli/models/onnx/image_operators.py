@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,18 +33,29 @@ def _sides(pads: Pads) -> list[int]:
     return [n for pair in reversed(pads) for n in pair]
 
 
-def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> tuple[list[int], list[int], Pads]:
-    """Stride, dilation and pads (begin, end) of each spatial axis."""
+class _KernelWindow(NamedTuple):
+    """How a kernel moves over an image, of each spatial axis."""
+
+    stride: list[int]
+    dilation: list[int]
+    pads: Pads
+    """(begin, end) of each axis."""
+
+
+def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> _KernelWindow:
+    """The window of a node."""
     rank = x.ndim - 2
     auto = node.get("auto_pad", "NOTSET")
     stride = node.get("strides", [1] * rank)
     dilation = node.get("dilations", [1] * rank)
     if auto in ("NOTSET", "VALID"):
-        flat = node.get("pads", [0] * (2 * rank)) if auto == "NOTSET" else [0] * (2 * rank)
-        return stride, dilation, list(zip(flat[:rank], flat[rank:], strict=True))
+        flat = [0] * (2 * rank)
+        if auto == "NOTSET":
+            flat = node.get("pads", flat)
+        return _KernelWindow(stride, dilation, list(zip(flat[:rank], flat[rank:], strict=True)))
     sizes = zip(x.shape[2:], kernel, stride, dilation, strict=True)
     totals = [(math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n for n, k, s, d in sizes]
-    return stride, dilation, _halves(node, totals)
+    return _KernelWindow(stride, dilation, _halves(node, totals))
 
 
 def _halves(node: Node, totals: Sequence[int]) -> Pads:
@@ -228,6 +239,7 @@ def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
     if node.get("coordinate_transformation_mode") == "tf_crop_and_resize":
         raise ModelError("a region of interest")
     torch.empty(out, size, device="meta")  # which a `SizeLimit` refuses if it is too large
+    # One node, that resizes each row of the identity matrix, to a size or by a factor.
     attributes = {name: node.get(name) for name in _RESIZE if name in node.attributes}
     stated = ["none", "by"]
     by = np.array([out, size])
@@ -242,6 +254,7 @@ def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, [out, size])],
         [numpy_helper.from_array(by, "by"), numpy_helper.from_array(none, "none")],
     )
+    # Its result is the weights.
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 12)], ir_version=8)
     with wrap_user_errors(f"{node.op} of onnxruntime"):
         session = onnxruntime.InferenceSession(

@@ -16,6 +16,7 @@ from pnpdepth_cli.commands.sample import sample_depth
 from pnpdepth_cli.commands.shared.sparse_files import Written
 from pnpdepth_cli.commands.simulate import simulate_scan
 from pnpdepth_cli.dataset.frame_files import ScanOptions
+from pnpdepth_cli.dataset.stored_depth import read_stored_sparse
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
@@ -91,7 +92,7 @@ def test_results_are_replaced_only_with_overwrite(frame: ScanOnDisk) -> None:
     refused(frame, OutputError, ".jpg", output="s.jpg")
     assert (frame.folder / "sparse_overlay.png").is_file()
     with pytest.raises(UsageError):  # options of a scan
-        ScanOptions(extrinsics=frame.calib).describes(frame.gt)
+        read_stored_sparse(frame.gt, ScanOptions(extrinsics=frame.calib))
 
 
 def test_the_seed_is_in_the_record_and_decides_every_byte(frame: ScanOnDisk) -> None:
