@@ -62,7 +62,7 @@ def record(folder: Path) -> Any:
 
 
 def test_a_network_a_loss_a_rule_and_a_propagation_are_used_by_name(record: Any) -> None:
-    assert record["model"]["name"] == "my-net"
+    assert record["result"]["model"]["name"] == "my-net"
     named = [record["result"]["settings"][key] for key in ("loss", "update", "propagate")]
     assert named == ["charbonnier", "rmsprop", "median"]
     assert record["result"]["loss"][-1] < record["result"]["loss"][0]

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pnpdepth_cli.measures import MEASURES, score, with_thresholds
+from pnpdepth_cli.measures import MEASURES, Measure, score, with_thresholds
 from tests.plain_scores import brute
 
 depths = st.one_of(
@@ -52,10 +52,16 @@ def test_scores_survive_a_pickle() -> None:
     assert pickle.loads(pickle.dumps(scores)) == scores
 
 
-def test_measures_of_depth_are_in_metres_and_those_of_inverse_depth_in_1_per_kilometre() -> None:
-    units = {measure.key: measure.unit for measure in MEASURES}
-    assert {key for key, unit in units.items() if unit == "m"} == {"rmse", "mae", "sq_rel"}
-    assert {key for key, unit in units.items() if unit == "1/km"} == {"irmse", "imae"}
+@pytest.mark.parametrize("measure", MEASURES, ids=lambda measure: measure.key)
+def test_a_measure_grows_with_the_depths_as_its_unit_does(measure: Measure) -> None:
+    rng = np.random.default_rng(0)
+    truth = torch.from_numpy(rng.uniform(1, 9, 100))
+    predicted = truth * torch.from_numpy(rng.uniform(0.5, 2, 100))
+    of_depths = score(predicted, truth)[measure.key]
+    of_doubled = score(2 * predicted, 2 * truth)[measure.key]
+    factor = {"m": 2.0, "1/km": 0.5}.get(measure.unit, 1.0)
+    assert of_doubled == pytest.approx(factor * of_depths, rel=1e-6)
+    assert of_depths != 0
 
 
 def test_of_all_measures_only_the_deltas_are_better_when_they_are_higher() -> None:

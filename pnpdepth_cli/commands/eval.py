@@ -265,10 +265,12 @@ def _notes_on_names(predictions: Mapping[str, Path], names: Sequence[str]) -> li
 
 
 def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
-    """The layout and the frames of a data set: as the batch read it, else recognised anew."""
+    """The layout and the frames of a data set; None and no frames for another folder."""
+    # As the batch read it, whose summary lies beside the predictions; else recognised anew.
     summary = prediction / "summary.json"
     stated = read_json(summary).get("layout") if summary.is_file() else None
-    for layout in (stated if stated in LAYOUTS else None, None):
+    layouts = [stated, None] if stated in LAYOUTS else [None]
+    for layout in layouts:
         with contextlib.suppress(InputError, OSError):
             found = list_frames(folder, layout)
             return found.layout, found.frames

@@ -311,7 +311,7 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
 
 
 def _predict_grid(field: Residuals) -> Tensor:
-    """The same, predicted at every pixel of the field's features."""
+    """The residual (H, W) of the Gaussian process at every pixel of the field's features."""
     height, width = field.points.size
     if _is_exact(field):
         queries = field.features.flatten(1).T.contiguous()[None]

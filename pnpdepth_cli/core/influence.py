@@ -179,6 +179,11 @@ class _Follower(TorchDispatchMode):
         args: Sequence[object] = (),
         kwargs: Mapping[str, object] | None = None,
     ) -> object:
+        """Runs an operation of torch, and keeps where its outputs depend on the layers followed.
+
+        Returns:
+            What the operation gives.
+        """
         kwargs = kwargs or {}
         # Inputs by the number of the argument; those in lists and keywords have none.
         inputs = [

@@ -203,7 +203,8 @@ def test_a_calibration_that_the_image_contradicts_is_warned_of(tmp_path: Path) -
 
 def test_a_valid_calibration_is_not_warned_of_for_beams_without_return(tmp_path: Path) -> None:
     whole = np.fromfile(STREET / "000000.bin", "<f4").reshape(-1, 4)
-    np.concatenate([np.zeros((300_000, 4), "<f4"), whole]).tofile(tmp_path / "silent.bin")
+    silent = np.zeros((3 * len(whole), 4), "<f4")
+    np.concatenate([silent, whole]).tofile(tmp_path / "silent.bin")
     np.savetxt(tmp_path / "pose.txt", matrix("Tr_velo_to_cam"))
     assert warnings_of(tmp_path / "silent.bin", extrinsics=tmp_path / "pose.txt") == []
 

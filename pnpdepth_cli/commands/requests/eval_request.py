@@ -93,9 +93,12 @@ class EvalRequest:
             if value is not None and not (math.isfinite(value) and value > least):
                 raise UsageError(f"{flag} must be a finite number above {least:g}, got {value:g}")
         inverse_factor("--gt-kind", self.gt_kind)
-        near, far = self.depth_limits or (1.0, 2.0)
-        if not (0 < near < far and math.isfinite(far)):
-            raise UsageError(f"--by-depth must be two rising depths in metres: {near:g} {far:g}")
+        if self.depth_limits is not None:
+            near, far = self.depth_limits
+            if not (0 < near < far and math.isfinite(far)):
+                raise UsageError(
+                    f"--by-depth must be two rising depths in metres: {near:g} {far:g}"
+                )
         if self.is_devkit and (self.delta != _DELTA or self.depth_limits):
             raise UsageError(
                 f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"

@@ -53,11 +53,15 @@ def concatenate(call: Call) -> Spread:
 
 @rule("stack")
 def stack(call: Call) -> Spread:
-    """Returns boxes with a new axis, from the first to the last place of the input along it."""
+    """Returns boxes with a new axis, from the first to the last place of the input along it.
+
+    `torch.stack` may be given one tensor several times; the box then reaches over all its places.
+    """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
     places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
     if not places:
         return everywhere(call)
+    # A box that is empty stays so: its last place is before its first.
     empty = call.spread.empty()
     first = torch.full((len(empty),), places[0]).masked_fill(empty, NOWHERE)
     last = torch.full((len(empty),), places[-1]).masked_fill(empty, -1)

@@ -28,6 +28,16 @@ _TYPES = {
 _TEXT = 7  # such as the graph of objects that TensorFlow 2 puts beside the variables
 _MAX_NAME = 1_000  # bytes of a variable's name
 
+# Numbers of fields in TensorFlow's tensor_bundle.proto: of the header, and of a variable's entry.
+_SHARD_COUNT = 1
+_IS_BIG_ENDIAN = 2
+_TYPE = 1
+_SHAPE = 2
+_SHARD = 3
+_OFFSET = 4
+_SIZE = 5
+_SLICES = 7
+
 _Fields = dict[int, list[Any]]  # of a protocol buffer, by number
 
 
@@ -39,7 +49,7 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     # The table of variables, after its header.
     table = dict(_table(index.read_bytes()))
     header = _message(table.pop(b"", b""))
-    if _last(header, 2) != 0:
+    if _last(header, _IS_BIG_ENDIAN) != 0:
         raise InputError("it was written on a big-endian machine")
     shards: dict[int, bytes] = {}
     tensors: dict[str, Tensor] = {}
@@ -47,19 +57,20 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
     for key, entry in table.items():
         name = key.decode()
         fields = _message(entry)
-        if 7 in fields:
+        if _SLICES in fields:
             raise InputError("a variable is in slices")
-        if _last(fields, 1) == _TEXT:
+        if _last(fields, _TYPE) == _TEXT:
             continue
         # The file of its values, read once.
-        shard = _last(fields, 3)
+        shard = _last(fields, _SHARD)
         if shard not in shards:
-            path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{_last(header, 1):05d}")
+            count = _last(header, _SHARD_COUNT)
+            path = index.with_name(f"{index.stem}.data-{shard:05d}-of-{count:05d}")
             check_network_file(path, f"checkpoint {index}: its file")
             shards[shard] = path.read_bytes()
             left += len(shards[shard])
         # Variables claim no more than the files have.
-        size = _last(fields, 5)
+        size = _last(fields, _SIZE)
         check_claim(f"{name} has {size:,} bytes", size, left)
         left -= size
         tensors[name.replace("/", ".")] = _tensor(name, fields, shards[shard])
@@ -67,10 +78,10 @@ def read_tensor_bundle(index: Path) -> dict[str, Tensor]:
 
 
 def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
-    kind, offset, size = (_last(fields, number) for number in (1, 4, 5))
+    kind, offset, size = (_last(fields, number) for number in (_TYPE, _OFFSET, _SIZE))
     if kind not in _TYPES:
         raise InputError(f"{name} is of TensorFlow's type {kind}, not of numbers")
-    sides = _message(fields[2][-1]).get(2, []) if 2 in fields else []
+    sides = _message(fields[_SHAPE][-1]).get(2, []) if _SHAPE in fields else []
     shape = [_last(_message(side), 1) for side in sides]
     if math.prod(shape) * _TYPES[kind].itemsize != size or offset + size > len(content):
         raise InputError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
