@@ -34,6 +34,7 @@ from pnpdepth_cli.measures import (
     choose_measures,
     frame_means,
 )
+from pnpdepth_cli.settings import OF_UPDATES
 
 Means = dict[str, float | None]
 """Means by the key of their measure; None where no frame has it."""
@@ -137,6 +138,7 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     """Returns the runs on the frames that all of them scored, compared with the first.
 
     A measure that a frame lacks in one of the runs is averaged and tested over the other frames.
+    Runs of a study whose settings give the same result are one.
 
     Args:
         paths: Outputs of `pnpdepth eval --json`, summaries of batches, or the folders of these; the
@@ -150,7 +152,9 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     """
     if len(paths) < 2:
         raise UsageError("two runs at least are needed to compare; name another one")
-    runs = [_read_run(path) for path in paths]
+    runs, same = _different([_read_run(path) for path in paths])
+    if len(runs) < 2:
+        raise UsageError(f"{same[0]}; name a run with another result")
     names, measures = _shared(runs, columns)
     keys = [measure.key for measure in measures]
     # the values that all runs have; None becomes NaN
@@ -184,7 +188,42 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
         clusters=clusters,
         notes=[],
     )
-    return replace(found, notes=[*_notes(runs, found, known)])
+    return replace(found, notes=[*same, *_notes(runs, found, known)])
+
+
+def _different(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """The runs without those that repeat an earlier one, and a line on each that was repeated.
+
+    Studies of earlier versions have a run for each step size where z is not updated at all. Such
+    runs are one if their scores are the same as well.
+    """
+    kept = list[Run]()
+    repeats = defaultdict[str, list[str]](list)
+    for run in runs:
+        if run.varied.get("iterations") != "0":
+            kept.append(run)
+            continue
+        effective = {name: text for name, text in run.varied.items() if name not in OF_UPDATES}
+        of_effect = replace(run, varied=effective)
+        earlier = next((other for other in kept if _is_repeat(of_effect, other)), None)
+        if earlier is None:
+            kept.append(of_effect)
+        else:
+            repeats[earlier.path].append(run.path)
+    notes = [
+        f"listed once, as {path}: {', '.join(others)} gave the same result, since z is not updated"
+        for path, others in repeats.items()
+    ]
+    return kept, notes
+
+
+def _is_repeat(run: Run, earlier: Run) -> bool:
+    """Whether a run has the settings, frames and scores of an earlier one."""
+    if run.varied != earlier.varied or run.frames.keys() != earlier.frames.keys():
+        return False
+    return all(
+        record.errors[GT] == earlier.frames[name].errors[GT] for name, record in run.frames.items()
+    )
 
 
 def _in_order(runs: Sequence[ComparedRun]) -> list[ComparedRun]:

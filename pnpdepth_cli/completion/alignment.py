@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import FITS, READINGS
-from pnpdepth_cli.completion.robust_line import fit_line, fit_location, mean_error
+from pnpdepth_cli.completion.robust_line import MAX_ERROR, fit_line, fit_location, mean_error
 from pnpdepth_cli.core.losses import MAD_TO_STD
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
@@ -52,6 +52,9 @@ _GROSS = 0.05
 
 _GROSS_STDS = 3.0
 """Errors below so many standard deviations are none either."""
+
+_ALIKE = 1.0
+"""Standard errors of the difference between two fits' criteria within which they are alike."""
 
 _DISTINCT = 1e-9
 """Range of x over its largest size below which x is the same at all points."""
@@ -83,7 +86,7 @@ _READINGS = {
     "inverted-disparity": _Reading("the inverse of a disparity", "inverse", "inverse"),
     "power": _Reading("a power of depth", "log", "log"),
 }
-_OF_KIND = {"depth": "depth", "inverse": "disparity", "log": "log"}
+READING_OF_KIND = {"depth": "depth", "inverse": "disparity", "log": "log"}
 """The reading of a definition's `output_kind`."""
 
 _OF_SCALE = {"affine": ("affine",), "scale": ("scale", "affine")}
@@ -151,14 +154,17 @@ class Alignment:
             return math.exp(min(max(min(ends), -_LARGEST_LOG), _LARGEST_LOG))
         return 1 / max(ends) if max(ends) > 0 else math.inf
 
+    @property
+    def title(self) -> str:
+        """What the numbers are, in a sentence."""
+        title = _READINGS[self.reading].title
+        if self.reading == "power" and self.scale < 0:
+            return "a power of disparity"
+        return f"negated {title}" if self.scale < 0 else title
+
     def __str__(self) -> str:
         if self.scale == 0:
             return "the network's output is read as one depth everywhere"
-        title = _READINGS[self.reading].title
-        if self.reading == "power" and self.scale < 0:
-            title = "a power of disparity"
-        elif self.scale < 0:
-            title = f"negated {title}"
         farther = (self.scale < 0) == (self.reading == "disparity")
         if self.reading == "power":
             fitted = f"fitted by factor and exponent {self.scale:.3g}"
@@ -169,7 +175,7 @@ class Alignment:
         else:
             fitted = f"fitted by {self.kind}"
         sense = "farther" if farther else "nearer"
-        return f"the network's output is read as {title} (larger is {sense}), {fitted}"
+        return f"the network's output is read as {self.title} (larger is {sense}), {fitted}"
 
 
 def candidates(
@@ -186,7 +192,7 @@ def candidates(
         output_kind: What a definition states, of `choices.OutputKind`.
         output_scale: What a definition states, of `choices.OutputScale`.
     """
-    stated = _OF_KIND.get(output_kind)
+    stated = READING_OF_KIND.get(output_kind)
     # A reading that contradicts the definition leaves its scale open, too.
     if asked in READINGS and asked != stated:
         output_scale = "unknown"
@@ -213,6 +219,25 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
 
     Args:
         x: (N,) the network's numbers at the points.
+        points: The points.
+        tried: The candidates, that of what is stated first.
+
+    Raises:
+        NoPointsError: There are too few points.
+        ModelError: The numbers do not vary, or are not finite.
+    """
+    return alignments(x, points, tried)[0]
+
+
+def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> list[Alignment]:
+    """Returns the alignment with the points, and then those that explain them as well.
+
+    The latter are the best ones of other readings, the better first. They are worse by no more than
+    the standard error of the difference, which the points have by chance.
+
+    Args:
+        x: (N,) the network's numbers at the points.
+        points: The points.
         tried: The candidates, that of what is stated first.
 
     Raises:
@@ -230,7 +255,11 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
     x, d = x[finite], d[finite]
     fits = [fit for candidate in tried if (fit := _fit(x, d, candidate)) is not None]
     if fits:
-        return min(fits, key=_bic)
+        # The best of each reading; the first of the best.
+        ordered = sorted(fits, key=_bic)
+        readings = {fit.reading: fit for fit in reversed(ordered)}
+        best, *others = (fit for fit in ordered if readings[fit.reading] is fit)
+        return [best, *(fit for fit in others if _is_alike(fit, best, x, d))]
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
@@ -378,6 +407,20 @@ def _bic(fit: Alignment) -> float:
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
     error = max(fit.misfit, _LEAST_ERROR) if fit.points > parameters else _UNTESTED
     return 2 * fit.points * math.log(error) + parameters * math.log(fit.points)
+
+
+def _is_alike(fit: Alignment, best: Alignment, x: Tensor, d: Tensor) -> bool:
+    """Whether a fit explains the points as well as the best one, within what they have by chance.
+
+    The criterion has the logarithm of the mean error. The standard error of the difference of two
+    follows from the differences that single points make.
+    """
+    shares = [
+        (of.depth(x).log() - d.log()).abs().clamp_max(MAX_ERROR) / max(of.misfit, _LEAST_ERROR)
+        for of in (fit, best)
+    ]
+    by_chance = 2 * math.sqrt(len(x)) * float((shares[0] - shares[1]).std(correction=0))
+    return _bic(fit) - _bic(best) <= _ALIKE * by_chance
 
 
 def _bounds(d: Tensor) -> Tensor:

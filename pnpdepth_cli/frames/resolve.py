@@ -318,7 +318,7 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
             lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
-            misfits.append(align_output(definition, at_points, points, "auto").error + lost)
+            misfits.append(align_output(definition, at_points, points, "auto")[0].error + lost)
         except NoPointsError:
             continue
         except ModelError:

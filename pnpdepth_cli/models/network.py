@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,12 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.budget import check_claim, max_network_pixels
 from pnpdepth_cli.choices import FITS, READINGS
-from pnpdepth_cli.completion.alignment import Alignment, align, candidates
+from pnpdepth_cli.completion.alignment import (
+    READING_OF_KIND,
+    Alignment,
+    alignments,
+    candidates,
+)
 from pnpdepth_cli.completion.outliers import off_together
 from pnpdepth_cli.completion.two_depths import is_reversed, rank_correlation
 from pnpdepth_cli.core.split import Split
@@ -70,6 +76,10 @@ one fits the points of a wall, too."""
 _GROUP = 0.06
 """Fraction of the points that contradict such a network together, from which on it is said. Of 34
 predictions of strong networks with 200 or 500 points each, 5.5 % at most do."""
+_OTHER_MAP = 0.03
+"""Mean difference of log depth over the image from which on two readings give different maps."""
+_COMPARED = 10_000
+"""Pixels that this mean is over."""
 _MOST_LOST = 0.5
 """Fraction of the points that may lie where the prediction is unknown, without a warning."""
 _FEW_UNKNOWN = 1e-4
@@ -291,8 +301,10 @@ class AlignedDepth:
         if self._kind == "none":
             self.notes += self._plain_notes(at_points)
             return
-        self.alignment = align_output(definition, at_points, self._points, self._kind)
+        fits = align_output(definition, at_points, self._points, self._kind)
+        self.alignment = fits[0]
         self.notes += self._notes(self.alignment, raw)
+        self.notes += self._alike_notes(fits, raw)
         self.notes += self._group_notes(self.alignment, at_points)
 
     def _unknown_notes(self, raw: Tensor, seen: Tensor) -> tuple[str, ...]:
@@ -325,6 +337,33 @@ class AlignedDepth:
             f" {definition.name!r} (rank correlation {rank:.2f}): if the points hold disparity or"
             " 1/depth, --sparse-kind reads them; if the network gives another kind of depth than is"
             " stated, --align states it",
+        )
+
+    def _alike_notes(self, fits: Sequence[Alignment], raw: Tensor) -> tuple[str, ...]:
+        """Which readings explain the points as well as the chosen one, and give other maps.
+
+        None where the chosen one is stated.
+        """
+        best, *others = fits
+        stated = READING_OF_KIND.get(self._network.definition.output_kind)
+        if best.reading in (self._kind, stated):
+            return ()
+        numbers = raw[raw.isfinite()].cpu().double()
+        numbers = numbers[:: max(1, len(numbers) // _COMPARED)]
+        log_depth = best.depth(numbers).log()
+        texts = []
+        for other in others:
+            differs = float((other.depth(numbers).log() - log_depth).abs().mean())
+            if differs > _OTHER_MAP:
+                texts.append(
+                    f"{other.title} ({other.reading}, off by {other.error:.1%} against"
+                    f" {best.error:.1%}, and the map differs by {differs:.0%})"
+                )
+        if not texts:
+            return ()
+        return (
+            f"note: the {best.points:,} points are explained as well by {' and by '.join(texts)};"
+            " --align states what is right",
         )
 
     def _group_notes(self, fit: Alignment, at_points: Tensor) -> tuple[str, ...]:
@@ -402,8 +441,10 @@ class AlignedDepth:
 
 def align_output(
     definition: ModelDefinition, x: Tensor, points: SparsePoints, asked: str
-) -> Alignment:
+) -> list[Alignment]:
     """Returns the alignment of a network's numbers with the points, of all that it can have.
+
+    Those of other readings that explain the points as well follow.
 
     Args:
         definition: What is stated of the numbers.
@@ -418,7 +459,7 @@ def align_output(
     if asked == "auto" and len(points) == 1:
         asked = "scale"  # one point shows no shift
     tried = candidates(asked, definition.output_kind, definition.output_scale)
-    return align(x, points, tried)
+    return alignments(x, points, tried)
 
 
 def load_network(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
@@ -334,3 +335,26 @@ def test_what_is_no_plot_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UsageError, match="plot"):
         plot_comparison(comparison, tmp_path / "p.png")
+
+
+def test_runs_without_updates_at_several_step_sizes_are_listed_once(tmp_path: Path) -> None:
+    study = [
+        refined(tmp_path, 0.5, iterations="0", lr="0.01"),
+        refined(tmp_path, 0.4, iterations="5", lr="0.01"),
+        refined(tmp_path, 0.5, iterations="0", lr="0.1"),
+        refined(tmp_path, 0.3, iterations="5", lr="0.1"),
+    ]
+    found = compare(study)
+    assert [run.path for run in found.runs] == [study[0], study[1], study[3]]
+    assert found.reference.varied == {"iterations": "0"}
+    (said,) = (note for note in found.notes if study[2] in note)
+    assert study[0] in said
+    # A run whose scores differ is another result, whatever its settings.
+    other = refined(tmp_path, 0.6, iterations="0", lr="0.2")
+    assert len(compare([study[0], other]).runs) == 2
+
+
+def test_runs_that_all_gave_one_result_are_nothing_to_compare(tmp_path: Path) -> None:
+    study = [refined(tmp_path, 0.5, iterations="0", lr=lr) for lr in ("0.01", "0.1")]
+    with pytest.raises(UsageError, match=re.escape(study[1])):
+        compare(study)

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from pnpdepth_cli.choices import READINGS
-from pnpdepth_cli.completion.alignment import Alignment, Candidate, align, candidates
+from pnpdepth_cli.completion.alignment import Alignment, Candidate, align, alignments, candidates
 from pnpdepth_cli.errors import ModelError, NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
@@ -247,3 +247,22 @@ def test_a_stated_network_that_gives_the_same_everywhere_is_one_depth_everywhere
     fit = align(torch.ones(20), points_of(d), candidates("auto", "inverse", "affine"))
     assert fit.scale == 0
     assert float(d.min()) < float(fit.depth(torch.zeros(1))) < float(d.max())
+
+
+def test_readings_that_explain_few_points_as_well_follow_the_chosen_one() -> None:
+    d = 2 + 0.6 * torch.rand(10, generator=torch.Generator().manual_seed(1))  # a small range
+    x = OUTPUTS["inverted-disparity"](d) * (0.02 * normal(10, 2)).exp()
+    best, *others = alignments(x, points_of(d), candidates("auto"))
+    assert best == align(x, points_of(d), candidates("auto"))
+    assert others
+    readings = [fit.reading for fit in (best, *others)]
+    assert len({*readings}) == len(readings)
+    assert all(fit.misfit < 1.5 * best.misfit for fit in others)
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_many_points_over_a_large_range_are_explained_by_one_reading_alone(reading: str) -> None:
+    d = scene(200, 3)
+    x = OUTPUTS[reading](d) * (0.003 * normal(200, 4)).exp()
+    (only,) = alignments(x, points_of(d), candidates("auto"))
+    assert only.reading == reading

@@ -212,3 +212,22 @@ def test_a_build_that_raises_or_returns_no_module_is_refused(build: Callable[...
 def test_a_missing_device_is_refused_in_one_line(name: str) -> None:
     with pytest.raises(DeviceError, match=r"\A.+\Z"):
         find_device(name)
+
+
+@pytest.mark.parametrize(
+    ("stated", "asked", "is_said"),
+    [("unknown", "auto", True), ("inverse", "auto", False), ("unknown", "disparity", False)],
+)
+def test_another_reading_that_explains_few_points_as_well_is_said_unless_one_is_stated(
+    stated: OutputKind, asked: str, is_said: bool
+) -> None:
+    # The points show a small part of the range of depths.
+    depth = torch.linspace(1, 8, 80)[None]
+    noise = torch.randn(10, generator=torch.Generator().manual_seed(2))
+    xy = torch.stack([torch.arange(14.0, 24.0), torch.zeros(10)], dim=1)
+    points = SparsePoints(xy=xy, depth=depth[0, 14:24] * (0.02 * noise).exp(), size=(1, 80))
+    reader = AlignedDepth(network(output_kind=stated, output_scale="affine"), points, asked)
+    reader((1 / depth)[None, None])
+    notes = [note for note in reader.notes if "explained as well" in note]
+    assert bool(notes) == is_said
+    assert all("10 points" in note and "--align" in note for note in notes)
