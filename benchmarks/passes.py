@@ -3,8 +3,12 @@
 One frame of the indoor sample is refined with a user's network, fused with `compact` and alone, and
 every pass of the two is counted by the step that makes it: whole passes, passes of the front, of
 the rear with and without a gradient, and backward passes. Beside them stand the processor's seconds
-of the whole frame, those spent in each network, and those of one bare pass of the user's network.
-The second frame of a network that stays open is that of a batch.
+of the whole frame, those spent in each network, and those of one bare pass of each. The second
+frame of a network that stays open is that of a batch.
+
+The bound of a frame is what 20 updates and 3 passes of the user's network take, and 15 % of that,
+and what the frame spends in `compact`. A network of random weights is updated in `fused` only if
+the user says so: `--iterations 5`.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from torch import nn
 from benchmarks.first_result import SAMPLE, anything_small
 from benchmarks.frames import EvalFrame, drawn_inputs, print_row
 from pnpdepth_cli.core import refine_z as updating
-from pnpdepth_cli.core.split import Split
+from pnpdepth_cli.core.split import Split, gradient_at
 from pnpdepth_cli.frames import experts, method, refine_frame, resolve, validation
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.method import Method
@@ -48,7 +52,11 @@ STEPS = {
 """Functions whose passes are a step by themselves."""
 ANYTHING = "anything-small"
 """A Hugging Face folder of random weights with the shape of Depth Anything V2 Small."""
-RUNS = 3  # of the bare pass, whose median is taken
+RUNS = 3  # of a bare pass or an update, whose median is taken
+BOUND_UPDATES = 20
+BOUND_PASSES = 3
+BOUND_REST = 1.15
+"""What a frame may take over these updates and passes, beside `compact`."""
 
 
 class Passes:
@@ -163,6 +171,22 @@ def bare_seconds(network: Network, frame: Frame) -> float:
     return statistics.median(spent)
 
 
+def update_seconds(member: OpenNetwork, frame: Frame) -> float:
+    """The processor's seconds of one update of z: the rear, and its gradient."""
+    network = member.network
+    spent = list[float]()
+    with network.cut_at(member.layer) as split:
+        z0 = split.front(*prepare(network, frame).arguments)
+        with torch.no_grad():
+            split.rear(z0)  # which is recorded
+        for _ in range(RUNS):
+            z = z0.detach().requires_grad_()
+            start = time.process_time()
+            gradient_at(z, network.map_of(split.rear(z)).mean())
+            spent.append(time.process_time() - start)
+    return statistics.median(spent)
+
+
 def report(title: str, network: Network, frame: Frame, settings: Settings) -> None:
     """Prints the passes of a first and of a second frame, and the seconds."""
     passes = Passes()
@@ -172,6 +196,7 @@ def report(title: str, network: Network, frame: Frame, settings: Settings) -> No
         open_.enter_context(mock.patch.object(method, "load_network", return_value=companion))
         open_.enter_context(passes.watched())
         refiner = open_.enter_context(Method([network], settings, frame))
+        spent_on_frame = dict[str, tuple[float, Counter[str]]]()
         for which in ("first", "second"):
             passes.seconds.clear()
             start = time.process_time()
@@ -179,17 +204,31 @@ def report(title: str, network: Network, frame: Frame, settings: Settings) -> No
             spent = time.process_time() - start
             for (name, step), counted in passes.counts.items():
                 print_row(title, which, name, step, *(counted[kind] or "" for kind in KINDS))
-            own = passes.seconds[network.definition.name]
-            seconds = f"{spent:.2f} s; in the user's network {own:.2f} s"
-            print_row(title, which, "seconds", seconds, *[""] * len(KINDS))
+            spent_on_frame[which] = spent, passes.seconds.copy()
             passes.counts.clear()
-    print_row(title, "", "bare pass", f"{bare_seconds(network, frame):.2f} s", *[""] * len(KINDS))
+        member = refiner.members[0]
+    # The seconds, beside those of one pass, one update, and the bound.
+    bare = bare_seconds(network, frame)
+    update = update_seconds(member, frame)
+    of_compact = bare_seconds(companion, frame)
+    empty = [""] * len(KINDS)
+    for which, (spent, seconds) in spent_on_frame.items():
+        own = seconds[network.definition.name]
+        most = BOUND_REST * (BOUND_UPDATES * update + BOUND_PASSES * bare)
+        most += seconds[companion.definition.name]
+        times = f"{spent:.2f} s; in the user's network {own:.2f} s; bound {most:.2f} s"
+        print_row(title, which, "seconds", times, *empty)
+        times = f"{spent / of_compact:.1f} passes of compact"
+        print_row(title, which, "seconds", times, *empty)
+    print_row(title, "", "one pass", f"{bare:.2f} s, of compact {of_compact:.2f} s", *empty)
+    print_row(title, "", "one update", f"{update:.2f} s", *empty)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
     parser.add_argument("--methods", nargs="+", default=["fused", "alone"])
+    parser.add_argument("--iterations", type=int, help="updates of z that the user states")
     parser.add_argument("--models", nargs="+", default=["fcrn-tiny", ANYTHING])
     args = parser.parse_args()
     print_row("frame", "", "network", "step", *KINDS, head=True)
@@ -201,7 +240,7 @@ def main() -> None:
             for chosen in args.methods:
                 for count in args.points:
                     network = load_network(model, None)
-                    settings = Settings(method=chosen)
+                    settings = Settings(method=chosen, iterations=args.iterations)
                     title = f"{Path(name).name}, {chosen}, {count}"
                     report(title, network, sample(count), settings)
 

@@ -35,7 +35,6 @@ from pnpdepth_cli.io.bags import (
     Message,
     check_topics,
     choose_topic,
-    is_bag,
     messages,
     open_bag,
 )
@@ -135,12 +134,10 @@ def write_frames(request: FramesRequest, say: Say) -> int:
 
 
 def unpack(request: BatchRequest, say: Say) -> BatchRequest:
-    """Returns the request with the frames of its bag as source; any other request as it is.
+    """Returns the request with the frames of its bag as source.
 
     The frames are written to OUTPUT_frames, and stay there for the next run.
     """
-    if not is_bag(request.source):
-        return request
     folder = request.output.with_name(f"{request.output.name}_frames")
     whole = request.limit is None or request.names is not None
     between = None if whole else (0, request.every * (request.limit or 1) - 1)

@@ -80,6 +80,7 @@ class NetworkExpert(Expert):
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
     unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
     not_updated: float = 0.0  # 0…1, the part that the aligned depth has beside the updated one
+    untrusted: bool = False  # whether z is not updated only because of missing trust
     harm: tuple[float, float] | None = None
     """Errors in metres at the validation points without and with updates of z, if these are not
     used because of them."""
@@ -109,12 +110,14 @@ class Experts(NamedTuple):
     warnings: tuple[str, ...] = ()
 
     @property
-    def of_users(self) -> list[Expert]:
+    def of_users(self) -> list[NetworkExpert]:
         """The user's networks, each with its own depth."""
         return [
             expert
             for expert in self.every
-            if expert.user is not None and expert.user.name == expert.name
+            if isinstance(expert, NetworkExpert)
+            and expert.user is not None
+            and expert.user.name == expert.name
         ]
 
     def replaced(self, changed: Sequence[Expert]) -> Experts:
@@ -210,6 +213,7 @@ def expert_of_user(
     whole = judged.by(network)
     unexplained = 1.0
     updates = True
+    untrusted = False
     # What its depth without updates leaves unexplained decides whether z is updated.
     if not network.takes_points:
         whole = whole or network.refine(split.whole, updates=network.always_updated)
@@ -218,10 +222,12 @@ def expert_of_user(
         stated = network.always_updated or network.tuned
         if needs_trust and not stated:
             updates = trust_in_image(whole.aligned, split.whole.points) > 0
-        wanted = network.always_updated or (updates and strength_of(unexplained) < 1)
-        if wanted and not whole.updates and network.is_updated(split.whole):
+        gains = network.always_updated or strength_of(unexplained) < 1
+        wanted = gains and not whole.updates and network.is_updated(split.whole)
+        untrusted = wanted and not updates
+        if wanted and updates:
             whole = network.refine(split.whole)
-    return expert_of(
+    expert = expert_of(
         network,
         split,
         network.name,
@@ -230,6 +236,7 @@ def expert_of_user(
         updates=updates,
         unexplained=unexplained,
     )
+    return replace(expert, untrusted=untrusted)
 
 
 def _mix_with_aligned(prediction: Prediction, not_updated: float) -> Tensor:

@@ -55,14 +55,14 @@ def fit_weights(
         split: The frame and its validation points.
         chosen: (M,) bool, the validation points to fit. None: all.
     """
-    from scipy.optimize import nnls
-
     having = [expert for expert in experts if expert.weight > 0]
     prior = np.array([expert.weight for expert in having])
     prior = prior / prior.sum()
     fitted = prior
     points = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
     if len(having) > 1 and bool(points.any()):
+        from scipy.optimize import nnls
+
         # Log predictions and log depths, relative to the prediction with the prior weights.
         at = torch.stack([expert.at for expert in having], dim=1)[points].double()
         mean = weighted_mean([(at[:, k], float(w)) for k, w in enumerate(prior)])

@@ -365,10 +365,15 @@ def _validation(
 def _notes_on_networks(
     experts: Experts, split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[str]:
-    """Which of the user's networks have no part in the result, and why."""
+    """Which of the user's networks have no part in the result or are not updated, and why."""
     notes: list[str] = []
     alone = experts.alone
     for network in experts.of_users:
+        if network.untrusted:
+            notes.append(
+                f"z of {network.name} is not updated: its aligned depth explains too little of the"
+                " points for updates to reach the result; `iterations` updates it all the same"
+            )
         # Its depth, and what the network that takes a prior makes of it.
         experts_of_user = [expert for expert in experts.every if expert.user is network.user]
         if sum(weights[expert.name] for expert in experts_of_user) >= LEAST_PART:

@@ -10,6 +10,7 @@ Nothing is kept of networks in Python files, whose code may be anywhere.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -19,6 +20,7 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.models.file_graph import FileGraph
@@ -36,6 +38,9 @@ FOLDER = "PNPDEPTH_CACHE"
 _MOST_BYTES = 1 << 18  # of a file that is read
 _MOST_ANSWERS = 100  # of a network; a batch asks some for each size of image
 _HEADER_BYTES = 1 << 24  # of a safetensors file, with the names and shapes of its tensors
+
+# Each network's digest, as long as the network is in use: its file is read once.
+_DIGESTS = WeakKeyDictionary["nn.Module", str]()
 
 
 def cache_folder() -> Path:
@@ -106,6 +111,7 @@ def forget() -> None:
             raise OutputError(f"{path} cannot be removed ({error.strerror})") from None
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     versions = {"pnpdepth": __version__}
     for package in ("torch", "transformers", "onnx", "onnxruntime"):
@@ -116,6 +122,9 @@ def _versions() -> dict[str, str]:
 
 def _digest(module: nn.Module, file: Path) -> str | None:
     """The digest of what describes the network; None if its code is not in files that are known."""
+    known = _DIGESTS.get(module)
+    if known is not None:
+        return known
     parts = list[bytes]()
     try:
         if isinstance(module, FileGraph):
@@ -134,7 +143,8 @@ def _digest(module: nn.Module, file: Path) -> str | None:
     for content in parts:
         digest.update(len(content).to_bytes(8, "little"))
         digest.update(content)
-    return digest.hexdigest()
+    _DIGESTS[module] = digest.hexdigest()
+    return _DIGESTS[module]
 
 
 def _read(path: Path) -> dict[str, list[str]]:

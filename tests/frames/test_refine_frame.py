@@ -166,6 +166,23 @@ def test_z_of_a_useless_network_is_updated_only_if_the_user_says_so(
     result = refined(frame_in_memory(100), network, compact())
     assert len(result.losses) - 1 == updates
     assert result.weights["noise"] == 0
+    said = [note for note in result.notes if note.startswith("z of noise is not updated")]
+    assert bool(said) is not stated
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        member(Noise, settings=ALIGNED),  # it is never updated
+        member(Brightness, settings=UPDATES),  # its updates are used
+        member(Exact, settings=UPDATES),  # it takes the points
+    ],
+)
+def test_nothing_is_said_of_trust_where_it_does_not_decide_about_updates(
+    network: OpenNetwork,
+) -> None:
+    result = refined(frame_in_memory(100), network, compact())
+    assert not [note for note in result.notes if "is not updated" in note]
 
 
 def test_the_result_at_a_validation_point_does_not_depend_on_its_depth() -> None:
@@ -327,7 +344,8 @@ def test_a_network_that_takes_the_image_alone_runs_no_more_often_than_its_update
     assert result.validation is not None
     assert len(result.losses) == 1 + updates
     assert len(result.used) <= 120 - outlying
-    # The plain pass serves all points and validation points; each of the two is updated by itself.
+    # The plain pass serves all points and validation points; each of the two is updated by itself,
+    # unless the network is strong, or, beside `compact`, not trusted.
     assert own.network.module.front.passes == 1
     assert own.network.module.rear.passes == (1 + 2 * (1 + updates) if updates else 1)
 

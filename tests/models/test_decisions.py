@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import multiprocessing
 import threading
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -169,6 +172,70 @@ def test_a_folder_that_cannot_be_written_changes_nothing(
     assert decided(file) == decided(file)
     assert len(asked) == 4
     assert cache.read_text() == "a file where the folder would be"
+
+
+def test_a_folder_that_can_only_be_read_still_recalls(
+    file: str, asked: list[str], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object, **options: object) -> object:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    first = decided(file)
+    monkeypatch.setattr(decisions.tempfile, "mkstemp", refuse)
+    before = {path: path.read_bytes() for path in cache.iterdir()}
+    assert decided(file) == first
+    # What is new is decided each time.
+    default_layer(load_network(file, None), SIZE, 500)
+    default_layer(load_network(file, None), SIZE, 500)
+    assert asked == ["suggest_layers", *["fields_of"] * 3]
+    assert {path: path.read_bytes() for path in cache.iterdir()} == before
+
+
+def _ask_often(loaded: Any, number: int) -> None:
+    """Asks of a network what another process does not; exit code 1 for an answer of another's."""
+    for count in range(30):
+        text = f"{number}.{count}"
+        answer = decisions.recalled(loaded.module, loaded.checkpoint, text, partial(list, [text]))
+        if answer != [text]:
+            raise SystemExit(1)
+
+
+@pytest.mark.skipif(
+    "fork" not in multiprocessing.get_all_start_methods(), reason="the system cannot fork"
+)
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_processes_that_write_at_once_leave_a_whole_file(
+    file: str, asked: list[str], cache: Path
+) -> None:
+    first = decided(file)
+    loaded = load_network(file, None)
+    context: Any = multiprocessing.get_context("fork")
+    processes = [context.Process(target=_ask_often, args=(loaded, number)) for number in range(4)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 4
+    (kept,) = decisions.kept()
+    assert [path for path in cache.iterdir() if path != kept] == []
+    # An answer may be lost, but none is wrong.
+    answers = json.loads(kept.read_text())["answers"]
+    asked_by_processes = {text: answer for text, answer in answers.items() if text[1:2] == "."}
+    assert asked_by_processes
+    assert all(answer == [text] for text, answer in asked_by_processes.items())
+    assert decided(file) == first
+
+
+def test_the_file_of_a_network_in_use_is_read_once_for_all_questions(
+    file: str, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = load_network(file, None)
+    decisions.recalled(loaded.module, loaded.checkpoint, "one", lambda: ["a"])
+    read = list[Path]()
+    original = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or original(path))
+    decisions.recalled(loaded.module, loaded.checkpoint, "two", lambda: ["b"])
+    assert loaded.checkpoint not in read
 
 
 def test_two_that_write_at_once_leave_a_whole_file(file: str) -> None:

@@ -12,6 +12,7 @@ from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions
 from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
@@ -160,6 +161,11 @@ class BatchRequest:
         if self.ray is not None and self.refine.device not in ("cpu", "cuda"):
             raise UsageError("--ray computes on --device cpu, or on all GPUs with --device cuda")
         choose_measures(MEASURES, self.columns)
+
+    @property
+    def is_of_bag(self) -> bool:
+        """Whether the source is a bag, whose frames are unpacked first."""
+        return is_bag(self.source)
 
     @property
     def reading(self) -> ReadOptions:
