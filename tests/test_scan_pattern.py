@@ -38,3 +38,19 @@ def test_random_points_and_a_few_lines_are_no_scan() -> None:
         assert scan_lines(xy, SIZE) is None
     xy, line = lines_of_points(4)
     assert scan_lines(xy[line < 8], SIZE) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_points_of_a_wide_area_are_no_scan(seed: int) -> None:
+    """In a band of an image, most points have no other in their column."""
+    xy = np.random.default_rng(seed).uniform((0, 200), (640, 300), (500, 2))
+    assert scan_pattern(xy, (480, 640)) is None
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_a_scan_stays_one_when_it_is_thinned(share: float) -> None:
+    xy, _ = lines_of_points(7)
+    chosen = np.random.default_rng(0).uniform(size=len(xy)) < share
+    repeated = np.concatenate([xy[chosen], xy[chosen] + [0, 120], xy[chosen] + [300, 0]])
+    assert len(repeated) > 500
+    assert scan_pattern(repeated, (240, 600)) is not None

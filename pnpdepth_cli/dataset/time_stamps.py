@@ -33,7 +33,7 @@ def time_of(path: Path) -> float | None:
     number = found[1]
     if "." in number:
         return float(number)
-    return float(int(number) / 10 ** (len(number) - _DIGITS_OF_SECONDS))
+    return int(number) / 10.0 ** (len(number) - _DIGITS_OF_SECONDS)
 
 
 def time_warning(image: Path, depth: Path) -> str | None:

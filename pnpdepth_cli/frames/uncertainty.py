@@ -103,6 +103,9 @@ _REACHED = 0.8
 """Fraction of that distance around the middle of a gap that belongs to the gap."""
 _LEAST_GAP = 0.01
 """Least fraction of the image in the middle of gaps."""
+_LARGE_GAPS = 0.05
+"""The same of gaps that tell without a sharp end. Of 12 rooms with all their depth two have as
+large gaps, with no point at the end beside them."""
 _AT_BORDER = 0.25
 """Least fraction of the points beside the gaps that are at the end."""
 
@@ -279,20 +282,18 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
 def beyond_range(points: SparsePoints) -> Tensor:
     """Returns (H, W) true where a sensor of limited range had no return; nowhere for others.
 
-    That is in gaps among and beside the points, if the points end sharply at one depth and many
-    points beside the gaps are there.
+    That is in gaps among and beside the points, if many points beside the gaps are at the end of
+    their range. Points of a scan, and points with small gaps, must also end sharply there: a scan
+    has no returns from the sky, and surfaces without return are small.
     """
     from scipy import ndimage
 
     nowhere = torch.zeros(points.size, dtype=torch.bool)
     depth = points.depth.double()
     farthest = float(depth.max())
-    # They must end sharply: a scene thins out towards the farthest point.
     last = depth >= _END * farthest
-    before = (depth >= (2 * _END - 1) * farthest) & ~last
     at_end = int(last.sum())
-    fewest = max(_LEAST_AT_END * len(points), _SHARP * int(before.sum()), _FEWEST_AT_END)
-    if at_end < fewest:
+    if at_end < max(_LEAST_AT_END * len(points), _FEWEST_AT_END):
         return nowhere
     # The gaps: pixels too far from any point for their spacing.
     to_next_px, _ = nearest_points(points, points.xy.double(), 2)  # to itself, and to the next
@@ -303,7 +304,13 @@ def beyond_range(points: SparsePoints) -> Tensor:
         reach_px = max(reach_px, _GAP_LINES * across_px)
     distance_px, nearest = nearest_points(points, pixels_of(points.size), 1)
     core = (distance_px.flatten() > reach_px).reshape(points.size)
-    if float(core.double().mean()) < _LEAST_GAP:
+    in_gaps = float(core.double().mean())
+    if in_gaps < _LEAST_GAP:
+        return nowhere
+    # Points end sharply where those before the end are not far more: a scene thins out.
+    before = (depth >= (2 * _END - 1) * farthest) & ~last
+    is_sharp = at_end >= _SHARP * int(before.sum())
+    if not is_sharp and (pattern is not None or in_gaps < _LARGE_GAPS):
         return nowhere
     # At their border points must end there.
     beside = torch.unique(nearest.flatten()[core.flatten()])

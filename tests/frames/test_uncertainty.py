@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from pnpdepth_cli.frames.uncertainty import (
     with_uncertainty,
 )
 from pnpdepth_cli.points import SparsePoints
+
+SAMPLES = Path(__file__).parents[2] / "samples"
 
 
 def test_without_residuals_the_factor_is_typical_of_the_number_of_points() -> None:
@@ -164,3 +167,14 @@ def test_gaps_of_points_that_end_at_one_depth_are_beyond_the_sensors_range(seed:
     assert not beyond_range(sampled(depth, 99.0, seed)).any()  # all is within the range
     wall = np.full(depth.shape, 4.0)
     assert not beyond_range(sampled(wall, 99.0, seed)).any()  # the farthest is a surface
+
+
+@pytest.mark.parametrize("farthest_m", [2.0, 3.0, 4.0, 5.0])
+def test_a_room_beyond_a_sensors_range_is_found(farthest_m: float) -> None:
+    room = cv2.imread(str(SAMPLES / "indoor" / "gt.png"), cv2.IMREAD_UNCHANGED) / 1000
+    beyond = room > farthest_m
+    for seed in range(3):
+        found = beyond_range(sampled(room, farthest_m, seed)).numpy()
+        assert (found & beyond).sum() > 0.75 * beyond.sum()
+        assert (found & ~beyond).sum() < 0.2 * beyond.size
+        assert not beyond_range(sampled(room, 99.0, seed)).any()
