@@ -93,6 +93,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     # Looking for garbage among imported modules, and once more at the end, takes 0.5 s of 2 s.
     gc.set_threshold(10_000)
     _keep_freed_memory()
+    _let_idle_threads_sleep()
     code = run(sys.argv[1:] if arguments is None else arguments)
     gc.freeze()
     sys.exit(code)
@@ -109,6 +110,15 @@ def _keep_freed_memory() -> None:
             libc = ctypes.CDLL(None)
             libc.mallopt(_MMAP_MAX, 0)
             libc.mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+def _let_idle_threads_sleep() -> None:
+    """Idle threads of OpenMP sleep, unless the user says otherwise; read when torch is imported.
+
+    Else they spin, and where other programs take the cores a command takes six times as long
+    (docs/notes/updates.md).
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def run(arguments: list[str]) -> int:

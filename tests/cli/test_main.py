@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnpdepth_cli.cli.main import cli, run
+from pnpdepth_cli.cli.main import cli, main, run
 from pnpdepth_cli.io.bags import open_bag
 from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.models.network import load_network
@@ -252,3 +252,17 @@ def test_a_link_to_itself_is_no_file(
     Path("loop.png").symlink_to("loop.png")
     assert run([argument.replace("LOOP", "loop.png") for argument in arguments]) == code
     assert [path.name for path in tmp_path.iterdir()] == ["loop.png"]
+
+
+@pytest.mark.parametrize(("stated", "used"), [(None, "passive"), ("active", "active")])
+def test_idle_threads_sleep_unless_the_user_says_otherwise(
+    stated: str | None, used: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "")
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    if stated is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", stated)
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert os.environ["OMP_WAIT_POLICY"] == used

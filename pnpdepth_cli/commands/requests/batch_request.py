@@ -12,7 +12,6 @@ from pnpdepth_cli.choices import LAYOUTS, POSE_KINDS, PROTOCOLS
 from pnpdepth_cli.commands.requests.refine_request import RefineRequest, parse_sample
 from pnpdepth_cli.dataset.frame_files import ReadOptions
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.bags import is_bag
 from pnpdepth_cli.measures import MEASURES, choose_measures, parse_keys
 from pnpdepth_cli.protocols import find_protocol
 from pnpdepth_cli.settings import option
@@ -165,6 +164,8 @@ class BatchRequest:
     @property
     def is_of_bag(self) -> bool:
         """Whether the source is a bag, whose frames are unpacked first."""
+        from pnpdepth_cli.io.bags import is_bag  # imports numpy, which --help does without
+
         return is_bag(self.source)
 
     @property
