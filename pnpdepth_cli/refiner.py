@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from pnpdepth_cli.camera import Camera
+from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
 from pnpdepth_cli.dataset.saved_result import save
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
@@ -41,6 +42,9 @@ UNITS = {"m": 1.0, "mm": 1000.0}
 FARTHEST_MEDIAN_M = 200.0
 """No frame has half of its depths farther than this; a larger median is in another unit."""
 
+DECIDED_BY = 5
+"""So many frames of one size decide together how later ones are moved to their points."""
+
 _OPEN: set[nn.Module] = set()  # modules that refiners have cut open
 _OPENING = threading.Lock()
 
@@ -63,7 +67,9 @@ class Refiner:
         uncertainty: Whether the standard deviation of the depth is estimated too.
         keep_measured: Whether the depth of points at whole pixels is kept there exactly.
         registration: Whether images are moved to their points: "auto", if their depth edges show
-            that they are not registered; "off"; or by (zoom, right, down), pixels.
+            that they are not registered; "off"; or by (zoom, right, down), pixels. With "auto" the
+            first four frames of a size decide alone. The first five together decide for the fifth
+            and all later ones.
         adapt: Frames of the same sequence, (image, sparse) each. Before the first frame is refined,
             the weights of `network`, which must take points, learn from them. The new weights are
             used while the refiner is open, if points hidden from its input show that they are
@@ -101,6 +107,7 @@ class Refiner:
         self._method: Method | None = None
         self._is_closed = False
         self._moved: dict[tuple[int, int], set[str]] = {}  # how images were moved, by their size
+        self._telling: dict[tuple[int, int], list[Evidence]] = {}  # of the first frames, likewise
         self._stack = ExitStack()
         self._lock = threading.Lock()
         check_combination(self._asked, len(self._networks))
@@ -155,9 +162,12 @@ class Refiner:
         frame = frame_of_arrays(image, sparse, self._register, unit, camera, depth)
         with self._lock:
             method = self._method_for(frame)
+            decision = self._keep_registration(method, frame)
             refined = method.refine(frame, with_stages=stages)
-        notes = [*method.own.network.notes, *frame.notes, *refined.notes]
-        if self._register == "auto" and self._differs(frame, refined):
+            decides_alone = self._register == "auto" and frame.size not in method.registrations
+            differs = decides_alone and self._differs(frame, refined)
+        notes = [*method.own.network.notes, *frame.notes, *decision, *refined.notes]
+        if differs:
             notes.append(
                 "note: images of this size were moved to their points in different ways;"
                 " `share_registration` decides once for a sequence"
@@ -182,6 +192,27 @@ class Refiner:
         if read:
             with self._lock:
                 self._method_for(read[0]).share_registration(read)
+
+    def _keep_registration(self, method: Method, frame: Frame) -> list[str]:
+        """Lets the first frames of a size decide how it and later ones are moved, and says so."""
+        if self._register != "auto" or frame.size in method.registrations:
+            return []
+        telling = self._telling.setdefault(frame.size, [])
+        of_frame = frame.evidence_of_registration
+        if of_frame is not None:
+            telling.append(of_frame)
+        if len(telling) < DECIDED_BY:
+            return []
+        shared = estimate_registration(self._telling.pop(frame.size))
+        method.registrations[frame.size] = shared
+        # Nothing is said of images that were never moved, and stay.
+        if shared is None and self._moved.get(frame.size, set()) <= {str(None)}:
+            return []
+        how = "are not moved" if shared is None else f"are all moved by {shared}"
+        return [
+            f"registration: from now on images of this size {how}, as {DECIDED_BY} frames show"
+            " together; `share_registration` decides it by other frames"
+        ]
 
     def _differs(self, frame: Frame, refined: Refined) -> bool:
         """Whether this image was moved otherwise than the earlier ones of its size."""

@@ -24,7 +24,9 @@ from pnpdepth_cli.commands.shared.results import result_frames
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.rgb import read_rgb
-from pnpdepth_cli.refiner import frame_of_arrays
+from pnpdepth_cli.refiner import DECIDED_BY, frame_of_arrays
+from tests.completion.unregistered import UNREGISTERED
+from tests.completion.unregistered import frame as unregistered
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "indoor"
 Frame = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -254,6 +256,33 @@ def test_a_closed_refiner_refines_nothing_and_its_network_is_free(
     with pytest.raises(pnp.UsageError, match="closed"):
         refiner.refine(*frame)
     assert pnp.refine(network, *frame).depth.shape == frame[1].shape
+
+
+def test_the_first_frames_of_a_size_decide_together_how_later_ones_are_moved(
+    network: pnp.Network,
+) -> None:
+    settings = pnp.Settings(method="alone", iterations=0, propagate="none")
+    refined = []
+    with pnp.Refiner(network, settings) as refiner:
+        for seed in range(DECIDED_BY + 2):
+            refined.append(refiner.refine(*unregistered(seed, UNREGISTERED, 500)))
+    alone, together = refined[: DECIDED_BY - 1], refined[DECIDED_BY - 1 :]
+    assert len({str(frame.registration) for frame in alone}) > 1
+    (shared,) = {str(frame.registration) for frame in together}
+    assert together[0].registration.zoom == pytest.approx(UNREGISTERED.zoom, abs=0.01)
+    # The frame that decides says so, and later ones say nothing more.
+    said = [[n for n in frame.notes if "share_registration" in n] for frame in together]
+    assert [len(notes) for notes in said] == [1, 0, 0]
+    assert shared in said[0][0]
+
+
+def test_frames_that_need_no_move_say_nothing_of_it(network: pnp.Network) -> None:
+    settings = pnp.Settings(method="alone", iterations=0, propagate="none")
+    with pnp.Refiner(network, settings) as refiner:
+        for seed in range(DECIDED_BY + 1):
+            refined = refiner.refine(*unregistered(seed, None, 500))
+            assert refined.registration is None
+            assert not any("share_registration" in note for note in refined.notes)
 
 
 def test_the_depth_after_each_step_is_returned_if_it_is_asked_for(frame: Frame) -> None:

@@ -44,6 +44,13 @@ CHANCE = 3.0
 
 So the best of all registrations must have it for one frame, and twice it for more."""
 
+_LEAST_MOVED = 0.02
+"""Root mean square, of the image's longer side, by which a registration moves pixels at least.
+
+Colour and depth of one frame are not exposed at the same time. Where the camera turns fast, that
+moves the images of a registered camera by 0.01 to 0.02, rarely 0.034, another way in each frame
+(TUM fr1_rpy)."""
+
 _TURNED = 4.0
 """Evidence for another orientation, at least."""
 
@@ -81,6 +88,12 @@ _LEAST_CONTRAST = 0.02  # of an image with edges
 _EDGE_SIGMA = 1.0  # before the gradient is taken
 _EDGE_REACH = 8.0  # of the surroundings that an edge's strength is relative to
 _EDGE_BAND = 6.0  # of the mean that is taken off
+
+# What must be better all over the image.
+_PARTS = (24, 32)  # rows and columns of parts of the image
+_LEAST_STANDING = 3.6  # standard errors of the gain of a registration, with 500 points a frame
+_MORE_STANDING = 0.8  # of it for each e-fold of more points, which see more of chance as well
+_POINTS_OF_STANDING = 500
 
 # What the correlation of edges and changes of depth tells.
 _WEIGHT = 0.1  # log likelihood per unit of it
@@ -149,6 +162,31 @@ class Evidence:
         top, left = (int(n) for n in 2 * reach)
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
         return cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
+
+    def gain(self, zoom: float, right: int, down: int) -> Floats:
+        """Returns the gain in log likelihood by a registration in each of the parts of the image.
+
+        Args:
+            zoom: Its zoom.
+            right: Its shift in pixels of the reduced image, as `down`.
+            down: The other shift.
+        """
+        of_samples = self._of_samples(zoom, right, down) - self._of_samples(1.0, 0, 0)
+        rows, columns = self.edges.shape
+        y = (self.between[:, 1] * _PARTS[0] / rows).astype(np.intp).clip(0, _PARTS[0] - 1)
+        x = (self.between[:, 0] * _PARTS[1] / columns).astype(np.intp).clip(0, _PARTS[1] - 1)
+        gains = np.bincount(y * _PARTS[1] + x, of_samples, _PARTS[0] * _PARTS[1])
+        return np.asarray(gains, np.float64)
+
+    def _of_samples(self, zoom: float, right: int, down: int) -> Floats:
+        """(S,) the log likelihood of each sample."""
+        rows, columns = self.edges.shape
+        centre = np.array([columns, rows]) / 2
+        moved = np.floor((self.between - centre) * zoom + centre).astype(np.intp)
+        x, y = (moved + np.array([right, down])).T
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        seen = self.edges[y.clip(0, rows - 1), x.clip(0, columns - 1)]
+        return np.where(inside, seen * self.weight, 0.0)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
@@ -273,7 +311,8 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     """Returns the registration that frames of one size have in common: the posterior's mean.
 
     None where the evidence is no better than chance, or than for an image that is registered
-    already, and where points are missing beside the jumps of depth.
+    already, where it is not spread over the image, and where points are missing beside the jumps of
+    depth.
 
     Args:
         frames: Evidence of the frames; None of a frame that tells nothing. The first decides the
@@ -316,13 +355,35 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     maps = [frame.log_likelihood(float(_ZOOMS[number])) for frame in usable]
     if _bayes_factor(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
         return None
+    # It must be better in most parts of the image, not by a few edges.
+    best_down, best_right = (int(n) - half for n, half in zip(place, middle, strict=True))
+    if not _is_spread(usable, float(_ZOOMS[number]), best_right, best_down):
+        return None
     # The posterior's mean.
     probability = np.exp(logits - logsumexp(logits))
-    return ImageRegistration(
+    found = ImageRegistration(
         zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
         right=round(float(right @ probability.sum((0, 1))), 2),
         down=round(float(down @ probability.sum((0, 2))), 2),
     )
+    # It must be more than what moves the images of a registered camera that turns.
+    of_zoom = (found.zoom - 1) * np.hypot(height, width) / np.sqrt(12)
+    moved = np.sqrt(of_zoom**2 + found.right**2 + found.down**2)
+    return found if moved >= _LEAST_MOVED * max(height, width) else None
+
+
+def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -> bool:
+    """Whether a registration fits better all over the image than none, by more than chance.
+
+    Neighbouring points see the same edges, so their gains are not independent; those of parts of
+    the image are. By chance their sum is 0 ± the root of the sum of their squares. A part is that
+    of all frames: many frames of a still scene are no more evidence than one.
+    """
+    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
+    standing = gains.sum() / (np.linalg.norm(gains) + 1e-9)
+    points = np.mean([frame.points for frame in frames])
+    more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
+    return bool(standing >= _LEAST_STANDING + more)
 
 
 def _bayes_factor(

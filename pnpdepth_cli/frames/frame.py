@@ -17,6 +17,7 @@ from torch import Tensor
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.alignment import Alignment
 from pnpdepth_cli.completion.image_registration import (
+    Evidence,
     ImageRegistration,
     estimate_registration,
     evidence,
@@ -75,12 +76,15 @@ class Frame:
         return None if self.rgb is None else np.ascontiguousarray(self.rgb.permute(1, 2, 0))
 
     @functools.cached_property
+    def evidence_of_registration(self) -> Evidence | None:
+        """What the points tell of the registration; None where they tell nothing."""
+        image = self.image
+        return None if image is None else evidence(image, self.points)
+
+    @functools.cached_property
     def _registration_of_points(self) -> ImageRegistration | None:
         """The registration that the points tell; kept, because most frames need it twice."""
-        image = self.image
-        if image is None:
-            return None
-        return estimate_registration([evidence(image, self.points)])
+        return estimate_registration([self.evidence_of_registration])
 
     def registered(self: AnyFrame) -> AnyFrame:
         """Returns the frame with its image moved to the points, if it has to be."""

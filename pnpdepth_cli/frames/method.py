@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration, evidence
+from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, UsedNetwork
 from pnpdepth_cli.frames.measured import with_measured, with_note_on_measured
@@ -216,8 +216,8 @@ class Method:
         """
         usable: list[Evidence] = []
         for read, frame in enumerate(frames, 1):
-            if frame.image is not None and frame.register == "auto":
-                of_frame = evidence(frame.image, frame.points)
+            if frame.register == "auto":
+                of_frame = frame.evidence_of_registration
                 if of_frame is not None:
                     usable.append(of_frame)
             if read == _TRIED and not usable:  # such as scans, none of which will tell

@@ -265,3 +265,34 @@ def test_no_other_orientation_is_better_than_a_right_one(count: int) -> None:
     for seed in range(6):
         known = evidence(*frame(seed, None, count))
         assert known is None or better_orientation([known]) is None
+
+
+def test_an_image_that_a_turn_of_the_camera_moved_by_little_stays() -> None:
+    late = ImageRegistration(zoom=1.0, right=5.0, down=2.0)  # of 320 pixels
+    for seed in range(3):
+        assert estimate_registration([evidence(*frame(seed, late, 4000))]) is None
+
+
+def test_a_gain_is_that_of_the_samples_in_each_part_of_the_image() -> None:
+    known = evidence(*frame(0, UNREGISTERED))
+    gains = known.gain(0.9, -5, 3)
+    assert gains.shape == (24 * 32,)
+    half = (known.edges.shape[0] // 2, known.edges.shape[1] // 2)
+    middle = (12, 16)  # of the shifts that are searched
+    more = known.log_likelihood(0.9)[middle[0] + 3, middle[1] - 5]
+    assert gains.sum() == pytest.approx(more - known.log_likelihood(1.0)[middle], abs=0.02)
+    # Without the samples of the left half, nothing is gained there.
+    x = known.between[:, 0]
+    right = replace(known, between=known.between[x >= half[1]], weight=known.weight[x >= half[1]])
+    rows = right.gain(0.9, -5, 3).reshape(24, 32)
+    assert not rows[:, :16].any()
+    assert np.allclose(rows[:, 16:], gains.reshape(24, 32)[:, 16:])
+
+
+def test_what_fits_better_in_a_quarter_of_the_image_only_moves_no_image() -> None:
+    known = evidence(*frame(2, UNREGISTERED))
+    x, y = known.between.T
+    of_quarter = (x < 160) & (y < 120)
+    quarter = replace(known, between=known.between[of_quarter], weight=known.weight[of_quarter])
+    assert estimate_registration([known]) is not None
+    assert estimate_registration([quarter]) is None
