@@ -126,7 +126,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
 
     question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
     with spent_on("layer"):
-        return recalled_layers(network, question, decide)[0]
+        return recalled_layers(network.module, network.definition, question, decide)[0]
 
 
 def _first_usable(

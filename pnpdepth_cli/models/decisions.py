@@ -30,7 +30,7 @@ from pnpdepth_cli.version import __version__
 if TYPE_CHECKING:
     from torch import nn
 
-    from pnpdepth_cli.models.network import Network
+    from pnpdepth_cli.models.definition import ModelDefinition
 
 FOLDER = "PNPDEPTH_CACHE"
 """Environment variable that names another cache folder."""
@@ -81,12 +81,24 @@ def recalled(
     return answer
 
 
-def recalled_layers(network: Network, question: str, decide: Callable[[], list[str]]) -> list[str]:
-    """Returns layers of a network that were decided before, else what is decided now."""
-    names = {name for name, _ in network.module.named_modules()}
+def recalled_layers(
+    module: nn.Module,
+    definition: ModelDefinition,
+    question: str,
+    decide: Callable[[], list[str]],
+) -> list[str]:
+    """Returns layers of a network that were decided before, else what is decided now.
+
+    Args:
+        module: The network.
+        definition: Its definition.
+        question: What is decided, with all that it depends on besides the network.
+        decide: Function that decides it; called unless the answer is known.
+    """
+    names = {name for name, _ in module.named_modules()}
     return recalled(
-        network.module,
-        network.definition.checkpoint if network.definition.complete else None,
+        module,
+        definition.checkpoint if definition.complete else None,
         question,
         decide,
         lambda layers: bool(layers) and names.issuperset(layers),

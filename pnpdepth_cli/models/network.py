@@ -551,7 +551,7 @@ def _with_suggested_layers(network: Network) -> Network:
             return [*suggest_layers(network.module, arguments, network.map_of)]
 
     question = f"layers, of {frame.network}"
-    layers = tuple(recalled_layers(network, question, suggest))
+    layers = tuple(recalled_layers(network.module, network.definition, question, suggest))
     if not layers:
         return network
     note = (
