@@ -13,10 +13,16 @@ from pnpdepth_cli.errors import OutputError
 
 
 def check_outputs(paths: Iterable[Path], inputs: Iterable[Path] = (), *, overwrite: bool) -> None:
-    """Raises OutputError for a file that is an input, or that exists and may not be replaced."""
+    """Raises OutputError for a file that cannot be written.
+
+    It is an input, or it exists and may not be replaced, or what it would lie in is no folder.
+    """
     resolved = {os.path.realpath(path) for path in inputs}
     for path in paths:
         if os.path.realpath(path) in resolved:
             raise OutputError(f"{path} is one of the inputs; name another output")
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; --overwrite replaces it, or name another output")
+        there = next((parent for parent in path.parents if os.path.lexists(parent)), None)
+        if there is not None and not there.is_dir():
+            raise OutputError(f"{there} is no folder; name another output")
