@@ -1,12 +1,12 @@
 """What `pnpdepth refine` gives without options: `python -m benchmarks.default --data PATH`.
 
 For each network, set and number of points, means over frames and seeds of the MAE and the RMSE in
-metres: linear interpolation, the network aligned with the points, its z updated, its residual
-propagated, `compact` alone, and the result. All are scored on the same pixels, those with ground
-truth. `worse` is the fraction of frames where the MAE of the result is above that of linear
-interpolation, `weight` the mean weight of the network in the result, its depth as a prior of
-`compact` included, `no part` the fraction of frames where it is below 1 %, and `warned` the
-fraction with a warning that the image does not help.
+metres: linear interpolation, the network aligned with the points, its z updated and its residual
+propagated (both by `--method alone`), `compact` alone, and the result. All are scored on the same
+pixels, those with ground truth. `worse` is the fraction of frames where the MAE of the result is
+above that of linear interpolation, `weight` the mean weight of the network in the result, its depth
+as a prior of `compact` included, `no part` the fraction of frames where it is below 1 %, and
+`warned` the fraction with a warning that the image does not help.
 
 A second table has the fractions of the ground truth within multiples of `--uncertainty`'s standard
 deviation, the fraction of frames with at least 60 % within one and 90 % within two, and what its
@@ -128,6 +128,13 @@ def measure(
     seconds = time.process_time() - start
     depths = {LINEAR: linear(inputs.points), AFTER: torch.from_numpy(refined.depth)}
     depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+    # z of a network without trust is not updated by default, so its own steps are those of `alone`.
+    if ALONE in depths:
+        alone = by_default(network, inputs, seed, method="alone")
+        for name in (UPDATED, PROPAGATED):
+            depths.pop(name, None)
+            if name in alone.stages:
+                depths[name] = torch.from_numpy(alone.stages[name])
     return {
         "errors": errors_of(depths, torch.from_numpy(frame.gt)),
         "cpu_s": seconds,

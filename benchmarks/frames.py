@@ -182,10 +182,10 @@ def opened(name: str, data: Path) -> Network:
     return load_network(name, data / "weights" / WEIGHTS[name] if name in WEIGHTS else None)
 
 
-def by_default(network: Network, inputs: Frame, seed: int = 0) -> Refined:
-    """The frame as `pnpdepth refine` gives it by default."""
-    with Method([network], Settings(seed=seed), inputs) as method:
-        return method.refine(inputs, with_stages=True)
+def by_default(network: Network, inputs: Frame, seed: int = 0, method: str = "fused") -> Refined:
+    """The frame as `pnpdepth refine` gives it without other options."""
+    with Method([network], Settings(seed=seed, method=method), inputs) as opened_method:
+        return opened_method.refine(inputs, with_stages=True)
 
 
 def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:

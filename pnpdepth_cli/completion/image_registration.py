@@ -91,8 +91,8 @@ _EDGE_BAND = 6.0  # of the mean that is taken off
 
 # What must be better all over the image.
 _PARTS = (24, 32)  # rows and columns of parts of the image
-_LEAST_STANDING = 3.2  # standard errors of the gain of a registration, with 500 points a frame
-_MORE_STANDING = 1.08  # of it for each e-fold of more points, which see more of chance as well
+_LEAST_STANDING = 2.4  # standard errors of the gain of a registration, with 500 points a frame
+_MORE_STANDING = 1.66  # of it for each e-fold of more points, which see more of chance as well
 _POINTS_OF_STANDING = 500
 
 # What the correlation of edges and changes of depth tells.
