@@ -112,7 +112,7 @@ HALVES = {"even": slice(0, None, 2), "odd": slice(1, None, 2)}
 
 def frames_of(name: str, data: Path, count: int, half: str | None = None) -> list[EvalFrame]:
     """`count` evenly spaced frames of a set, or of one of its `HALVES`; none if it is not there."""
-    if not any(folder.name.startswith(name) for folder in data.iterdir()):
+    if not any(data.glob(f"{name}*")):
         return []
     frames = list(ALL_SETS[name](data))
     return evenly(frames if half is None else frames[HALVES[half]], count)
