@@ -15,14 +15,13 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.protocols import NYU_PART, FramePart
 from pnpdepth_cli.sensors.projection import as_depth_image
-from pnpdepth_cli.sensors.simulation import LIDARS, simulate_lidar
+from pnpdepth_cli.sensors.simulation import HDL_64E, simulate_lidar
 
 ROOM_LIMIT = 10.0
 """Metres beyond which the ground truth of rooms counts as unknown: a Kinect's range."""
 STREET_LIMIT = 80.0
 """Metres beyond which the ground truth of streets counts as unknown, as in KITTI's protocol."""
 
-SCANNER = LIDARS["hdl-64e"]
 VIEWS = 4  # of one scene; frames are rendered a scene at a time
 
 
@@ -115,7 +114,7 @@ def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
     """(H, W) one turn of 64 scan lines from the camera's place; lens: fx, fy, cx, cy in pixels."""
     fx, fy, cx, cy = (float(value) for value in lens)
     camera = Camera(intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    return as_depth_image(simulate_lidar(gt, camera, SCANNER, seed))
+    return as_depth_image(simulate_lidar(gt, camera, HDL_64E, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:

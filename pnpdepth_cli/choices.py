@@ -127,6 +127,15 @@ UPDATES = OpenList(
 )
 """U: each entry creates a rule that turns gradients into directions of z."""
 
+SCHEDULES = OpenList(
+    "schedules",
+    names={
+        "constant": "pnpdepth_cli.core.update_rules:constant",
+        "linear": "pnpdepth_cli.core.update_rules:linear",
+    },
+)
+"""Factor of α at each update, from the fraction of the updates already made."""
+
 PROPAGATIONS = OpenList(
     "propagations",
     names={
@@ -154,6 +163,32 @@ BASELINES = OpenList(
 
 NETWORKS = OpenList("models", folder="model_zoo_defs")
 """The networks' files in `model_zoo_defs`, and what other packages enter as `pnpdepth.models`."""
+
+NORMALISATIONS = OpenList(
+    "normalisations",
+    names={
+        "unit": "pnpdepth_cli.models.definition:UNIT",
+        "imagenet": "pnpdepth_cli.models.definition:IMAGENET",
+        "symmetric": "pnpdepth_cli.models.definition:SYMMETRIC",
+        "bytes": "pnpdepth_cli.models.definition:BYTES",
+    },
+)
+"""Ranges of the image that a network may want: `pnpdepth_cli.models.definition.Normalisation`."""
+
+SENSORS = OpenList(
+    "sensors",
+    names={
+        "vlp-16": "pnpdepth_cli.sensors.simulation:VLP_16",
+        "vlp-32c": "pnpdepth_cli.sensors.simulation:VLP_32C",
+        "hdl-32e": "pnpdepth_cli.sensors.simulation:HDL_32E",
+        "hdl-64e": "pnpdepth_cli.sensors.simulation:HDL_64E",
+        "paper-vlp-16": "pnpdepth_cli.sensors.simulation:PAPER_VLP_16",
+        "paper-vlp-32c": "pnpdepth_cli.sensors.simulation:PAPER_VLP_32C",
+        "paper-hdl-32e": "pnpdepth_cli.sensors.simulation:PAPER_HDL_32E",
+        "paper-hdl-64e": "pnpdepth_cli.sensors.simulation:PAPER_HDL_64E",
+    },
+)
+"""Scanners by data sheet, and as the paper has them: `pnpdepth_cli.sensors.simulation.Lidar`."""
 
 FORMATS = OpenList(
     "formats",
@@ -211,7 +246,6 @@ MEASURES = OpenList(
 UNKNOWN = ("keep", "zero")  # depth that no points support, in the depth file
 POSE_KINDS = ("camera-to-world", "world-to-camera", "opengl")  # what rows of poses are
 METHODS = ("fused", "alone", "paper")  # without and with the included network; the paper's
-SCHEDULES = ("constant", "linear")  # of the step size over the updates
 
 FITS = ("none", "median", "scale", "affine")
 """Parameters of the fit of a network's output to the points."""
@@ -239,22 +273,8 @@ InputKind = Literal["rgb", "sparse", "rgb+sparse", "map"]
 Fit = Literal["stretch", "crop"]
 """How an image is brought to a network's fixed input size."""
 
-NORMALISATIONS = ("unit", "imagenet", "symmetric", "bytes")  # rgb as 0…1, mean and std, −1…1, 0…255
-
 # Files and sensors
 REGISTRATIONS = ("auto", "off")  # whether the image is moved to the points
-
-SENSORS = (
-    "vlp-16",
-    "vlp-32c",
-    "hdl-32e",
-    "hdl-64e",
-    "paper-vlp-16",
-    "paper-vlp-32c",
-    "paper-hdl-32e",
-    "paper-hdl-64e",
-)
-"""LiDARs by data sheet, and as the paper has them: `pnpdepth_cli.sensors.simulation`."""
 
 LENSES = ("radial-tangential", "fisheye")
 """Lens distortions: `pnpdepth_cli.sensors.lens`."""

@@ -10,9 +10,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.choices import OpenList
 from pnpdepth_cli.core import losses, update_rules
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.sensors.simulation import LIDARS
 
 
 @pytest.fixture
@@ -69,10 +67,6 @@ def test_a_measure_has_the_key_of_its_name(key: str) -> None:
     assert choices.MEASURES[key].key == key
 
 
-def test_every_name_of_a_closed_list_is_implemented_in_its_order() -> None:
-    for names, implemented in (
-        (choices.SCHEDULES, update_rules.SCHEDULES),
-        (choices.NORMALISATIONS, NORMALISATIONS),
-        (choices.SENSORS, LIDARS),
-    ):
-        assert tuple(names) == tuple(implemented)
+@pytest.mark.parametrize("name", [*choices.SENSORS])
+def test_a_scanner_has_the_name_by_which_it_is_chosen(name: str) -> None:
+    assert choices.SENSORS[name].name == name

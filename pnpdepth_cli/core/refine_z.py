@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pnpdepth_cli.choices import UPDATES
+from pnpdepth_cli.choices import SCHEDULES, UPDATES
 from pnpdepth_cli.core.losses import checked_loss
 from pnpdepth_cli.core.split import Split, gradient_at
-from pnpdepth_cli.core.update_rules import SCHEDULES, Update, blur, step_size
+from pnpdepth_cli.core.update_rules import Update, blur, step_size
 from pnpdepth_cli.errors import DivergedError, ModelError, wrap_user_errors
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings

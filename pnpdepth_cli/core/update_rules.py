@@ -84,11 +84,14 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
     return update
 
 
-SCHEDULES: dict[str, Callable[[float], float]] = {
-    "constant": lambda done: 1.0,
-    "linear": lambda done: 1.0 - done,
-}
-"""Factor of α at each update, from the fraction 0 ≤ done < 1 of the updates already made."""
+def constant(done: float) -> float:
+    """Returns 1, the factor of α after any fraction 0 ≤ done < 1 of the updates (the paper's)."""
+    return 1.0
+
+
+def linear(done: float) -> float:
+    """Returns the factor of α that falls from 1 to 0 with the fraction 0 ≤ done < 1 of updates."""
+    return 1.0 - done
 
 
 def step_size(lr: float | str, z0: Tensor) -> float:

@@ -11,6 +11,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from pnpdepth_cli.choices import NORMALISATIONS
 from pnpdepth_cli.core.influence import Field, influential_fields
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import (
@@ -22,26 +23,13 @@ from pnpdepth_cli.errors import (
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
 from pnpdepth_cli.models.decisions import recalled_layers
-from pnpdepth_cli.models.definition import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    ModelDefinition,
-    Normalisation,
-)
+from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.frame_map import FrameMap
 from pnpdepth_cli.models.network import Network, align_output
 from pnpdepth_cli.models.shapes import by_shapes
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 from pnpdepth_cli.spent import spent_on
-
-NORMALISATIONS = {
-    "unit": Normalisation(),
-    "imagenet": Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD),
-    "symmetric": Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
-    "bytes": Normalisation(std=(1 / 255, 1 / 255, 1 / 255)),
-}
-"""rgb as the network may want it: 0…1, ImageNet's mean and deviation, −1…1, 0…255."""
 
 UPDATES = 5
 """Most updates of z in the default method. More fit what propagation fits anyway."""

@@ -122,6 +122,15 @@ class Normalisation:
             _check(self, field, good, "a finite number each for red, green and blue, std above 0")
 
 
+UNIT = Normalisation()
+"""rgb as 0…1."""
+IMAGENET = Normalisation(mean=IMAGENET_MEAN, std=IMAGENET_STD)
+"""rgb less ImageNet's mean, over its standard deviation."""
+SYMMETRIC = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
+"""rgb as −1…1."""
+BYTES = Normalisation(std=(1 / 255, 1 / 255, 1 / 255))
+"""rgb as 0…255."""
+
 UNTUNED_DEFAULTS = Settings(
     iterations=20, lr="25%", loss="cauchy", update="normalised", schedule="linear", blur=1.0
 )

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.errors import NoPointsError, UsageError, unequal_sizes
 from pnpdepth_cli.file_record import SamplePattern
@@ -96,19 +97,14 @@ def _from_paper(name: str, elevations_deg: tuple[float, ...]) -> Lidar:
     )
 
 
-_NAMED = (
-    _from_sheet("vlp-16", evenly_spaced(15, 2, 16), 0.2, 100, 0.03),
-    _from_sheet("vlp-32c", _VLP_32C_DEG, 0.2, 200, 0.03),
-    _from_sheet("hdl-32e", evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02),
-    _from_sheet("hdl-64e", _HDL_64E_DEG, 0.1728, 120, 0.02),
-    _from_paper("paper-vlp-16", evenly_spaced(15, 2, 16)),
-    _from_paper("paper-vlp-32c", evenly_spaced(15, 0.3, 134)),
-    _from_paper("paper-hdl-32e", evenly_spaced(10.67, 1.3, 32)),
-    _from_paper("paper-hdl-64e", evenly_spaced(2, 0.4, 68)),
-)
-
-LIDARS = {lidar.name: lidar for lidar in _NAMED}
-"""The scanners that can be named, as `choices.SENSORS` lists them."""
+VLP_16 = _from_sheet("vlp-16", evenly_spaced(15, 2, 16), 0.2, 100, 0.03)
+VLP_32C = _from_sheet("vlp-32c", _VLP_32C_DEG, 0.2, 200, 0.03)
+HDL_32E = _from_sheet("hdl-32e", evenly_spaced(10 + 2 / 3, 4 / 3, 32), 0.166, 100, 0.02)
+HDL_64E = _from_sheet("hdl-64e", _HDL_64E_DEG, 0.1728, 120, 0.02)
+PAPER_VLP_16 = _from_paper("paper-vlp-16", evenly_spaced(15, 2, 16))
+PAPER_VLP_32C = _from_paper("paper-vlp-32c", evenly_spaced(15, 0.3, 134))
+PAPER_HDL_32E = _from_paper("paper-hdl-32e", evenly_spaced(10.67, 1.3, 32))
+PAPER_HDL_64E = _from_paper("paper-hdl-64e", evenly_spaced(2, 0.4, 68))
 
 
 def lidar_of(
@@ -117,7 +113,7 @@ def lidar_of(
     """Returns the scanner of a name, or one without noise, with a VLP-16's azimuth step.
 
     Args:
-        name: One of `LIDARS`.
+        name: One of `choices.SENSORS`.
         beams: Number of beams, evenly spaced in elevation.
         vertical_fov: Elevations of the uppermost and the lowest beam, degrees.
 
@@ -125,7 +121,8 @@ def lidar_of(
         UsageError: There is no such scanner, or neither or both are given.
     """
     if name is not None and beams is None and vertical_fov is None:
-        return LIDARS[name]
+        named: Lidar = choices.SENSORS[name]
+        return named
     if name is not None or beams is None or vertical_fov is None:
         raise UsageError("give --sensor, or --beams and --vertical-fov")
     top_deg, bottom_deg = vertical_fov

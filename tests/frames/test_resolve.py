@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import nn
 
+from pnpdepth_cli.choices import NORMALISATIONS
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import (
-    NORMALISATIONS,
     choose_input_range,
     default_layer,
     resolve_layer,

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pnpdepth_cli import choices
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import PATTERNS, SamplePattern
 from pnpdepth_cli.sensors.projection import Points
-from pnpdepth_cli.sensors.simulation import LIDARS, lidar_of, sample_points, simulate_lidar
+from pnpdepth_cli.sensors.simulation import lidar_of, sample_points, simulate_lidar
 
 
 @pytest.mark.parametrize(
@@ -27,14 +28,14 @@ from pnpdepth_cli.sensors.simulation import LIDARS, lidar_of, sample_points, sim
 def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_samples(
     name: str, beams: int, top: float, bottom: float, percent: float
 ) -> None:
-    angles = np.array(LIDARS[name].elevations_deg)
+    angles = np.array(choices.SENSORS[name].elevations_deg)
     assert len(angles) == beams
     assert (np.diff(angles) < 0).all()
     assert (angles[0], angles[-1]) == pytest.approx((top, bottom), abs=0.01)
     # SYNTHIA's sequences are 1280×760 with a focal length of 532.74; at 0.4 of that size
     synthia = Camera(intrinsics=np.array([[213.1, 0, 255.5], [0, 213.1, 151.5], [0, 0, 1]]))
     depth = np.full((304, 512), 10.0)
-    points = simulate_lidar(depth, synthia, LIDARS[f"paper-{name}"], 0)
+    points = simulate_lidar(depth, synthia, choices.SENSORS[f"paper-{name}"], 0)
     assert 100 * len(points) / depth.size == pytest.approx(percent, rel=0.1)
 
 

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 import torch
 
+from pnpdepth_cli.choices import NORMALISATIONS
 from pnpdepth_cli.commands.many_frames.running import spread
 from pnpdepth_cli.commands.requests.batch_request import parse_address
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import DeviceError, ModelError, OutputError, StorageError, UsageError
-from pnpdepth_cli.frames.resolve import NORMALISATIONS
 from pnpdepth_cli.io.atomic import remove_leftovers
 from tests.commands.batches import Recorder, add_frame, batch, done, pairs_on_disk, results
 from tests.io.full_disk import no_room_on_disk
