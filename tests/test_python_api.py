@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 import pnpdepth_cli as pnp
+from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.choices import LOSSES
 from pnpdepth_cli.cli.main import run
 from pnpdepth_cli.commands.shared.results import result_frames
@@ -32,6 +33,7 @@ SAMPLE = Path(__file__).parent.parent / "samples" / "indoor"
 Frame = tuple[NDArray[np.float32], NDArray[np.float32]]
 PART = slice(0, 128), slice(0, 160)
 BLACK = np.zeros((4, 4, 3))
+OTHER_CAMERA = Camera(intrinsics=np.eye(3), size=(4, 5))
 
 
 @pytest.fixture(scope="module")
@@ -428,6 +430,7 @@ def test_a_module_is_refined_with_its_definition_and_without_one(frame: Frame) -
         (pnp.UsageError, lambda net: pnp.Refiner([net] * 2, pnp.Settings(method="paper"))),
         (pnp.InputError, lambda net: pnp.refine(net, BLACK, np.ones((4, 4)), camera=np.eye(4))),
         (pnp.InputError, lambda net: pnp.refine(net, BLACK, np.ones((4, 4)), camera=-np.eye(3))),
+        (pnp.InputError, lambda net: pnp.refine(net, BLACK, np.ones((4, 4)), camera=OTHER_CAMERA)),
         (pnp.UsageError, lambda network: LOSSES["no_such.py"]),
         (pnp.InputError, lambda net: pnp.Refiner(net).share_registration([np.ones(3)])),
         (pnp.InputError, lambda network: pnp.Refiner(network, adapt=[(1, 2, "m")])),

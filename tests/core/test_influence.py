@@ -57,6 +57,8 @@ def in_place(x: torch.Tensor) -> torch.Tensor:
     return y[..., 1:-1, 1:-1].relu_()
 
 
+RANDOM = torch.rand((32, 32), generator=torch.Generator().manual_seed(0))
+
 BEHIND = {
     "pooling": lambda x: F.avg_pool2d(F.max_pool2d(x, 3, 2, 1), 2),
     "resizing": lambda x: F.interpolate(x, scale_factor=2, mode="bilinear"),
@@ -74,6 +76,14 @@ BEHIND = {
     "instances": lambda x: F.group_norm(x, 2),
     "patches": shuffled_patches,
     "products": lambda x: (x.permute(0, 2, 3, 1) @ torch.ones(4, 4)).permute(0, 3, 1, 2),
+    "columns": lambda x: RANDOM @ x,
+    "rows": lambda x: torch.bmm(x[0], RANDOM.expand(4, -1, -1))[None],
+    "sums of products": lambda x: torch.baddbmm(x[0], RANDOM.expand(4, -1, -1), x[0])[None],
+    "transposing": lambda x: x[0, 1].t().contiguous().t()[None, None].repeat(1, 4, 1, 1),
+    "shares of rows": lambda x: x.softmax(2),
+    "sums of columns": lambda x: x + x.sum(3, keepdim=True),
+    "sums of channels": lambda x: x + x.sum(1),
+    "the mean of all": lambda x: x + x.mean(),
     "splitting": lambda x: torch.cat(x.split(2, dim=1)[::-1], dim=1) + x.unbind(2)[3].mean(),
 }
 """Functions of a map (1, 4, 32, 32) between two convolutions, by what they do."""

@@ -29,6 +29,17 @@ def test_points_survive_every_format_also_what_is_no_number(tmp_path: Path, name
         np.testing.assert_array_equal(got.astype(np.float32), points.astype(np.float32))
 
 
+@pytest.mark.parametrize(("away", "kind"), [(0, np.float32), (5e6, np.float64)])
+def test_coordinates_of_64_bits_keep_them_only_where_32_would_round_by_millimetres(
+    tmp_path: Path, away: float, kind: type
+) -> None:
+    points = POINTS.astype(np.float64) + away
+    np.save(tmp_path / "a.npy", points)
+    got = read_scan(tmp_path / "a.npy")[0]
+    assert got.dtype == kind
+    assert np.abs(got - points).max() < 1e-3
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [

@@ -48,6 +48,16 @@ def test_a_preview_has_its_panels_in_columns_and_depth_in_the_colours_of_one_sca
         assert np.array_equal(shown[::factor, ::factor], scale.paint(before))
 
 
+@pytest.mark.parametrize(
+    ("least", "most", "low", "high"), [(2.0, 3.0, 2.02, 2.98), (2.0, 2.001, 1.9, 2.1)]
+)
+def test_the_scale_of_depth_spans_its_percentiles_and_at_least_a_tenth_of_it(
+    least: float, most: float, low: float, high: float
+) -> None:
+    scale = depth_scale(np.linspace(least, most, 1001))
+    assert (scale.low_m, scale.high_m) == pytest.approx((low, high), rel=1e-3)
+
+
 def test_depths_that_are_unknown_or_all_alike_still_make_a_preview(tmp_path: Path) -> None:
     none = np.zeros((6, 8), np.float32)
     one = np.full((6, 8), 3, np.float32)

@@ -42,6 +42,7 @@ def test_a_sensor_has_the_beams_of_its_data_sheet_and_the_papers_fraction_of_sam
 def test_the_beams_of_a_lidar_of_ones_own_are_evenly_spaced_from_top_to_bottom() -> None:
     assert lidar_of(None, 5, (15, -25)).elevations_deg == (15, 5, -5, -15, -25)
     assert lidar_of(None, 1, (3, 3)).elevations_deg == (3,)
+    assert lidar_of(None, 3, (90, -90)).elevations_deg == (90, 0, -90)
 
 
 def test_each_beam_of_a_lidar_of_ones_own_has_1800_directions_a_turn() -> None:
