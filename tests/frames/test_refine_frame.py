@@ -56,6 +56,13 @@ class Noise(Brightness):
         return self.layer(1 + random)
 
 
+class Sharp(Brightness):
+    """The scene's own depth, of the image alone."""
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return self.layer(depth_of_scene()[None, None] + 0 * rgb[:, :1])
+
+
 def refined(frame: Frame, *members: OpenNetwork, **options: Any) -> Refined:
     """The frame by the default method with these networks."""
     with opened(*members) as networks:
@@ -155,6 +162,15 @@ def test_a_useless_network_has_no_part_which_is_said() -> None:
         off = (checked.predicted[stage] - checked.points.depth).abs().numpy()
         assert f"{np.average(off, weights=checked.weights.numpy()):.4f}" in note
     assert not [note for note in alone.notes if "no part" in note]
+
+
+@pytest.mark.parametrize(("kind", "least", "most"), [(Sharp, 0.15, 1.0), (Noise, 0.0, 0.01)])
+def test_between_scan_lines_a_good_image_network_has_a_least_part_and_a_useless_one_none(
+    kind: type[Brightness], least: float, most: float
+) -> None:
+    result = refined(scan_frame(), member(kind, settings=ALIGNED), compact())
+    assert least <= result.weights[kind.__name__.lower()] <= most
+    assert sum(result.weights.values()) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])

@@ -139,6 +139,7 @@ def test_the_depth_of_a_picture_is_of_the_networks_that_have_a_part() -> None:
 def test_names_are_shortened_by_what_they_share_and_numbers_stay_whole() -> None:
     drive = "2011_09_26_drive_0023_sync_{:010}_image_02"
     names = [drive.format(number) for number in (0, 1, 12)]
+    assert tables.short_names(names[:2]) == [names[0], "…0000000001…"]
     assert tables.short_names(names) == [names[0], "…0000000001…", "…0000000012…"]
     for others in (["a_1"], ["a_1", "a_2"], ["kitchen", "office"], ["a", "a"], []):
         assert tables.short_names(others) == others
