@@ -15,6 +15,7 @@ import pytest
 from pnpdepth_cli.commands.export import export_results
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.errors import InputError, OutputError
+from pnpdepth_cli.io.depth import read_depth
 from pnpdepth_cli.io.scans import read_scan
 from tests.colmap_models import HEIGHT, WIDTH
 from tests.commands.projects import DEPTH, NAMES, project, results
@@ -283,6 +284,22 @@ def test_a_bag_of_frames_without_times_has_steps_and_names_what_it_lacks(root: P
     ]
     with pytest.raises(OutputError, match="--overwrite"):
         export_results(root / "out", root / "bag", to="mcap")
+
+
+def test_the_depth_image_of_a_bag_has_the_numbers_of_the_result_row_by_row(root: Path) -> None:
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    folder = results(root)
+    export_results(folder, root / "bag", to="mcap")
+    with rosbags.AnyReader([root / "bag"]) as reader:
+        wanted = [found for found in reader.connections if found.topic == "/camera/depth/image"]
+        _, _, data = next(reader.messages(connections=wanted))
+        image = reader.deserialize(data, wanted[0].msgtype)
+    depth = read_depth(folder / "a_depth.exr").values
+    valid = depth > 0
+    assert (image.encoding, image.height, image.width) == ("32FC1", *depth.shape)
+    assert image.step == 4 * image.width
+    values = image.data.view("<f4").reshape(depth.shape)
+    assert np.array_equal(values[valid], depth[valid])
 
 
 @pytest.mark.parametrize(
