@@ -91,6 +91,23 @@ def test_kittis_points_are_where_its_matrices_have_them(kind: str, tmp_path: Pat
             read_calibration(path)
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "centre_px", "size"),
+    [
+        ("7.188560000000e+02", "6.071928000000e+02 1.852157000000e+02", (376, 1241)),  # 00
+        ("7.215377000000e+02", "6.095593000000e+02 1.728540000000e+02", (375, 1242)),  # 03
+        ("7.070912000000e+02", "6.018873000000e+02 1.831104000000e+02", (370, 1226)),  # 04
+        ("7.070912000000e+02", "6.028873000000e+02 1.831104000000e+02", None),  # of no sequence
+    ],
+)
+def test_a_file_of_kittis_odometry_has_the_size_of_its_images_which_it_does_not_state(
+    focal_px: str, centre_px: str, size: tuple[int, int] | None, tmp_path: Path
+) -> None:
+    across, down = centre_px.split()
+    text = f"P0: {focal_px} 0 {across} 0 0 {focal_px} {down} 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0"
+    assert read_calibration(write(tmp_path, text), 0).camera.size == size
+
+
 EIGHT = [0.1, 0.2, 0.0, 0.0, 0.1, 0.2, 0.1, 0.01]
 VALUES = {"K": K, "R": TURN, "t": SHIFT, "distortion": FIVE, "size": [640, 480]}
 NAMED: dict[str, tuple[str, int | None, list[float], str, bool]] = {
