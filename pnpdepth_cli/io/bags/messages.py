@@ -54,7 +54,7 @@ _COMPRESSED_DEPTH = "compressedDepth"
 _DEPTH_HEADER = 12
 """Bytes in front of its PNG."""
 _MM_PER_M = 1000.0
-_FASTEST_PNG = 1  # zlib's level, as the image is read again soon
+_FASTEST_PNG = 1  # of zlib's levels
 _LONGEST_WORD = 40  # characters of a message's text that an error shows
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
@@ -209,8 +209,8 @@ def depth_image(message: Message, topic: str, scale: float | None = None) -> NDA
     kind = str(message.format).partition(";")[0].strip()
     if kind not in _DEPTH or kind_of(data[_DEPTH_HEADER:]) != "PNG":
         raise InputError(
-            f"{topic}: {one_line(message.format)[:_LONGEST_WORD]!r} is no PNG of {' or '.join(_DEPTH)}; name"
-            " another --topic"
+            f"{topic}: {one_line(message.format)[:_LONGEST_WORD]!r} is no PNG of"
+            f" {' or '.join(_DEPTH)}; name another --topic"
         )
     codes = read_png(Path(topic), data[_DEPTH_HEADER:]).values
     if _DEPTH[kind] == "u2":
@@ -378,7 +378,7 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
         camera: frame_id of the camera.
         scanner: frame_id of the scanner.
     """
-    # The transforms, each in both directions.
+    # The transforms in both directions: two frames, and the pose of the second in the first.
     links: list[tuple[str, str, Extrinsics]] = []
     topics = [name for name in bag.topics(TRANSFORMS) if name.endswith("/tf_static")]
     for _, _, message in bag.messages(topics):
@@ -387,14 +387,14 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
             child = str(stamped.child_frame_id).lstrip("/")
             pose = _pose_in(bag, stamped.transform.translation, stamped.transform.rotation)
             links += [(parent, child, pose), (child, parent, pose.inverse())]
-    # The shortest chain: the pose in the camera's coordinates of all frames one transform away, then
-    # of those two away, and so on.
+    # The shortest chain: the poses in the camera's coordinates of all frames that one transform
+    # reaches, then of those that two reach, and so on.
     poses = {camera: SAME_PLACE}
     while scanner not in poses:
         reached = {
-            child: poses[parent] @ pose
-            for parent, child, pose in links
-            if parent in poses and child not in poses
+            next_frame: poses[frame] @ pose
+            for frame, next_frame, pose in links
+            if frame in poses and next_frame not in poses
         }
         if not reached:
             return None
