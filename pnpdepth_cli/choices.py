@@ -73,12 +73,12 @@ class OpenList(Mapping[str, Any]):
         locations = dict(self._names)
         if self._folder is not None:
             locations |= _locations_in(self._folder)
-        own = {
+        entries = {
             name: EntryPoint(name, location, self._group) for name, location in locations.items()
         }
         installed = {point.name: point for point in entry_points(group=f"pnpdepth.{self._group}")}
-        new_names = sorted(installed.keys() - own.keys())
-        return own | {name: installed[name] for name in new_names}
+        new_names = sorted(installed.keys() - entries.keys())
+        return entries | {name: installed[name] for name in new_names}
 
 
 def _locations_in(folder: str) -> dict[str, str]:
@@ -100,7 +100,11 @@ def _locations_in(folder: str) -> dict[str, str]:
 
 @functools.cache
 def _from_file(path: str, attribute: str) -> object:
-    """The function of this name that a user's Python file defines; the file is run once.
+    """The function that a user's Python file defines; the file is run once.
+
+    Args:
+        path: The file.
+        attribute: Name of the function in it.
 
     Raises:
         UsageError: The file cannot be run, or defines no such function.

@@ -59,8 +59,7 @@ DELTA_THRESHOLDS = (1.25, 1.25**2, 1.25**3)
 OfPixels = Callable[["Tensor", "Tensor"], "Tensor"]
 """Function of N pixels that returns a scalar.
 
-It takes predicted and true depth (N,) float64, all positive, in metres. In formulas they are p and
-g, for prediction and ground truth."""
+It takes predicted and true depth (N,) float64, all positive, in metres."""
 
 
 def _rms(errors: Tensor) -> Tensor:
@@ -73,28 +72,26 @@ def _mean_abs(errors: Tensor) -> Tensor:
     return errors.abs().mean()
 
 
-def _log(p: Tensor, g: Tensor) -> Tensor:
-    """(N,) natural logarithm of predicted depth p less that of true depth g."""
-    return p.log() - g.log()
+def _log(predicted: Tensor, true: Tensor) -> Tensor:
+    """(N,) natural logarithm of the predicted depth less that of the true depth."""
+    return predicted.log() - true.log()
 
 
-def _inv(p: Tensor, g: Tensor) -> Tensor:
-    """(N,) inverse of predicted depth p less that of true depth g, 1/km of depths in metres."""
-    return 1000 / p - 1000 / g
+def _inv(predicted: Tensor, true: Tensor) -> Tensor:
+    """(N,) inverse of the predicted depth less that of the true depth, 1/km of depths in metres."""
+    return 1000 / predicted - 1000 / true
 
 
-def _silog(p: Tensor, g: Tensor) -> Tensor:
-    """100 times the standard deviation of log p − log g, of predicted depth p and true depth g."""
-    errors = _log(p, g)
+def _silog(predicted: Tensor, true: Tensor) -> Tensor:
+    """100 times the standard deviation of log predicted − log true depth."""
+    errors = _log(predicted, true)
     return 100 * _rms(errors - errors.mean())
 
 
-def _delta(p: Tensor, g: Tensor, threshold: float) -> Tensor:
-    """The fraction of pixels whose ratio max(p/g, g/p) is below the threshold.
-
-    p is the predicted depth, g the true depth.
-    """
-    return ((p / g).maximum(g / p) < threshold).double().mean()
+def _delta(predicted: Tensor, true: Tensor, threshold: float) -> Tensor:
+    """The fraction of pixels at which the larger depth is below `threshold` times the smaller."""
+    ratios = (predicted / true).maximum(true / predicted)
+    return (ratios < threshold).double().mean()
 
 
 @dataclass(frozen=True)
@@ -163,8 +160,8 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
         frames: Values of each frame by their key; None and NaN where a frame has none.
     """
     sums: dict[str, tuple[float, int]] = {}
-    for values in frames:
-        for key, value in values.items():
+    for values_by_key in frames:
+        for key, value in values_by_key.items():
             total, count = sums.get(key, (0.0, 0))
             if value is not None and math.isfinite(value):
                 total += value
@@ -241,13 +238,12 @@ def by_depth(measures: Sequence[Measure], near_m: float, far_m: float) -> tuple[
     )
 
 
-def _within(p: Tensor, g: Tensor, formula: OfPixels, low_m: float, high_m: float) -> Tensor:
-    """The value of a formula over the pixels whose true depth lies in [low_m, high_m).
-
-    p is the predicted depth, g the true depth.
-    """
-    inside = (g >= low_m) & (g < high_m)
-    return formula(p[inside], g[inside])
+def _within(
+    predicted: Tensor, true: Tensor, formula: OfPixels, low_m: float, high_m: float
+) -> Tensor:
+    """The value of a formula over the pixels whose true depth lies in [low_m, high_m)."""
+    is_inside = (true >= low_m) & (true < high_m)
+    return formula(predicted[is_inside], true[is_inside])
 
 
 _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))
@@ -414,9 +410,9 @@ def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[Fl
     """
     import numpy as np
 
-    known = (truth > 0) & (predicted > 0) & (sigma > 0)
-    errors = np.abs(predicted[known].astype(np.float64) - truth[known])
-    return errors, sigma[known].astype(np.float64)
+    is_known = (truth > 0) & (predicted > 0) & (sigma > 0)
+    errors = np.abs(predicted[is_known].astype(np.float64) - truth[is_known])
+    return errors, sigma[is_known].astype(np.float64)
 
 
 OF_SIGMA = (
@@ -493,18 +489,20 @@ def score(
         ground_truth: Ground truth of the same shape, in metres and unknown likewise.
         measures: Measures to compute; those without a formula of pixels are left out.
     """
-    known = ground_truth.isfinite() & (ground_truth > 0)
-    scored = known & predicted.isfinite() & (predicted > 0)
-    p = predicted[scored].double()
-    g = ground_truth[scored].double()
+    # The pixels where both depths are known, in 64 bits.
+    has_truth = ground_truth.isfinite() & (ground_truth > 0)
+    is_scored = has_truth & predicted.isfinite() & (predicted > 0)
+    predicted_depth = predicted[is_scored].double()
+    true_depth = ground_truth[is_scored].double()
+    pixel_count = len(true_depth)
     return Scores(
         values_by_key={
-            measure.key: float(measure.of_pixels(p, g))
+            measure.key: float(measure.of_pixels(predicted_depth, true_depth))
             for measure in measures
             if measure.of_pixels is not None
         },
-        pixels=len(g),
-        coverage=len(g) / int(known.sum()) if known.any() else math.nan,
+        pixels=pixel_count,
+        coverage=pixel_count / int(has_truth.sum()) if has_truth.any() else math.nan,
     )
 
 

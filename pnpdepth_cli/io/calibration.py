@@ -114,7 +114,7 @@ class _Fields:
         self.values = values
 
     def text(self, name: str, default: str) -> str:
-        """Returns a value as a word without quotes; the default where it is missing or empty."""
+        """Returns a value as a word without quotes; the default if it is missing, empty or 0."""
         value = self.values.get(name) or default
         return str(value).strip(" \n\"'") or default
 
@@ -301,14 +301,17 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
         of the values that give this pose. Empty without P, or if rectification changes nothing.
     """
     # P is [K' | K' · offset] of the rectified camera, R its rotation.
-    p = np.array(fields.numbers("projection_matrix", "P", "p", optional=True))
-    r = np.array(fields.numbers("rectification_matrix", "R", "r", optional=True))
-    if p.size != 12 or min(p[0], p[5], np.linalg.det(p.reshape(3, 4)[:, :3])) <= 0:
-        return {}  # no P, or one of zeros, as of an uncalibrated camera
-    projection = p.reshape(3, 4)
+    p_numbers = np.array(fields.numbers("projection_matrix", "P", "p", optional=True))
+    r_numbers = np.array(fields.numbers("rectification_matrix", "R", "r", optional=True))
+    if p_numbers.size != 12:
+        return {}
+    projection = p_numbers.reshape(3, 4)
     intrinsics = projection[:, :3]
+    if min(intrinsics[0, 0], intrinsics[1, 1], np.linalg.det(intrinsics)) <= 0:
+        return {}  # an uncalibrated camera has zeros
     offset = np.linalg.solve(intrinsics, projection[:, 3])
-    turn = r.reshape(3, 3) if r.size == 9 and r.any() else np.eye(3)
+    has_rotation = r_numbers.size == 9 and r_numbers.any()
+    turn = r_numbers.reshape(3, 3) if has_rotation else np.eye(3)
     is_turned = not np.allclose(turn, np.eye(3), atol=_SAME_TURN)
     is_shifted = np.abs(offset).max() > _SAME_SHIFT_M
     # The poses of the raw camera that may be meant, by what gives them.

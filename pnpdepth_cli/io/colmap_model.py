@@ -68,6 +68,7 @@ focal lengths, the lens, and how many of its coefficients."""
 _NAMES = {number: name for name, (number, *_) in MODELS.items()}
 """Names of the camera models by their numbers in binary files."""
 _LARGEST = 1e9  # parameter of a camera, in pixels or of distortion; beyond it, products overflow
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # beyond which four numbers are no quaternion
 _NO_POINT = -1  # number of the point of a keypoint that observes none
 _TEXT_POINT_WORDS = 8  # number, x y z, r g b and error; the track follows
 
@@ -90,7 +91,7 @@ POINT = np.dtype(
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Returns the files of cameras, images and points in a folder; none if one is missing."""
+    """Returns the files of cameras, images and points in a folder; [] if one is missing."""
     for suffix in (".bin", ".txt"):  # binary first, as COLMAP itself
         files = [folder / f"{name}{suffix}" for name in MODEL_PARTS]
         if all(file.is_file() for file in files):
@@ -160,7 +161,7 @@ def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
 
 
 def name_in_model(model: ColmapModel, image: Path) -> str:
-    """Returns the name under which a model has a photo.
+    """Returns the name under which a COLMAP model has a photo.
 
     It is the longest name of the model that the photo's path ends with, or else the only one with
     the name of the photo's file.
@@ -239,13 +240,20 @@ def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
     """
     quaternion, translation = np.split(np.array(numbers, np.float64), [4])
     is_finite = np.isfinite(quaternion).all() and np.isfinite(translation).all()
-    if not is_finite or not 1e-6 < np.linalg.norm(quaternion) < 1e6:
+    shortest, longest = _QUATERNION_LENGTHS
+    if not is_finite or not shortest < np.linalg.norm(quaternion) < longest:
         raise ValueError("a pose that is not made of finite numbers")
     return Extrinsics(rotation_of(quaternion), translation)
 
 
 def _records(stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1) -> NDArray[_Kind]:
-    """The next records of a binary file, (count,) of the layout. ValueError if it ends before."""
+    """The next records of a binary file, (count,). ValueError if the file ends before.
+
+    Args:
+        stream: The file, at the first of the records.
+        layout: NumPy type of a record.
+        count: Number of records, as the file claims it.
+    """
     begin = stream.tell()
     size = count * layout.itemsize
     data = stream.read(min(size, sys.maxsize))

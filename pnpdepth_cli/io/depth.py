@@ -285,10 +285,10 @@ def _known_codes(values: NDArray[np.generic]) -> NDArray[np.uint16] | None:
     """
     if values.dtype != np.uint16:
         return None
-    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
-    if np.count_nonzero(known) < _MANY_CODES:
+    is_known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
+    if np.count_nonzero(is_known) < _MANY_CODES:
         return None
-    return np.asarray(values[known], np.uint16)
+    return np.asarray(values[is_known], np.uint16)
 
 
 def _roughness(codes: NDArray[np.uint16]) -> float:
@@ -328,11 +328,11 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
     depth_format = formats.format_of_suffix(path)
     if depth.ndim != 2 or 0 in depth.shape:
         raise InputError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
-    known = known_metres(depth)
-    values: NDArray[np.generic] = known
+    metres_or_0 = known_metres(depth)
+    values: NDArray[np.generic] = metres_or_0
     text = dict[str, str]()
     if depth_format.integer:
-        values = _codes(path, known, scale)
+        values = _codes(path, metres_or_0, scale)
         text[formats.SCALE_KEY] = repr(float(scale)).removesuffix(".0")
     with atomic_path(path) as temporary:
         depth_format.write(temporary, values, text)
@@ -357,10 +357,10 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
             f"{path}: the largest depth, {metres.max():.6g} m, does not fit in 16 bits with"
             f" {scale:g} codes per metre; write .exr, .npy or .tiff"
         )
-    lost = (metres > 0) & (codes == 0)
-    if lost.any():
+    is_lost = (metres > 0) & (codes == 0)
+    if is_lost.any():
         raise OutputError(
-            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be"
+            f"{path}: {int(is_lost.sum()):,} depths down to {metres[is_lost].min():.3g} m would be"
             f" unknown in 16 bits with {scale:g} codes per metre; write .exr, .npy or .tiff"
         )
     return codes.astype(np.uint16)
@@ -462,6 +462,7 @@ def _from_rows(
         NoPointsError: No row has depth.
         InputError: The rows are not three floats each, or no size was given.
     """
+    # What is no list of points.
     if rows.dtype.kind != "f":
         raise InputError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
     if rows.shape[1] != 3:
@@ -469,6 +470,7 @@ def _from_rows(
             f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
             " scan, give --calib"
         )
+    # The rows that have a depth and a pixel.
     depth = known_metres(rows[:, 2])
     has_both = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
     if not has_both.any():
@@ -557,20 +559,22 @@ def describe_range(
         option: Option that states the scale.
         unit: Name of the unit.
     """
-    values = np.asarray(depth, dtype=np.float64)
-    known = values[np.isfinite(values) & (values > 0)]
+    all_depths = np.asarray(depth, dtype=np.float64)
+    depths = all_depths[np.isfinite(all_depths) & (all_depths > 0)]
     hint = f"; {option} to change" if reading.assumed else ""
-    if known.size == 0:
+    if depths.size == 0:
         return f"no {noun} with known depth ({reading.source}{hint})"
     # Near depths by KITTI's scale may be millimetres of a room.
-    by_kitti = reading.assumed and reading.source.endswith(f"÷ {KITTI_SCALE:g}")
-    if by_kitti and float(known.max()) < _FARTHEST_INDOORS_M:
-        low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
+    nearest = float(depths.min())
+    farthest = float(depths.max())
+    is_by_kitti = reading.assumed and reading.source.endswith(f"÷ {KITTI_SCALE:g}")
+    if is_by_kitti and farthest < _FARTHEST_INDOORS_M:
+        low, high = (metres(end * KITTI_SCALE / 1000) for end in (nearest, farthest))
         hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
     # How many there are, and from where to where.
-    count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
-    low = metres(float(known.min()))
-    high = metres(float(known.max()))
+    count = f"{depths.size:,} {noun.removesuffix('s') if depths.size == 1 else noun}"
+    low = metres(nearest)
+    high = metres(farthest)
     extent = low if low == high else f"{low}–{high}"
     return f"{count}, {extent} {unit} ({reading.source}{hint})"
 

@@ -105,7 +105,7 @@ def pose_of_matrix(path: Path, name: str, numbers: list[float]) -> Extrinsics:
 
 
 def pose_of_quaternion(path: Path, numbers: list[float]) -> Extrinsics:
-    """Returns the pose of a translation in metres and a quaternion.
+    """Returns the pose that a translation in metres and a quaternion make.
 
     Args:
         path: The file that the numbers are from, for messages.
@@ -295,9 +295,9 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
         # Path without suffix, and matrix, of each image, by the name of its file without suffix.
         by_name: dict[str, list[tuple[str, object]]] = {}
         for frame in content["frames"]:
-            file = PurePosixPath(frame["file_path"]).with_suffix("")
-            entry = (f"/{file.as_posix()}", frame["transform_matrix"])
-            by_name.setdefault(file.name, []).append(entry)
+            image = PurePosixPath(frame["file_path"]).with_suffix("")
+            entry = (f"/{image.as_posix()}", frame["transform_matrix"])
+            by_name.setdefault(image.name, []).append(entry)
         # The matrix of each frame. Images of several cameras are told apart by their folders.
         poses = np.empty((len(names), 3, 4))
         for index, name in enumerate(names):
@@ -368,6 +368,7 @@ def _read_rows(path: Path) -> tuple[Floats, Floats]:
     Raises:
         InputError: The file has no row, or a row has other numbers or no rotation.
     """
+    # The numbers, of other columns only those that a header names.
     rows, header = file_bytes.read_rows(path, file_bytes.read_bytes(path), _NAMED)
     if header and set(_NAMED) <= set(header):
         rows = rows[:, [header.index(name) for name in _NAMED]]
@@ -377,6 +378,7 @@ def _read_rows(path: Path) -> tuple[Floats, Floats]:
             f"{path} has no rows of 12 or 16 numbers, a matrix (KITTI), or of 8, time, position and"
             f" quaternion (TUM); there are {rows.shape[1]} in a row"
         )
+    # The poses: matrices, or time, position and quaternion x y z w.
     if rows.shape[1] == _KITTI_COLUMNS:
         poses = rows.reshape(-1, 3, 4)
     else:
@@ -448,7 +450,7 @@ class Trajectory:
         if end_s - start_s > longest_gap_s:
             return None
         turn_at = Slerp([start_s, end_s], Rotation.from_matrix(self.poses[pair, :, :3]))
-        weight = (time_s - start_s) / (end_s - start_s)
+        weight = (time_s - start_s) / (end_s - start_s)  # of the later pose
         shift = (1 - weight) * self.poses[after - 1, :, 3] + weight * self.poses[after, :, 3]
         return np.column_stack([turn_at(time_s).as_matrix(), shift])
 

@@ -53,21 +53,9 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         InputError: The file is missing, damaged, cut short, beyond the budget, or no image.
     """
     data = read_bytes(path)
-    kind = kind_of(data)
-    # What the file is. HEIF and videos have one kind of container.
+    kind = _kind_of_image(path, data)
     if kind == "EXR":
         return _from_linear_light(path, data)
-    if data[4:8] == b"ftyp":
-        if data[8:11] in VIDEO_BRANDS:
-            raise InputError(f"{path} is a video; `batch` takes videos, with depth of their frames")
-        if data[8:12] in (b"avif", b"avis") or not _reads_heic():
-            raise InputError(
-                f"{path} is a HEIC or AVIF photo; pip install 'pnpdepth[heic]' reads HEIC, or save"
-                " it as JPEG"
-            )
-        kind = "HEIF"
-    if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF"):
-        raise InputError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
     # Its numbers, in 0…1, and the EXIF orientation that is still to be applied.
     note = None
     white = 255.0
@@ -87,7 +75,7 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
         else:
             frames = 1 if kind == "JPEG" else getattr(image, "n_frames", 1)  # a JPEG has previews
             note = f"first of {frames} images" if frames > 1 else None
-            image.seek(0)
+            image.seek(0)  # the first of several
             pixels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
             values = np.divide(pixels, np.float32(255), dtype=np.float32)
     # How the camera was held.
@@ -96,6 +84,32 @@ def read_rgb(path: Path, *, upright: bool = True) -> RgbImage:
     elif orientation in range(2, 9):
         note = "EXIF rotation not applied, as COLMAP reads the photo"
     return RgbImage(values=np.ascontiguousarray(values), note=note, white=white)
+
+
+def _kind_of_image(path: Path, data: bytes) -> str:
+    """The format of an image by its content: "PNG", "JPEG", "TIFF", "WEBP", "HEIF" or "EXR".
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is no image, or none that can be read here.
+    """
+    # HEIF and videos have one kind of container, which says at byte 8 what it holds.
+    if data[4:8] == b"ftyp":
+        if data[8:11] in VIDEO_BRANDS:
+            raise InputError(f"{path} is a video; `batch` takes videos, with depth of their frames")
+        if data[8:12] in (b"avif", b"avis") or not _reads_heic():
+            raise InputError(
+                f"{path} is a HEIC or AVIF photo; pip install 'pnpdepth[heic]' reads HEIC, or save"
+                " it as JPEG"
+            )
+        return "HEIF"
+    kind = kind_of(data)
+    if kind not in ("PNG", "JPEG", "TIFF", "WEBP", "EXR"):
+        raise InputError(f"{path} is not an image; give a PNG, JPEG, TIFF, WebP or EXR file")
+    return kind
 
 
 @functools.cache
@@ -182,15 +196,18 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
     Any other number means that the image is upright already.
     """
+    # Rows and columns are exchanged, then the rows reversed, then the columns.
     if orientation in (5, 6, 7, 8):
         values = values.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
-    return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    return values
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    """The image of an EXR, whose linear light is converted to sRGB."""
+    """The image of an EXR, whose linear light is converted to sRGB. InputError if damaged."""
     linear = read_exr_colour(path, data).astype(np.float32)
     np.nan_to_num(linear, copy=False, nan=0.0, posinf=_BRIGHTEST_LIGHT, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
@@ -285,9 +302,10 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
 def _open_video(
     path: Path, mtime_ns: int
 ) -> tuple[Iterator[tuple[int, Pixels]], deque[tuple[int, Pixels]]]:
-    """Number and pixels of the frames of a video: an iterator of those to come, and the last ones.
+    """The frames of an open video that are still to be decoded, and the last that were.
 
-    The one video that is open stays so until another, or a newer one of its name, is asked for.
+    Both give number, from 0, and pixels of a frame. The caller adds what it decodes to the second.
+    The cache keeps one video open, until another one is opened.
 
     Args:
         path: The video.
@@ -306,9 +324,11 @@ def _decode_video(path: Path) -> Iterator[Pixels]:
     """
     import cv2
 
+    # Other files are refused, as FFmpeg would follow the addresses in a playlist.
     with path.open("rb") as file:
-        if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow the addresses in a playlist
+        if file.read(8)[4:] != b"ftyp":
             raise InputError(f"{path} is not an MP4 or MOV video; convert it")
+    # The size is checked before a frame is decoded.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise damaged(path, "video", "cannot be decoded")

@@ -242,6 +242,7 @@ def _decompress_rows(columns: list[Column], point_count: int, body: bytes) -> by
         raise ValueError("it is cut short, or no compressed one")
     packed_bytes, claimed_bytes = _PCD_SIZES.unpack_from(body)
     packed = body[_PCD_SIZES.size :][:packed_bytes]
+    # A point without fields, and a field of less than no numbers, are no points either.
     if (
         len(packed) < packed_bytes
         or min(field_bytes, default=-1) < 0

@@ -67,7 +67,12 @@ _FONT_SIZE = 19
 _SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
-_LABELS = 9  # of the bar
+_TITLE_TOP = 4  # of a title, below the top of its line
+_REMARK_TOP = 5  # of a remark, which is smaller, and of the title of the bar
+_REMARK_GAP = 14  # between a title and its remark
+_MARK_LENGTH = 6  # of a mark beside the bar
+_LABEL_GAP = 11  # between the bar and a label
+_LABELS = 9  # number of labels of a bar of depth
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
@@ -94,8 +99,9 @@ class DepthScale:
         Args:
             depth: Metres, 0 or not finite where unknown.
         """
-        known = np.isfinite(depth) & (depth > 0)
-        depths = np.clip(np.where(known, depth, self.low_m), self.low_m, self.high_m, dtype=float)
+        is_known = np.isfinite(depth) & (depth > 0)
+        filled = np.where(is_known, depth, self.low_m)
+        depths = np.clip(filled, self.low_m, self.high_m, dtype=float)
         # 0 at the near end of the scale, 1 at the far one.
         position = (depths - self.low_m) / (self.high_m - self.low_m)
         if self.logarithmic:
@@ -105,7 +111,7 @@ class DepthScale:
         levels = np.rint(_TURBO_FIRST + turbo_range * (1 - position)).astype(np.intp)
         turbo = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
         colours = turbo[:, 0, ::-1][levels]
-        return np.where(known[..., None], colours, np.uint8(UNKNOWN))
+        return np.where(is_known[..., None], colours, np.uint8(UNKNOWN))
 
 
 def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
@@ -114,10 +120,10 @@ def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
     Args:
         depths: Depths of any shape in metres, 0 or not finite where unknown.
     """
-    known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
-    if not known.size:
+    known_depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
+    if not known_depths.size:
         return DepthScale(low_m=1.0, high_m=2.0)  # any scale, as nothing has its colours
-    low, high = np.percentile(known.astype(np.float64), _RANGE_PERCENTILES).tolist()
+    low, high = np.percentile(known_depths.astype(np.float64), _RANGE_PERCENTILES).tolist()
     if high - low < _NARROW * low:  # a single depth still needs a bar with two ends
         low = (1 - _WIDENED) * low
         high = (1 + _WIDENED) * high
@@ -180,6 +186,12 @@ def _magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
     room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - _LEGEND_WIDTH
     fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
     return math.floor(fit) if fit >= 1 else fit
+
+
+def _columns(size: tuple[int, ...]) -> int:
+    """The number of panels in a row of a figure: wide images (H, W) are below each other."""
+    height, width = size
+    return 1 if width > _WIDE * height else 2
 
 
 def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
@@ -288,22 +300,23 @@ def _save_figure(
         row, column = divmod(index, columns)
         x = MARGIN + column * (width + GAP)
         y = MARGIN + row * (row_height + GAP // 2)
-        draw.text((x, y + 4), title, font=font, fill=_INK)
-        indent = draw.textlength(title, font=font) + 14
-        draw.text((x + indent, y + 5), remark, font=small, fill=_FAINT_INK)
+        draw.text((x, y + _TITLE_TOP), title, font=font, fill=_INK)
+        indent = draw.textlength(title, font=font) + _REMARK_GAP
+        draw.text((x + indent, y + _REMARK_TOP), remark, font=small, fill=_FAINT_INK)
         figure.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y + _TITLE_HEIGHT))
         boxes[title] = (x, y + _TITLE_HEIGHT, width, height)
     # The bar, with its upper end at the top, as on an axis, and a mark at each label.
     left = width_px - MARGIN - _LEGEND_WIDTH + GAP
     top = MARGIN + _TITLE_HEIGHT
     length = height_px - MARGIN - top
-    draw.text((left, MARGIN + 5), noun, font=font, fill=_INK)
+    draw.text((left, MARGIN + _REMARK_TOP), noun, font=font, fill=_INK)
     strip = Image.fromarray(np.ascontiguousarray(bar[::-1, None])).resize((_BAR_WIDTH, length))
     figure.paste(strip, (left, top))
     ends = np.linspace(top + length - 1, top, len(labels)).tolist()
     for y, label in zip(ends, labels, strict=True):
-        draw.line((left + _BAR_WIDTH, y, left + _BAR_WIDTH + 6, y), fill=_INK, width=1)
-        draw.text((left + _BAR_WIDTH + 11, y), label, font=small, fill=_INK, anchor="lm")
+        right = left + _BAR_WIDTH
+        draw.line((right, y, right + _MARK_LENGTH, y), fill=_INK, width=1)
+        draw.text((right + _LABEL_GAP, y), label, font=small, fill=_INK, anchor="lm")
     # The file.
     with atomic_path(path) as temporary:
         figure.save(temporary, "PNG", compress_level=_FAST)
@@ -337,8 +350,7 @@ def preview(
     Raises:
         OutputError: The file cannot be written.
     """
-    height, width = before.shape
-    columns = 1 if width > _WIDE * height else 2
+    columns = _columns(before.shape)
     factor = _magnification(before.shape, columns=columns)
     scale = depth_scale(sparse_depth, before, after)
     grey = _grey_of(rgb, before.shape)
@@ -433,18 +445,18 @@ def improvement(
         OutputError: The file cannot be written.
     """
     # The map.
-    gains = gain(before, after, truth)
-    known = np.isfinite(gains)
-    gains = gains[known]
-    pixels, strongest = _paint(gains, known, _grey_of(rgb, truth.shape), "gain")
+    all_gains = gain(before, after, truth)
+    is_known = np.isfinite(all_gains)
+    gains = all_gains[is_known]
+    pixels, strongest = _paint(gains, is_known, _grey_of(rgb, truth.shape), "gain")
     pixels = _resize(pixels, _magnification(truth.shape))
     # The texts for a report: how many pixels improved, and why others are dark.
     improved = 100 * float((gains > 0).mean())
     worse = 100 * float((gains < 0).mean())
     footer = f"{improved:.1f} % of {gains.size:,} pixels improved, {worse:.1f} % worse"
     unknown = None
-    if not known.all():
-        unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
+    if not is_known.all():
+        unknown = "unknown" if (truth[~is_known] > 0).any() else "no ground truth"
     remark = f"{footer}; dark: {unknown}" if unknown else footer
     # The figure.
     figure = _save_gains(path, [(_GAINS, remark, pixels)], strongest, unit)
@@ -482,28 +494,30 @@ def improvement_at_points(
     Raises:
         OutputError: The file cannot be written.
     """
-    columns = 1 if size[1] > _WIDE * size[0] else 2
+    columns = _columns(size)
     grey = _grey_of(rgb, size)
     factor = _magnification(size, columns=columns)
-    shown = {_GAINS: points.after, "Linear interpolation": points.linear}
-    gains = {name: gain(points.before, depth, points.truth) for name, depth in shown.items()}
+    # The gains of what each panel shows, by the panel's title.
+    depths = {_GAINS: points.after, "Linear interpolation": points.linear}
+    gains = {title: gain(points.before, depth, points.truth) for title, depth in depths.items()}
     # One scale for both panels.
     strongest = _strongest(
         np.concatenate([values[np.isfinite(values)] for values in gains.values()])
     )
     panels = []
     remarks = {}
-    for name, gains_at_points in gains.items():
-        known = np.isfinite(gains_at_points)
-        values = gains_at_points[known]
+    for title, gains_at_points in gains.items():
+        is_known = np.isfinite(gains_at_points)
+        values = gains_at_points[is_known]
         # The points in their colours, the largest change on top.
         order = np.argsort(np.abs(values), kind="stable")
-        colours = _paint_signed(values[order] / strongest, np.full(len(values), 0.8), "gain")
-        dots = _dots(grey, points.xy[known][order], colours, factor)
+        light = np.full(len(values), _DOT_LIGHT)
+        colours = _paint_signed(values[order] / strongest, light, "gain")
+        dots = _dots(grey, points.xy[is_known][order], colours, factor)
         better = 100 * float((values > 0).mean()) if len(values) else 0.0
         worse = 100 * float((values < 0).mean()) if len(values) else 0.0
-        remarks[name] = f"{better:.1f} % better, {worse:.1f} % worse"
-        panels.append((name, remarks[name], dots))
+        remarks[title] = f"{better:.1f} % better, {worse:.1f} % worse"
+        panels.append((title, remarks[title], dots))
     # The panel of the result, the first one, says how many points it has, and so does the report.
     footer = f"at {np.isfinite(gains[_GAINS]).sum():,} {points.what}: {remarks[_GAINS]}"
     title, _, dots = panels[0]
@@ -541,9 +555,9 @@ def gain(before: Array, after: Array, truth: Array) -> NDArray[np.float64]:
         after: Depth after, of the same shape, 0 or NaN where unknown.
         truth: Depth as measured, of the same shape, 0 or not finite where unknown.
     """
-    known = np.isfinite(truth) & (truth > 0) & (after > 0)
+    is_known = np.isfinite(truth) & (truth > 0) & (after > 0)
     errors = (np.abs(depth.astype(np.float64) - truth) for depth in (before, after))
     error_before, error_after = (
         np.nan_to_num(error, nan=_NO_DEPTH_ERROR, posinf=_NO_DEPTH_ERROR) for error in errors
     )
-    return np.where(known, error_before - error_after, np.nan)
+    return np.where(is_known, error_before - error_after, np.nan)

@@ -65,13 +65,13 @@ class Bag:
         """Returns the number of messages by topic, of topics with one of these message types."""
         with _as_our_errors(self.path):
             topics = sorted(self.reader.topics.items())
-            return {name: int(info.msgcount) for name, info in topics if info.msgtype in kinds}
+            return {name: int(topic.msgcount) for name, topic in topics if topic.msgtype in kinds}
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
         """Yields (topic, nanoseconds at which it was logged, message) in the order of the log.
 
         Args:
-            topics: Names of topics; those that the bag does not have count for nothing.
+            topics: Names of topics; those that the bag does not have are ignored.
         """
         wanted = [
             connection for connection in self.reader.connections if connection.topic in topics
@@ -98,12 +98,14 @@ def open_bag(path: Path) -> Iterator[Bag]:
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
         raise UsageError(f"reading {path} needs rosbags: pip install 'pnpdepth[ros]'") from None
+    # Checked before rosbags opens it, which must not decompress or compute more than is bounded.
     ros1 = path.suffix.lower() == ".bag"
     bound_decompression()
     with _as_our_errors(path):
         _check_bag(path)
         reader = Reader1(path) if ros1 else Reader2(path)
         reader.open()
+    # Messages of ROS 1 and ROS 2 are encoded differently.
     try:
         types = message_types(ros1=ros1)
         decode = types.deserialize_ros1 if ros1 else types.deserialize_cdr
@@ -222,6 +224,7 @@ def _check_bag(path: Path) -> None:
     Such a bag is compressed as a whole, has a database that would compute what is read, or lacks
     its metadata.
     """
+    # The folder of a ROS 2 bag: its metadata, and the files of its database.
     files = [path]
     if path.is_dir():
         files = sorted(path.glob("*.db3"))
@@ -234,6 +237,7 @@ def _check_bag(path: Path) -> None:
                     raise InputError(f"{path}: the bag is compressed; `ros2 bag convert` it")
             case _:
                 raise InputError(f"{metadata} is no metadata of a bag; repair it: ros2 bag reindex")
+    # Each file.
     for file in files:
         size_of_regular_file(file)
         if file.suffix.lower() == ".db3":

@@ -259,7 +259,7 @@ def cloud_points(message: Message, topic: str) -> NDArray[np.float32]:
 
 
 def seconds_of(message: Message, logged_ns: int) -> float:
-    """Returns the time in seconds of a message's header; that of its log where this is 0.
+    """Returns the time in a message's header, or, where that is 0, at which it was logged; seconds.
 
     Args:
         message: A message with a header.

@@ -51,6 +51,7 @@ def write_mcap(folder: Path, outgoing: Iterable[OutgoingMessage]) -> None:
         with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
             connections = dict[str, Any]()
             for topic, kind, time_ns, fields in outgoing:
+                # A topic is announced with its first message.
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 data = store.serialize_cdr(_message(store, kind, fields), kind)

@@ -145,7 +145,7 @@ def kind_of(data: bytes) -> str | None:
     """
     if data.startswith(b"\xff\xd8\xff"):
         return "JPEG"
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":  # the size is in between
         return "WEBP"
     depth_format = format_of_content(data)
     return None if depth_format is None else depth_format.name
@@ -217,7 +217,7 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
     shape, is_fortran, dtype = _parse_header(path, stream, kind)
     if dtype.hasobject:
         raise InputError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
-    if dtype.kind not in "fiub":
+    if dtype.kind not in "fiub":  # floats, integers with and without sign, and truth values
         raise InputError(f"{path} holds {dtype} values; save numbers")
     # The numbers that it claims.
     count = math.prod(shape)
@@ -236,13 +236,30 @@ def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]
 
 
 def read_npy(path: Path, data: bytes) -> DepthFile:
-    """Returns the array of an NPY file, of any shape. Raises InputError as `parse_npy` does."""
+    """Returns the array of an NPY file, of any shape.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: As `parse_npy` has it.
+    """
     array = parse_npy(path, data)
     return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
 
 
 def write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as an NPY file, which has no room for texts."""
+    """Writes an NPY file.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with file.open("wb") as stream:
         np.save(stream, metres)
 
@@ -258,6 +275,10 @@ COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 def read_npz(path: Path, data: bytes) -> DepthFile:
     """Returns the only array of an NPZ archive, of any shape.
 
+    Args:
+        path: The archive, for messages.
+        data: Content of the archive.
+
     Raises:
         InputError: The archive is damaged or beyond the budget, or has no or several arrays, or one
             whose name says that it is no depth.
@@ -272,11 +293,12 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
             array = _parse_member(path, archive, member)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
-    name = member.filename.removesuffix(".npy")
-    no_depth = _NO_DEPTH.search(name.lower())
-    if no_depth is not None:
+    # An array that its own name calls something else is not taken for depth.
+    name = member.filename.removesuffix(_OF_ARRAY)
+    match = _NO_DEPTH.search(name.lower())
+    if match is not None:
         raise InputError(
-            f"{path} holds the array {name!r}, which is {no_depth[0]} and no depth by its name;"
+            f"{path} holds the array {name!r}, which is {match[0]} and no depth by its name;"
             " save depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
         )
     reading = Reading(f"{array.dtype} NPZ array {name}")
@@ -287,6 +309,11 @@ def _parse_member(
     path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
 ) -> NDArray[np.generic]:
     """The array of one member of an NPZ archive, of any shape.
+
+    Args:
+        path: The archive, for messages.
+        archive: The archive, which is open.
+        member: Entry of the array in it.
 
     Raises:
         InputError: The member is compressed by a method that NumPy does not use, is beyond the
@@ -313,6 +340,10 @@ class ArrayKind(NamedTuple):
 def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
     """Returns shape and type of each array in an NPZ archive, by the arrays' names.
 
+    Args:
+        path: The archive, for messages.
+        data: Content of the archive.
+
     Raises:
         InputError: The archive is damaged, has too many arrays, or has none, as a ZIP of other
             files.
@@ -325,6 +356,7 @@ def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
             ]
             claim = f"{path} holds {len(members):,} arrays"
             check_claim(claim, len(members), _MOST_ARRAYS, way_out="save those of this image")
+            # Only the header of each array is decompressed.
             for member in members:
                 if member.compress_type not in COMPRESSIONS:
                     raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
@@ -360,7 +392,16 @@ def read_npz_array(path: Path, data: bytes, name: str) -> DepthFile:
 
 
 def write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as the array `depth` of an NPZ archive, which has no room for texts."""
+    """Writes an NPZ archive of one array, `depth`; equal depth gives equal bytes.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with file.open("wb") as stream:
         np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
 
@@ -378,15 +419,21 @@ def read_pfm(path: Path, data: bytes) -> DepthFile:
     The sign of the scale factor in the header gives the byte order. Its amount is not applied, and
     the reading says so.
 
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
     Raises:
         InputError: The header or the size is wrong, or the image is beyond the budget.
     """
+    # The header: size and scale factor.
     match = _PFM_HEADER.match(data)
     if match is None or float(match[3]) == 0:
         raise damaged(path, "PFM", "has no valid header of one channel (Pf)")
     width, height = (int(side) for side in (match[1], match[2]))
     factor = float(match[3])
     check_pixel_count(path, width, height)
+    # The numbers, from the lowest row on.
     body = data[match.end() :]
     needed_bytes = _PFM_VALUE_BYTES * width * height
     if len(body) != needed_bytes:
@@ -396,7 +443,7 @@ def read_pfm(path: Path, data: bytes) -> DepthFile:
             f"holds {len(body):,} bytes where {width}x{height} needs {needed_bytes:,}",
         )
     stored = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
-    from_the_top = np.ascontiguousarray(stored[::-1], dtype=np.float32)  # the last row is first
+    from_the_top = np.ascontiguousarray(stored[::-1], dtype=np.float32)
     source = "PFM"
     if abs(factor) != 1:
         source += f", scale factor {abs(factor):g} of its header not applied"
@@ -404,7 +451,16 @@ def read_pfm(path: Path, data: bytes) -> DepthFile:
 
 
 def write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as a PFM of one channel, which has no room for texts."""
+    """Writes a PFM of one channel.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     height, width = metres.shape
     # A negative scale factor means little-endian; rows are stored from the bottom.
     header = f"Pf\n{width} {height}\n-1.0\n".encode()

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _BYTES_OF_TYPE = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 """Bytes of a value of a TIFF tag, by the number of its type; those of all others have one."""
 _TAG_BYTES = 12  # of a tag: its number, type, count of values, and the values or where they are
+_FIRST_PAGE_AT = 4
+"""Where a TIFF has the offset of its first page."""
 _BITS, _CHANNELS, _SAMPLE_FORMAT = 258, 277, 339
 """Tags of a TIFF's pixels."""
 _FLOATS = 3  # of _SAMPLE_FORMAT
@@ -63,16 +65,17 @@ def check_tags(data: bytes) -> None:
         ValueError: The tags, or the pages, together claim more bytes than there are.
         struct.error: A page or a tag lies outside the data.
     """
+    # A TIFF begins with II or MM, its byte order, and has the offset of its first page at byte 4.
     order = "<" if data[:2] == b"II" else ">"
-    page_offsets = list(struct.unpack_from(f"{order}I", data, 4))  # 0 is no page
-    seen: set[int] = set()
+    page_offsets = list(struct.unpack_from(f"{order}I", data, _FIRST_PAGE_AT))
+    checked_offsets = {0}  # which is no page
     claimed_bytes = 0
     page_bytes = 0
     while page_offsets:
         start = page_offsets.pop()
-        if start == 0 or start in seen:
+        if start in checked_offsets:
             continue
-        seen.add(start)
+        checked_offsets.add(start)
         # A page is the number of its tags, the tags, and the offset of the next page.
         (tag_count,) = struct.unpack_from(f"{order}H", data, start)
         end = start + 2 + _TAG_BYTES * tag_count
@@ -158,7 +161,7 @@ def _unread_floats(data: bytes) -> str | None:
     """
     order = "<" if data[:2] == b"II" else ">"
     try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (start,) = struct.unpack_from(f"{order}I", data, _FIRST_PAGE_AT)
         (tag_count,) = struct.unpack_from(f"{order}H", data, start)
         entries = data[start + 2 : start + 2 + _TAG_BYTES * tag_count]
         first_values = dict[int, int]()
@@ -215,6 +218,10 @@ def read_png(path: Path, data: bytes) -> DepthFile:
     MoGe writes codes that are logarithms of depth. These are returned as depth, float32 metres, 0
     where unknown.
 
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
     Raises:
         InputError: The file is damaged, beyond the budget, or no PNG of one channel of 16 bits, or
             its scale is none.
@@ -260,7 +267,12 @@ def _log_ends(image: PIL.Image.Image) -> tuple[float, float] | None:
 
 
 def write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) -> None:
-    """Writes codes (H, W) as a 16-bit PNG, with a text for each key.
+    """Writes a 16-bit PNG.
+
+    Args:
+        file: The file, which is replaced.
+        codes: (H, W) codes of depth, 0 where unknown.
+        text: Texts that the file keeps, by their keys.
 
     Raises:
         OSError: The file cannot be written.
@@ -278,6 +290,10 @@ def read_tiff(path: Path, data: bytes) -> DepthFile:
 
     Scale, offset and number of no data that GDAL's tags state are applied; 0 is unknown. Codes
     with an offset become float32 metres.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
 
     Raises:
         InputError: The file is damaged, beyond the budget, or of other pixels.
@@ -320,6 +336,10 @@ class _GdalTags(NamedTuple):
 def _gdal_tags(path: Path, image: PIL.Image.Image) -> _GdalTags:
     """What the tags of GDAL say of a TIFF.
 
+    Args:
+        path: The file, for messages.
+        image: The file, opened by Pillow.
+
     Raises:
         InputError: The tags hold no numbers, or a scale that is not above 0.
     """
@@ -338,7 +358,16 @@ def _gdal_tags(path: Path, image: PIL.Image.Image) -> _GdalTags:
 
 
 def write_tiff(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as a TIFF of floats, without texts."""
+    """Writes a TIFF of floats.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     from PIL import Image
 
     encoded = io.BytesIO()  # libtiff prints to standard error when a disk is full
@@ -393,6 +422,7 @@ def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
         file: The file, of which the header is read.
         file_bytes: Size of the file.
     """
+    # The size: corners of the window of pixels that are stored, both inside of it.
     header = file.header(0)
     channels = header["channels"]
     (left, top), (right, bottom) = np.array(header["dataWindow"]).tolist()
@@ -403,6 +433,7 @@ def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
         pixel_bytes=4 * len(channels),
         file_bytes=file_bytes,
     )
+    # What makes it more, or less, than one image.
     is_deep = "deep" in str(header.get("type", ""))
     is_cropped = not np.array_equal(header["dataWindow"], header["displayWindow"])
     is_sampled = any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels)
@@ -414,7 +445,12 @@ def _check_exr(path: Path, file: OpenEXR.File, file_bytes: int) -> None:
 
 
 def write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as an EXR of one channel Z, ZIP compressed and without texts.
+    """Writes an EXR of one channel Z, ZIP compressed.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
 
     Raises:
         OSError: The file cannot be written.
@@ -432,6 +468,10 @@ def write_exr(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) 
 
 def read_exr(path: Path, data: bytes) -> DepthFile:
     """Returns the numbers (H, W) of the channel of an EXR that holds depth.
+
+    Args:
+        path: The file, which OpenEXR reads itself.
+        data: Content of the file.
 
     Raises:
         InputError: The file cannot be read as `read_exr_channels` reads it, or it has several
