@@ -286,19 +286,19 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
 
 
 def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
-    """The cameras that images may be of which were rectified before they were stored.
+    """The possible cameras of rectified images, of which camera_info states the raw camera.
 
-    ROS rectifies an image by R and P of camera_info, and removes its distortion. No file says
-    whether poses are of the rectified camera, as kitti2bag has it, or of the raw one, which R turns
-    and the last column of P shifts into the rectified one. So there are several candidates.
+    ROS rectifies an image by R and P, and removes its distortion. No file says whether the poses of
+    other sensors are in the coordinates of the rectified camera, as kitti2bag has it, or of the raw
+    one, which R turns and the last column of P shifts into the rectified one. So there are several.
 
     Args:
         fields: Values of camera_info.
         raw: Camera of the images before rectification.
 
     Returns:
-        Camera of rectified images, and the pose of the raw camera in its coordinates, by the names
-        of the values that give this pose. Empty without P, or if rectification changes nothing.
+        The rectified camera and the pose of the raw camera in its coordinates, by the names of the
+        values that give this pose. Empty without P, or if rectification changes nothing.
     """
     # P is [K' | K' · offset] of the rectified camera, R its rotation.
     p_numbers = np.array(fields.numbers("projection_matrix", "P", "p", optional=True))

@@ -192,7 +192,7 @@ def _parameter_count(name: str) -> int:
             " cameras"
         )
     _, focals, _, coefficients = MODELS[name]
-    return focals + 2 + coefficients
+    return focals + 2 + coefficients  # with the principal point, cx and cy
 
 
 def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence[float]) -> Camera:

@@ -203,7 +203,7 @@ def depth_from_stored(
     _check_codes(path, values, is_stated=scale is not None)
     scale_of_file = stored.reading.scale
     assumed_scale = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
-    if values.shape[1] > _WIDE * values.shape[0]:  # of no phone or depth camera
+    if values.shape[1] > _WIDE * values.shape[0]:  # no phone or depth camera has such images
         assumed_scale = KITTI_SCALE
     divisor = scale or scale_of_file or assumed_scale
     source += f" ÷ {divisor:.12g}"
@@ -212,11 +212,11 @@ def depth_from_stored(
     elif scale_of_file not in (None, divisor):
         source += f" (not {scale_of_file:.12g}, as the file says)"
     # The largest code is no depth.
-    saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
-    if saturated.any():
-        count = int(saturated.sum())
+    is_saturated = values == formats.SATURATED_CODE
+    if values.dtype == np.uint16 and is_saturated.any():
+        count = int(is_saturated.sum())
         source += f", {count:,} pixels of value {formats.SATURATED_CODE} taken as unknown"
-        values = np.where(saturated, 0, values)
+        values = np.where(is_saturated, 0, values)
     is_assumed = scale is None and scale_of_file is None
     depth = known_metres(values.astype(np.float64) / divisor)
     reading = Reading(source + negatives, divisor, assumed=is_assumed)

@@ -203,7 +203,7 @@ class Fingerprint:
 
 
 def fingerprint(path: Path) -> Fingerprint:
-    """Returns the fingerprint of a file. Raises InputError if it cannot be read."""
+    """Returns size, times and SHA-256 of a file. Raises InputError if it cannot be read."""
     status = _status(path)
     sha256 = _digest(path, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
     return Fingerprint(
@@ -298,7 +298,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def plain(value: object) -> Any:
-    """Returns the value in JSON's own types; NaN and infinity become None."""
+    """Returns the value in JSON's own types; NaN and infinity become None.
+
+    Dataclasses become mappings, tuples and arrays lists, and paths texts.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, Mapping):

@@ -144,7 +144,7 @@ def link_image(source: Path, target: Path) -> None:
     """Makes the new file `target` a hard link to `source`, or a copy where no link is possible."""
     try:
         os.link(source, target)
-    except OSError:  # another disk, or one without links; the copy says if there is more to it
+    except OSError:  # another disk, or one without links; of anything else the copy fails, too
         shutil.copy2(source, target)
 
 

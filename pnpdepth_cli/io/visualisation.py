@@ -437,7 +437,7 @@ def improvement(
         rgb: (H, W, 3) in 0..1, the ground of the map; None for a network without image.
         before: (H, W) before refinement, 0 or not finite where unknown.
         after: (H, W) after refinement, likewise.
-        truth: (H, W) as measured, likewise, and known somewhere.
+        truth: (H, W) as measured, likewise; the gain is known at one pixel at least.
         path: The PNG.
         unit: Name of the unit of depth.
 

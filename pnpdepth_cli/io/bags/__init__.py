@@ -246,11 +246,12 @@ def _check_bag(path: Path) -> None:
 
 def _check_database(path: Path) -> None:
     """Raises InputError if an SQLite database would compute what is read from it."""
+    # Immutable, so that SQLite neither locks the file nor writes beside it.
     uri = f"{path.absolute().as_uri()}?immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as connection:
-        computed = connection.execute(_COMPUTED).fetchone()
-    if computed is not None:
-        name = one_line(computed[0])[:40]
+        first_computed = connection.execute(_COMPUTED).fetchone()
+    if first_computed is not None:
+        name = one_line(first_computed[0])[:40]
         raise InputError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
 
 

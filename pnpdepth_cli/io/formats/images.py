@@ -125,7 +125,7 @@ def open_image(path: Path, data: bytes, kind: str) -> Iterator[PIL.Image.Image]:
             check_tags(data)
         if kind == "PNG":
             with Image.open(stream, formats=[kind]) as image:
-                image.verify()
+                image.verify()  # which reads up to the last checksum
             if stream.read(4) != _END_OF_PNG:
                 raise damaged(path, kind, f"is cut short after {len(data):,} bytes")
         with Image.open(stream, formats=[kind]) as image:
@@ -195,7 +195,10 @@ def raw_mode(image: PIL.Image.Image) -> str:
 
 
 def orientation_of(image: PIL.Image.Image) -> int:
-    """Returns the EXIF orientation 1..8, or another number that means nothing."""
+    """Returns the EXIF orientation 1..8 of an image, 1 if it has none that can be read.
+
+    Any other number is what the EXIF has, and means nothing.
+    """
     from PIL.ExifTags import Base
 
     try:
@@ -224,7 +227,7 @@ def read_png(path: Path, data: bytes) -> DepthFile:
 
     Raises:
         InputError: The file is damaged, beyond the budget, or no PNG of one channel of 16 bits, or
-            its scale is none.
+            it states a scale that is no number above 0.
     """
     with open_image(path, data, "PNG") as image:
         mode = raw_mode(image)
@@ -288,8 +291,8 @@ def write_png(file: Path, codes: NDArray[np.uint16], text: Mapping[str, str]) ->
 def read_tiff(path: Path, data: bytes) -> DepthFile:
     """Returns the numbers (H, W) of a TIFF of one channel, float32 metres or 16-bit codes.
 
-    Scale, offset and number of no data that GDAL's tags state are applied; 0 is unknown. Codes
-    with an offset become float32 metres.
+    What GDAL's tags state is applied: metres are scale · number + offset, and one number stands for
+    no data. Depth is 0 where unknown. Codes with an offset become float32 metres.
 
     Args:
         path: The file, for messages.
