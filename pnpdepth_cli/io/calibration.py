@@ -136,7 +136,7 @@ class _Fields:
                 return []
             raise InputError(f"{self.path} has no {name}; it is incomplete or of another kind")
         numbers = numbers_in(self.values[name])
-        if numbers is None or not (np.abs(numbers) <= _LARGEST).all():
+        if numbers is None or not (np.abs(numbers) <= _LARGEST).all():  # NaN is refused, too
             raise InputError(f"{self.path}: {name} is not made of a camera's numbers; correct it")
         if count is not None and len(numbers) != count:
             raise InputError(

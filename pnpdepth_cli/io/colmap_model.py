@@ -218,9 +218,9 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
     if not (np.abs(parameters) < _LARGEST).all() or min(fx, fy) <= 0:
         raise ValueError(f"a {name} camera with parameters {list(parameters)}")
     distortion = tuple(parameters[focals + 2 :])
-    if lens == _RADIAL and distortion:  # at least the four coefficients k1 k2 p1 p2 of OpenCV
-        missing = 4 - len(distortion)
-        distortion += (0.0,) * missing
+    if lens == _RADIAL and distortion:
+        while len(distortion) < 4:  # k1 k2 p1 p2, which OpenCV has at least
+            distortion = (*distortion, 0.0)
     # Whole numbers are at pixel centres here, where COLMAP has .5.
     intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     return Camera(

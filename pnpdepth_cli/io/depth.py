@@ -493,7 +493,7 @@ def holds_scan(stored: DepthFile, *, is_stated: bool = False) -> bool:
 
     Args:
         stored: Numbers, as `load_numbers` returns them.
-        is_stated: Whether the user states of the list what only a scan has.
+        is_stated: Whether the user states what only a scan has, such as its extrinsics.
     """
     rows = stored.values
     # What the file or the user says.

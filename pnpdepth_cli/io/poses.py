@@ -298,14 +298,12 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
             image = PurePosixPath(frame["file_path"]).with_suffix("")
             entry = (f"/{image.as_posix()}", frame["transform_matrix"])
             by_name.setdefault(image.name, []).append(entry)
-        # The matrix of each frame. Images of several cameras are told apart by their folders.
+        # The matrix of each frame. Images of several cameras are told apart by their paths.
         poses = np.empty((len(names), 3, 4))
         for index, name in enumerate(names):
             entries = by_name.get(name.rpartition("/")[2], [])
             if len(entries) > 1:
-                entries = [
-                    (place, matrix) for place, matrix in entries if place.endswith(f"/{name}")
-                ]
+                entries = [entry for entry in entries if entry[0].endswith(f"/{name}")]
             if len(entries) != 1:
                 raise InputError(
                     f"{path} has {len(entries)} frames of the name {name!r}, not one; give the"
@@ -368,7 +366,7 @@ def _read_rows(path: Path) -> tuple[Floats, Floats]:
     Raises:
         InputError: The file has no row, or a row has other numbers or no rotation.
     """
-    # The numbers, of other columns only those that a header names.
+    # The numbers; of a table with more columns, those that its header names.
     rows, header = file_bytes.read_rows(path, file_bytes.read_bytes(path), _NAMED)
     if header and set(_NAMED) <= set(header):
         rows = rows[:, [header.index(name) for name in _NAMED]]

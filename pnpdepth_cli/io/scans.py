@@ -168,6 +168,7 @@ def _explained_variance(
     sizes = by_position.count(axis=1)
     if (sizes < 2).any():
         return 0.0
+    # The variance that is left among the numbers at one position, on average.
     within = (by_position.var(axis=1, ddof=1) * sizes).sum(axis=1) / sizes.sum(axis=1)
     # NumPy masks the quotient of a feature that does not vary, so the mean leaves it out.
     return float(np.ma.filled((1 - within / features.var(axis=1)).mean(), 0))
@@ -434,16 +435,16 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
     count = 0
     _, properties = _PROPERTIES[0]  # of a cloud without parts
     with atomic_path(path) as temporary, TemporaryFile(dir=temporary.parent) as body:
-        for part in parts:
-            # The bytes of what this part has, point after point.
+        for cloud in parts:
+            # The bytes of what this part of the cloud has, point after point.
             properties = []
             columns_of_bytes = []
-            for values, (kind, names) in zip(part, _PROPERTIES, strict=True):
+            for values, (kind, names) in zip(cloud, _PROPERTIES, strict=True):
                 if values is not None:
                     columns_of_bytes.append(np.ascontiguousarray(values, kind).view(np.uint8))
                     properties += names
             body.write(np.hstack(columns_of_bytes).tobytes())
-            count += len(part[0])
+            count += len(cloud[0])
         # The header has the number of points, which is known last.
         header = [
             "ply",

@@ -417,9 +417,9 @@ def _paint(
 
 
 def _strongest(values: NDArray[np.float64]) -> float:
-    """The amount of a signed value that has the full colour.
+    """The amount of a signed value from which on it has the full colour.
 
-    It is a high percentile of the amounts that are not 0, or 1 if all are.
+    It is the 95th percentile of the amounts that are not 0; 1 if there are none.
     """
     changed = np.abs(values[values != 0])
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0

@@ -403,9 +403,9 @@ def static_pose(bag: Bag, camera: str, scanner: str) -> Extrinsics | None:
 
 
 def poses_topics(bag: Bag, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Returns the topics of odometry or of poses that the user named, or the ones to be used.
+    """Returns the topics of poses that the user named, else all of odometry, else all of poses.
 
-    Those are the topics of odometry, or else of poses; none if the bag has neither.
+    There are none if the bag has neither.
 
     Args:
         bag: The bag.
