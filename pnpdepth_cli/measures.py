@@ -309,8 +309,8 @@ def _boundary_counts(
     """
     import numpy as np
 
-    # A neighbour may lie one pixel outside of the image, where depth is unknown. So the image begins
-    # at row and column 1 of the padded one.
+    # A neighbour may lie one pixel outside of the image, where depth is unknown. So the image
+    # begins at row and column 1 of the padded one.
     height, width = truth.shape
     predicted, truth = (np.pad(image, 1) for image in (predicted, truth))
 
