@@ -19,8 +19,8 @@ from markupsafe import Markup
 
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import atomic_folder, cannot_write
+from pnpdepth_cli.io.colours import LOGARITHMIC_FROM, DepthScale, signed_bar
 from pnpdepth_cli.io.file_bytes import plain, read_json, write_json
-from pnpdepth_cli.io.visualisation import LOGARITHMIC_FROM, DepthScale, signed_bar
 from pnpdepth_cli.version import __version__
 
 PAGE = "index.html"

@@ -13,29 +13,13 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.colours import DepthScale, Pixels, depth_scale, paint_signed, signed_bar
 
-Pixels = NDArray[np.uint8]
 Array = NDArray[np.float32]
 Panel = tuple[str, str, Pixels]
 """Title, a fainter remark beside it, and an image (H, W, 3)."""
 
-UNKNOWN = 70
-"""The grey of a pixel without depth: turbo has no such colour."""
-
-_SIGNED = {"gain": ((25, 90, 190), (220, 105, 0)), "change": ((1, 102, 94), (118, 42, 131))}
-"""Colours of 1 and -1: better and worse, farther and nearer. Blue and orange are told apart by
-colour-blind eyes."""
 _LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
-
-_TURBO_FIRST = 12
-_TURBO_LAST = 243
-"""The levels of turbo, of 0 to 255, that are used: beyond them both ends are so dark that near and
-far look alike."""
-_RANGE_PERCENTILES = (2, 98)
-"""Percentiles of depth at the ends of the colours, which a few depths do not stretch so."""
-_NARROW = 0.01  # range as a fraction of the depth, below which the bar is widened
-_WIDENED = 0.05  # of the depth, on both sides
-
 _UNIFORM_GREY = 0.3  # 0…1, of the ground without an image
 _DIM_DARKEST = 20  # levels, of 0 to 255, of a dark image
 _DIM_RANGE = 115
@@ -43,17 +27,12 @@ _MAP_DIM = 0.6  # of the light of that image, behind a map of signed values
 _MAP_LIGHT = 0.66  # 0…1, of a value of 0 in a map where the image is black
 _MAP_LIGHT_RANGE = 0.3  # that the image adds to it
 _DOT_LIGHT = 0.8  # 0…1, of a point without a change
-_BAR_LIGHT = 0.88  # 0…1, of a value of 0 in a legend
 
 _DOT_SHIFT = 4  # bits of a coordinate below the whole pixel, as OpenCV draws points
 _DOT_SPACING = 0.24  # radius of a point by the mean distance of points
 _DOT_RADII_PX = (1.4, 6.0)  # the smallest and the largest
 _BAR_COLOURS = 256
 _NO_DEPTH_ERROR = 1e9  # metres, of a pixel whose depth before is unknown or infinite
-
-LOGARITHMIC_FROM = 8.0
-"""Ratio of far to near from which the scale is logarithmic; on a linear one, nearly all of a street
-would have the colour of its far end."""
 
 # Pixels of a figure.
 FIGURE_WIDTH = 1600
@@ -81,55 +60,6 @@ _GAINS = "Change of error"
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 
 
-@dataclass(frozen=True, kw_only=True)
-class DepthScale:
-    """The colour of each depth: turbo from `low_m`, near and warm, to `high_m`, far and cold."""
-
-    low_m: float
-    high_m: float
-
-    @property
-    def logarithmic(self) -> bool:
-        """Whether the colours follow the logarithm of depth."""
-        return self.high_m / self.low_m > LOGARITHMIC_FROM
-
-    def paint(self, depth: NDArray[np.floating]) -> Pixels:
-        """Returns the colours (..., 3) of depths of any shape; `UNKNOWN` where depth is unknown.
-
-        Args:
-            depth: Metres, 0 or not finite where unknown.
-        """
-        is_known = np.isfinite(depth) & (depth > 0)
-        filled = np.where(is_known, depth, self.low_m)
-        depths = np.clip(filled, self.low_m, self.high_m, dtype=float)
-        # 0 at the near end of the scale, 1 at the far one.
-        position = (depths - self.low_m) / (self.high_m - self.low_m)
-        if self.logarithmic:
-            position = np.log(depths / self.low_m) / math.log(self.high_m / self.low_m)
-        # Near is warm, at the upper end of turbo; OpenCV gives blue, green and red.
-        turbo_range = _TURBO_LAST - _TURBO_FIRST
-        levels = np.rint(_TURBO_FIRST + turbo_range * (1 - position)).astype(np.intp)
-        turbo = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
-        colours = turbo[:, 0, ::-1][levels]
-        return np.where(is_known[..., None], colours, np.uint8(UNKNOWN))
-
-
-def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
-    """Returns the scale over the 2nd to 98th percentile of all known depths together.
-
-    Args:
-        depths: Depths of any shape in metres, 0 or not finite where unknown.
-    """
-    known_depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
-    if not known_depths.size:
-        return DepthScale(low_m=1.0, high_m=2.0)  # any scale, as nothing has its colours
-    low, high = np.percentile(known_depths.astype(np.float64), _RANGE_PERCENTILES).tolist()
-    if high - low < _NARROW * low:  # a single depth still needs a bar with two ends
-        low = (1 - _WIDENED) * low
-        high = (1 + _WIDENED) * high
-    return DepthScale(low_m=low, high_m=high)
-
-
 def _grey_of(rgb: Array | None, size: tuple[int, ...]) -> Array:
     """The grey (H, W) of an image, 0…1; a uniform one without an image.
 
@@ -147,32 +77,6 @@ def _dim(grey: Array) -> Pixels:
     """The dark image (H, W, 3) of grey (H, W) in 0…1, on which coloured points stand out."""
     levels = np.rint(_DIM_DARKEST + _DIM_RANGE * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)
-
-
-def _paint_signed(values: NDArray[np.floating], light: NDArray[np.floating], colors: str) -> Pixels:
-    """The colours (..., 3) of signed values: from grey at 0 to a full colour at -1 and at 1.
-
-    Args:
-        values: Values of any shape; those beyond -1 and 1 have the full colour.
-        light: Grey of the same shape, 0…1, at a value of 0.
-        colors: Name of the two colours in `_SIGNED`.
-    """
-    above, below = np.array(_SIGNED[colors], np.float32)
-    signed = values[..., None].astype(np.float32)
-    amount = np.clip(np.abs(signed), 0, 1)
-    base = 255 * light[..., None].astype(np.float32)
-    hue = np.where(signed > 0, above, below)
-    return np.asarray(np.rint((1 - amount) * base + amount * hue), np.uint8)
-
-
-def signed_bar(colors: str, length: int) -> Pixels:
-    """Returns the colours (length, 3) of the legend of a map of signed values, from -1 to 1.
-
-    Args:
-        colors: Name of the two colours in `_SIGNED`: "gain" or "change".
-        length: Number of colours.
-    """
-    return _paint_signed(np.linspace(-1, 1, length), np.full(length, _BAR_LIGHT), colors)
 
 
 def _magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
@@ -407,12 +311,12 @@ def _paint(
         values: (N,) signed values.
         where: (H, W) true at the N pixels of the values.
         grey: (H, W) in 0…1, the image.
-        colors: Name of the two colours in `_SIGNED`.
+        colors: Name of the two colours in `colours.SIGNED`.
     """
     strongest = _strongest(values)
     pixels = _dim(np.asarray(_MAP_DIM * grey, np.float32))
     light = _MAP_LIGHT + _MAP_LIGHT_RANGE * grey[where]
-    pixels[where] = _paint_signed(values / strongest, light, colors)
+    pixels[where] = paint_signed(values / strongest, light, colors)
     return pixels, strongest
 
 
@@ -512,7 +416,7 @@ def improvement_at_points(
         # The points in their colours, the largest change on top.
         order = np.argsort(np.abs(values), kind="stable")
         light = np.full(len(values), _DOT_LIGHT)
-        colours = _paint_signed(values[order] / strongest, light, "gain")
+        colours = paint_signed(values[order] / strongest, light, "gain")
         dots = _dots(grey, points.xy[is_known][order], colours, factor)
         better = 100 * float((values > 0).mean()) if len(values) else 0.0
         worse = 100 * float((values < 0).mean()) if len(values) else 0.0
