@@ -67,7 +67,7 @@ class SamplePattern:
     """Random seed. None in what is asked for: that of the method."""
 
     def __post_init__(self) -> None:
-        """Raises UsageError for an unknown pattern, or for a count or fraction that is none."""
+        """Raises UsageError unless the pattern is known, and has a count or else a fraction."""
         count, fraction = self.count, self.fraction
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")

@@ -24,6 +24,10 @@ def read_dense_map(path: Path, data: bytes) -> DepthFile:
 
     Depth is 0 where unknown. In the file, the numbers follow the header, row by row.
 
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
     Raises:
         InputError: The file is cut short, or holds more channels, as maps of normals do.
     """

@@ -400,4 +400,6 @@ def metres(value: float) -> str:
     """
     if value >= 1e6 or (0 < value < 1e-3):
         return f"{value:.1e}"
-    return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
+    if value >= 0.95:  # which is rounded to 1.0
+        return f"{value:,.1f}"
+    return f"{value:.2g}"

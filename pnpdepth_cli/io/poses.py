@@ -286,6 +286,10 @@ def poses_of_frames(
 def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
     """The matrices (N, 3, 4) that a transforms.json has for the frames of these names.
 
+    Args:
+        path: The file.
+        names: Names of the frames, which are those of their images without suffix.
+
     Raises:
         InputError: The file is no transforms.json, has no or several matrices for a frame, or one
             without a rotation.
@@ -322,6 +326,10 @@ def _poses_of_nerfstudio(path: Path, names: Sequence[str]) -> Floats:
 
 def _poses_of_rows(path: Path, names: Sequence[str]) -> tuple[Floats, str]:
     """The poses (N, 3, 4) of the frames of these names in a file of rows, and how they join.
+
+    Args:
+        path: The file.
+        names: Names of the frames: times in seconds, numbers of rows, or any in the rows' order.
 
     Raises:
         InputError: The rows do not fit the frames, or a row has other numbers or no rotation.

@@ -158,6 +158,14 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     """(H, W, 3) in 0..1 of a PNG or TIFF of 16 bits, and the stored number that became 1.
 
     OpenCV decodes the file, as Pillow cuts colours to 8 bits. EXIF rotation is not applied.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+        kind: "PNG" or "TIFF".
+
+    Raises:
+        InputError: The file cannot be decoded.
     """
     import cv2
 
@@ -207,7 +215,17 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
 
 
 def _from_linear_light(path: Path, data: bytes) -> RgbImage:
-    """The image of an EXR, whose linear light is converted to sRGB. InputError if damaged."""
+    """The image of an EXR, whose linear light is converted to sRGB.
+
+    Light beyond 0…1 is clipped, and the image's note says of how many pixels.
+
+    Args:
+        path: The file, which OpenEXR reads itself.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, beyond the budget, or holds no or several images.
+    """
     linear = read_exr_colour(path, data).astype(np.float32)
     np.nan_to_num(linear, copy=False, nan=0.0, posinf=_BRIGHTEST_LIGHT, neginf=0.0)
     outside = float(((linear > 1) | (linear < 0)).any(axis=2).mean())
@@ -224,6 +242,10 @@ def _from_linear_light(path: Path, data: bytes) -> RgbImage:
 
 def read_exr_colour(path: Path, data: bytes) -> NDArray[np.generic]:
     """Returns R, G and B (H, W, 3) as an EXR stores them; a single channel is repeated.
+
+    Args:
+        path: The file, which OpenEXR reads itself.
+        data: Content of the file.
 
     Raises:
         InputError: The file is damaged, beyond the budget, or holds no or several images.

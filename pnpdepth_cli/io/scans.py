@@ -100,6 +100,13 @@ def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
     """x y z of a file of float32 numbers, and what was read, for a person.
 
     How many numbers a point has, x y z first, is found in the content.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The content is of no such points, or does not tell how many numbers they have.
     """
     check_no_colmap_map(path, data)
     fields = _fields_of_bin(path, data)
@@ -175,7 +182,15 @@ def _explained_variance(
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of an NPY file of (N, 3 or more) floats, and what was read, for a person."""
+    """x y z of an NPY file of (N, 3 or more) floats, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, or holds no such floats.
+    """
     if kind_of(data) != "NPY":
         raise InputError(f"{path} is not an NPY file; save it with numpy.save")
     array = parse_npy(path, data)
@@ -192,7 +207,15 @@ Column = tuple[str, str, int]
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of a PCD, ASCII, binary or compressed, and what was read, for a person."""
+    """x y z of a PCD, ASCII, binary or compressed, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, or has no x, y and z.
+    """
     try:
         header, body = _split_header(data, b"DATA")
         entries = {words[0].upper(): words[1:] for words in header}
@@ -292,7 +315,15 @@ def _decompress_lzf(packed: bytes) -> bytes:
 
 
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of the vertices of a PLY, ASCII or binary, and what was read, for a person."""
+    """x y z of the vertices of a PLY, ASCII or binary, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, has no x, y and z, or does not begin with its vertices.
+    """
     try:
         header, body = _split_header(data, b"end_header")
         # The lines of the first element, from its name and count up to the next element.
@@ -331,7 +362,8 @@ def _split_header(data: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
     stream = io.BytesIO(data)
     while stream.tell() < min(len(data), _LONGEST_HEADER):
         line = stream.readline()
-        if words := line.decode("latin-1").split():
+        words = line.decode("latin-1").split()
+        if words:
             lines.append(words)
         if line.lstrip().startswith(last):
             return lines, data[stream.tell() :]
@@ -374,7 +406,15 @@ def _xyz(columns: list[Column], point_count: int, body: bytes, order: str | None
 
 
 def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z, the first numbers of lines of text, and what was read, for a person."""
+    """x y z, the first numbers of lines of text, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: A line is not made of as many numbers as the first.
+    """
     rows, _ = read_rows(path, data)
     return _first_columns(rows), "text scan"
 
