@@ -26,7 +26,7 @@ class OpenList(Mapping[str, Any]):
     of other packages are their entry points in the group `pnpdepth.<group>`. The own ones win.
 
     Args:
-        group: What the entries are, in the plural.
+        group: Name of what the entries are, in the plural, such as "losses".
         names: Locations of this package's entries, by their names.
         folder: A package each of whose files is an entry; `package:object` is an object in each
             file. A "-" in a name is "_" in the file. Files that start with "_", and subpackages,
@@ -49,7 +49,7 @@ class OpenList(Mapping[str, Any]):
         self._in_file = in_file
 
     def __getitem__(self, name: str) -> Any:
-        """Returns the entry. Raises UsageError for an unknown name."""
+        """Returns the entry, which is imported. Raises UsageError for an unknown name."""
         if name in self._entries:
             return self._entries[name].load()
         if self._in_file is not None and name in self:
@@ -57,6 +57,7 @@ class OpenList(Mapping[str, Any]):
         raise UsageError(f"{name!r} is none of the {self._group} {', '.join(self)}")
 
     def __contains__(self, name: object) -> bool:
+        """Whether the name is one of the list, or a Python file where users may give one."""
         is_file = self._in_file is not None and str(name).endswith(".py")
         return is_file or name in self._entries
 
@@ -68,37 +69,54 @@ class OpenList(Mapping[str, Any]):
 
     @functools.cached_property
     def _entries(self) -> dict[str, EntryPoint]:
-        """The package's own, in their order, then those of others by name."""
-        places = {**self._names, **({} if self._folder is None else _files_of(self._folder))}
-        own = {name: EntryPoint(name, place, self._group) for name, place in places.items()}
-        others = {point.name: point for point in entry_points(group=f"pnpdepth.{self._group}")}
-        return own | {name: others[name] for name in sorted(others.keys() - own.keys())}
+        """The entries of this package in their order, then those of other packages by name."""
+        locations = dict(self._names)
+        if self._folder is not None:
+            locations |= _locations_in(self._folder)
+        entries = {
+            name: EntryPoint(name, location, self._group) for name, location in locations.items()
+        }
+        installed = {point.name: point for point in entry_points(group=f"pnpdepth.{self._group}")}
+        new_names = sorted(installed.keys() - entries.keys())
+        return entries | {name: installed[name] for name in new_names}
 
 
-def _files_of(folder: str) -> dict[str, str]:
-    """The locations of the entries in the files of a package, by name."""
+def _locations_in(folder: str) -> dict[str, str]:
+    """The locations of the entries in the files of a package, by name.
+
+    Args:
+        folder: Name of the package, or `package:object`, as `OpenList` takes it.
+    """
     package, colon, attribute = folder.partition(":")
     spec = importlib.util.find_spec(package)
     if spec is None:
         raise ModuleNotFoundError(f"there is no package {package}", name=package)
     return {
-        file.name.replace("_", "-"): f"{package}.{file.name}{colon}{attribute}"
-        for file in pkgutil.iter_modules(spec.submodule_search_locations)
-        if not file.name.startswith("_") and not file.ispkg
+        module.name.replace("_", "-"): f"{package}.{module.name}{colon}{attribute}"
+        for module in pkgutil.iter_modules(spec.submodule_search_locations)
+        if not module.name.startswith("_") and not module.ispkg
     }
 
 
 @functools.cache
 def _from_file(path: str, attribute: str) -> object:
-    """The object in a Python file, which is run. UsageError if there is none."""
-    values: dict[str, object] = {"__name__": Path(path).stem, "__file__": path}
+    """The function that a user's Python file defines; the file is run once.
+
+    Args:
+        path: The file.
+        attribute: Name of the function in it.
+
+    Raises:
+        UsageError: The file cannot be run, or defines no such function.
+    """
+    namespace: dict[str, object] = {"__name__": Path(path).stem, "__file__": path}
     try:
-        exec(compile(Path(path).read_bytes(), path, "exec"), values)
-    except Exception as error:
+        exec(compile(Path(path).read_bytes(), path, "exec"), namespace)
+    except Exception as error:  # a user's code may raise anything
         raise UsageError(f"{path} cannot be run: {type(error).__name__}: {error}") from None
-    if not callable(values.get(attribute)):
+    if not callable(namespace.get(attribute)):
         raise UsageError(f"{path} defines no function {attribute!r}")
-    return values[attribute]
+    return namespace[attribute]
 
 
 LOSSES = OpenList(

@@ -12,6 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
+_LONGEST_TEXT = 300  # characters that are shown of the message of a user's exception
+
+_OUT_OF_MEMORY = (
+    "out of memory",  # torch, on a GPU
+    "allocate memory",  # torch, on the CPU
+    "ALLOC_FAILED",  # cuBLAS and cuDNN
+    "bad_alloc",  # C++
+    "map segment",  # the loader of shared libraries
+)
+"""Parts of messages by which exhausted memory is known."""
+
 
 class PnpDepthError(Exception):
     """The root of the tree; `exit_code` is the exit status of the process."""
@@ -40,10 +51,25 @@ class InputError(PnpDepthError):
 
 
 def unequal_sizes(
-    what: str, own: tuple[int, ...], other: str, size: tuple[int, ...], way_out: str = ""
+    name: str,
+    size: tuple[int, ...],
+    other_name: str,
+    other_size: tuple[int, ...],
+    way_out: str = "",
 ) -> InputError:
-    """Returns the error of two things whose sizes (H, W) should be equal."""
-    return InputError(f"{what} is {own[1]}×{own[0]} but {other} is {size[1]}×{size[0]}{way_out}")
+    """Returns the error of two images whose sizes differ but should be equal.
+
+    Args:
+        name: Name of the first image in the message.
+        size: Its shape, which begins with H and W.
+        other_name: Name of the second image in the message.
+        other_size: Its shape, which begins with H and W.
+        way_out: End of the message: what the user can do.
+    """
+    return InputError(
+        f"{name} is {size[1]}×{size[0]} but {other_name} is {other_size[1]}×{other_size[0]}"
+        f"{way_out}"
+    )
 
 
 class NoPointsError(InputError):
@@ -83,6 +109,9 @@ def wrap_user_errors(what: str) -> Iterator[None]:
     """Turns exceptions inside the block into a ModelError "`what` raises …".
 
     Errors of this program and exhausted memory are raised as they are.
+
+    Args:
+        what: Name of the user's code in the message, such as "the network's forward".
     """
     try:
         yield
@@ -93,26 +122,39 @@ def wrap_user_errors(what: str) -> Iterator[None]:
 
 
 def describe(error: BaseException, file: Path | None = None) -> str:
-    """Returns the exception on one line, with the number of the line of `file` that raised it."""
-    text = " ".join(str(error).split())[:300]
-    frames = traceback.extract_tb(error.__traceback__)
-    lines = [f.lineno for f in frames if file and Path(f.filename).resolve() == file.resolve()]
-    line = f" (line {lines[-1]})" if lines else ""
-    return f"{type(error).__name__}: {text}{line}" if text else f"{type(error).__name__}{line}"
+    """Returns the exception's type and message on one line, the message cut if it is long.
+
+    Args:
+        error: Exception that was raised.
+        file: Python file of a user. The number of its line that raised the exception is added.
+    """
+    line = ""
+    if file is not None:
+        calls = traceback.extract_tb(error.__traceback__)  # the innermost call is the last
+        lines = [call.lineno for call in calls if Path(call.filename).resolve() == file.resolve()]
+        if lines:
+            line = f" (line {lines[-1]})"
+    name = type(error).__name__
+    text = " ".join(str(error).split())[:_LONGEST_TEXT]
+    return f"{name}: {text}{line}" if text else f"{name}{line}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether torch, Python or the loader of libraries report exhausted memory by the exception."""
-    messages = ("out of memory", "allocate memory", "ALLOC_FAILED", "bad_alloc", "map segment")
-    return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError | ImportError)
-        and any(message in str(error) for message in messages)
-    )
+    """Whether the exception says that memory is exhausted.
+
+    Python raises a MemoryError. torch raises a RuntimeError, and the loader of shared libraries
+    makes an import fail; both say it only in their message.
+    """
+    if isinstance(error, MemoryError):
+        return True
+    if not isinstance(error, RuntimeError | ImportError):
+        return False
+    return any(message in str(error) for message in _OUT_OF_MEMORY)
 
 
 @contextmanager
 def out_of_memory_is_a_device_error(device: object) -> Iterator[None]:
-    """Inside, running out of memory becomes a DeviceError."""
+    """Turns exhausted memory inside the block into a DeviceError that names the device."""
     try:
         yield
     except Exception as error:

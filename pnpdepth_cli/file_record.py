@@ -27,17 +27,30 @@ FileKind = Literal[
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:
-    """Returns the file of FILE:PART, as networks and arrays of archives are named, and the part.
+    """Returns the file and the part that a name FILE:PART consists of.
 
-    The part is empty if there is none, or if a file has that whole name.
+    A network in a file of several, or an array in an archive, is named so. The part is empty where
+    the name has none, or where a file of the whole name exists.
     """
-    name, _, part = path.name.rpartition(":")
-    return (path.with_name(name), part) if name and not path.exists() else (path, "")
+    file_name, _, part = path.name.rpartition(":")
+    if not file_name or path.exists():
+        return path, ""
+    return path.with_name(file_name), part
 
 
 def what_applies(entries: Iterable[tuple[str, object]]) -> dict[str, object]:
-    """Returns the entries that are not None, false or empty, as `asdict` wants them."""
-    return {k: v for k, v in entries if v is not None and v is not False and v not in ({}, [])}
+    """Returns a record's fields without those that are None, False, or an empty dict or list.
+
+    It is given to `dataclasses.asdict` as `dict_factory`.
+
+    Args:
+        entries: Name and value of each field.
+    """
+    return {
+        name: value
+        for name, value in entries
+        if value is not None and value is not False and value not in ({}, [])
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +67,7 @@ class SamplePattern:
     """Random seed. None in what is asked for: that of the method."""
 
     def __post_init__(self) -> None:
+        """Raises UsageError unless the pattern is known, and has a count or else a fraction."""
         count, fraction = self.count, self.fraction
         if self.kind not in PATTERNS:
             raise UsageError(f"pattern {self.kind!r} is not one of {', '.join(PATTERNS)}")
@@ -64,9 +78,16 @@ class SamplePattern:
         if self.kind == "lines" and count is None:
             raise UsageError("pattern 'lines' needs the number of lines as its count")
 
-    def wanted(self, known: int) -> int:
-        """Returns the number of points to sample from `known` pixels."""
-        return self.count or max(1, round((self.fraction or 0) * known))
+    def wanted(self, available: int) -> int:
+        """Returns how many to sample: the count, or the fraction of what is available.
+
+        Args:
+            available: Number of pixels with known depth; of `lines`, of rows of the image.
+        """
+        if self.count is not None:
+            return self.count
+        fraction = self.fraction or 0.0  # given, as there is no count
+        return max(1, round(fraction * available))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +96,7 @@ class FileRecord:
 
     path: str
     kind: FileKind = "unread"
-    """What it is."""
+    """What the file is, which says how it was read."""
     sha256: str | dict[str, str] | None = None
     """SHA-256 of the content; of a COLMAP model, that of each of its files."""
     read_as: str | None = None
@@ -101,7 +122,7 @@ class FileRecord:
     keep_occluded: bool = False
     """Of a scan: whether points that are occluded by nearer ones were kept."""
     image: str | None = None
-    """Of a COLMAP model: name of the image in it."""
+    """Of a COLMAP model: name that the frame's image has in the model."""
     unit_scale: float | None = None
     """Of a COLMAP model: metres per unit."""
     poses: str | None = None
@@ -112,7 +133,7 @@ class FileRecord:
     """Of a neighbour: whether the images show another motion."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a kind without what belongs to it."""
+        """Raises ValueError for a kind without the field that says how such a file was read."""
         needed = {"sampled": self.sampled, "scan": self.calibration, "colmap": self.image}
         if self.kind in needed and needed[self.kind] is None:
             raise ValueError(f"a file of kind {self.kind!r} does not say how it was read")

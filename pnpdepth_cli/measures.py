@@ -62,31 +62,36 @@ OfPixels = Callable[["Tensor", "Tensor"], "Tensor"]
 It takes predicted and true depth (N,) float64, all positive, in metres."""
 
 
-def _rms(values: Tensor) -> Tensor:
-    return values.square().mean().sqrt()
+def _rms(errors: Tensor) -> Tensor:
+    """The root of the mean square."""
+    return errors.square().mean().sqrt()
 
 
-def _mean_abs(values: Tensor) -> Tensor:
-    return values.abs().mean()
+def _mean_abs(errors: Tensor) -> Tensor:
+    """The mean of the absolute values."""
+    return errors.abs().mean()
 
 
-def _log(p: Tensor, g: Tensor) -> Tensor:
-    return p.log() - g.log()
+def _log(predicted: Tensor, true: Tensor) -> Tensor:
+    """(N,) natural logarithm of the predicted depth less that of the true depth."""
+    return predicted.log() - true.log()
 
 
-def _inv(p: Tensor, g: Tensor) -> Tensor:
-    """1/p − 1/g, 1/km."""
-    return 1000 / p - 1000 / g
+def _inv(predicted: Tensor, true: Tensor) -> Tensor:
+    """(N,) inverse of the predicted depth less that of the true depth, 1/km of depths in metres."""
+    return 1000 / predicted - 1000 / true
 
 
-def _silog(p: Tensor, g: Tensor) -> Tensor:
-    errors = _log(p, g)
+def _silog(predicted: Tensor, true: Tensor) -> Tensor:
+    """100 times the standard deviation of log predicted − log true depth."""
+    errors = _log(predicted, true)
     return 100 * _rms(errors - errors.mean())
 
 
-def _delta(p: Tensor, g: Tensor, threshold: float) -> Tensor:
-    """The fraction of pixels whose ratio max(p/g, g/p) is below the threshold."""
-    return ((p / g).maximum(g / p) < threshold).double().mean()
+def _delta(predicted: Tensor, true: Tensor, threshold: float) -> Tensor:
+    """The fraction of pixels at which the larger depth is below `threshold` times the smaller."""
+    ratios = (predicted / true).maximum(true / predicted)
+    return (ratios < threshold).double().mean()
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ class Measure:
     key: str
     """Name in files and on the command line."""
     title: str
+    """Name in tables."""
     unit: str = ""
     """Unit in files."""
     better: Literal["lower", "higher", "neither"] = "lower"
@@ -129,7 +135,12 @@ class Measure:
         return {"lower": -1, "higher": 1, "neither": 0}[self.better]
 
     def text(self, value: float | None, unit: str = "") -> str:
-        """Returns the value as tables show it, followed by a unit; – for NaN and None."""
+        """Returns the value as tables show it, a dash for NaN and None.
+
+        Args:
+            value: Value in `unit`.
+            unit: Text after the number, except after per cent; empty for none.
+        """
         if value is None or math.isnan(value):
             return "–"
         if self.percent:
@@ -137,8 +148,9 @@ class Measure:
         return f"{value * self.shown_factor:,.{self.decimals}f} {unit}".rstrip()
 
     def to_json(self) -> dict[str, object]:
-        """Returns all but the formula."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
+        """Returns all fields by their names but the formulas."""
+        # The formulas are the fields that do not count when measures are compared.
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.compare}
 
 
 def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float | None]:
@@ -148,8 +160,8 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
         frames: Values of each frame by their key; None and NaN where a frame has none.
     """
     sums: dict[str, tuple[float, int]] = {}
-    for values in frames:
-        for key, value in values.items():
+    for values_by_key in frames:
+        for key, value in values_by_key.items():
             total, count = sums.get(key, (0.0, 0))
             if value is not None and math.isfinite(value):
                 total += value
@@ -159,7 +171,11 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
 
 
 def with_thresholds(thresholds: Sequence[float]) -> tuple[Measure, ...]:
-    """Returns `MEASURES` with other thresholds of δ1, δ2 and δ3."""
+    """Returns `MEASURES` with other thresholds of δ1, δ2 and δ3.
+
+    Args:
+        thresholds: Ratios of two depths, above 1, below which a pixel counts; one for each δ.
+    """
     deltas = (
         Measure(
             f"delta{number}",
@@ -175,6 +191,7 @@ def with_thresholds(thresholds: Sequence[float]) -> tuple[Measure, ...]:
     return (*_ERRORS, *deltas)
 
 
+# p is the predicted depth, g the true depth: (N,) float64, in metres.
 _ERRORS = (
     Measure("rmse", "RMSE", "m", main=True, of_pixels=lambda p, g: _rms(p - g)),
     Measure("mae", "MAE", "m", main=True, of_pixels=lambda p, g: _mean_abs(p - g)),
@@ -193,14 +210,16 @@ COVERAGE = Measure("coverage", "coverage", better="higher", percent=True, decima
 
 
 def by_depth(measures: Sequence[Measure], near_m: float, far_m: float) -> tuple[Measure, ...]:
-    """Returns the main ones of the measures, of near, middle and far pixels by their true depth.
+    """Returns each main measure three times: of the near, the middle and the far pixels alone.
+
+    Which a pixel is follows from its true depth. All measures of near pixels come first.
 
     Args:
-        measures: Such as `MEASURES`.
+        measures: Measures, such as `MEASURES`.
         near_m: Depth below which a pixel is near, metres.
         far_m: Depth from which on a pixel is far, metres.
     """
-    parts = (
+    ranges = (
         ("near", f"< {near_m:g} m", 0.0, near_m),
         ("middle", f"{near_m:g}–{far_m:g} m", near_m, far_m),
         ("far", f"≥ {far_m:g} m", far_m, math.inf),
@@ -211,90 +230,125 @@ def by_depth(measures: Sequence[Measure], near_m: float, far_m: float) -> tuple[
             key=f"{measure.key}_{name}",
             title=f"{measure.title} {title}",
             main=False,
-            of_pixels=partial(_within, of=measure.of_pixels, low_m=low_m, high_m=high_m),
+            of_pixels=partial(_within, formula=measure.of_pixels, low_m=low_m, high_m=high_m),
         )
-        for name, title, low_m, high_m in parts
+        for name, title, low_m, high_m in ranges
         for measure in measures
         if measure.main and measure.of_pixels
     )
 
 
-def _within(p: Tensor, g: Tensor, of: OfPixels, low_m: float, high_m: float) -> Tensor:
-    """The value of the pixels whose true depth lies in [low_m, high_m)."""
-    inside = (g >= low_m) & (g < high_m)
-    return of(p[inside], g[inside])
+def _within(
+    predicted: Tensor, true: Tensor, formula: OfPixels, low_m: float, high_m: float
+) -> Tensor:
+    """The value of a formula over the pixels whose true depth lies in [low_m, high_m)."""
+    is_inside = (true >= low_m) & (true < high_m)
+    return formula(predicted[is_inside], true[is_inside])
 
 
 _RATIOS = tuple(1.05 + 0.2 * step / 9 for step in range(10))
-"""A pixel is on a boundary if its neighbour is farther by such a factor: ten from 1.05 to 1.25."""
+"""A pixel is on a boundary if its neighbour is farther by such a factor: ten from 1.05 to 1.25.
+
+They are those of Depth Pro."""
 
 
 def _boundary_f1(predicted: Image, truth: Image) -> float:
-    """Scale-invariant F1 of the boundaries as Depth Pro's code prints it; NaN without any pair."""
+    """Scale-invariant F1 of the boundaries, 0…1, as Depth Pro's code prints it.
+
+    NaN if no two neighbours have known true depth.
+
+    Args:
+        predicted: (H, W) depth, 0 where unknown.
+        truth: (H, W) ground truth, 0 where unknown.
+    """
     import numpy as np
 
     # Precision and recall are means over four directions; F1 is weighted by the ratio. Depth Pro
     # scores dense ground truth; here pairs with an unknown pixel are left out.
     sides = ((0, 1), (0, -1), (1, 0), (-1, 0))
-    both, own, true = _boundary_counts(predicted, truth, sides, margin=0)
-    recall = (both / np.maximum(true, 1)).sum(axis=0) / 4
-    precision = (both / np.maximum(own, 1)).sum(axis=0) / 4
-    return _weigh(2 * recall * precision, recall + precision, _RATIOS)
+    in_both, in_prediction, in_truth = _boundary_counts(predicted, truth, sides, margin=0)
+    recall = (in_both / np.maximum(in_truth, 1)).sum(axis=0) / len(sides)
+    precision = (in_both / np.maximum(in_prediction, 1)).sum(axis=0) / len(sides)
+    return _mean_quotient(2 * recall * precision, recall + precision, _RATIOS)
 
 
 def _boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
-    """F1 of the boundaries as MoGe's code prints it, with neighbours within `radius` pixels."""
-    # All pairs count together, and F1 is weighted by the ratio − 1. Pixels nearer than the radius
-    # to the border are neighbours alone.
+    """F1 of the boundaries, 0…1, as MoGe's code prints it.
+
+    NaN if no two neighbours have known true depth.
+
+    Args:
+        predicted: (H, W) depth, 0 where unknown.
+        truth: (H, W) ground truth, 0 where unknown.
+        radius: Largest distance of a pixel's neighbours, pixels.
+    """
+    # All pairs count together, and F1 is weighted by the ratio − 1. A pixel nearer than the radius
+    # to the border counts as a neighbour only.
     span = range(-radius, radius + 1)
     disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
     counts = _boundary_counts(predicted, truth, disc, margin=radius)
-    both, own, true = (of_places.sum(axis=0) for of_places in counts)
-    return _weigh(2 * both, own + true, [ratio - 1 for ratio in _RATIOS])
+    in_both, in_prediction, in_truth = (of_offsets.sum(axis=0) for of_offsets in counts)
+    weights = [ratio - 1 for ratio in _RATIOS]
+    return _mean_quotient(2 * in_both, in_prediction + in_truth, weights)
 
 
 def _boundary_counts(
     predicted: Image, truth: Image, offsets: Sequence[tuple[int, int]], *, margin: int
 ) -> Floats:
-    """(3, N, ratios) how many pixels have a farther neighbour, in each of N places of it.
+    """(3, offsets, ratios) number of pixels on a boundary towards the neighbour at each offset.
 
-    Pairs of known true depth count that are farther by the ratio in both images, in the prediction,
-    and in the truth; NaN without any such pair. In a border as wide as the margin are no pixels but
-    neighbours.
+    A pixel is on a boundary if its neighbour is farther by one of `_RATIOS`. Only pairs whose true
+    depths are both known count. The three numbers are of pixels that are on a boundary in both
+    images, in the prediction, and in the truth. All are NaN if there is no pair.
+
+    Args:
+        predicted: (H, W) depth, 0 where unknown.
+        truth: (H, W) ground truth, 0 where unknown.
+        offsets: Rows down and columns right from a pixel to its neighbour.
+        margin: Width in pixels of the border of the image whose pixels are neighbours only.
     """
     import numpy as np
 
+    # A neighbour may lie one pixel outside of the image, where depth is unknown. So the image
+    # begins at row and column 1 of the padded one.
     height, width = truth.shape
-    predicted, truth = (np.pad(image, 1) for image in (predicted, truth))  # unknown around them
+    predicted, truth = (np.pad(image, 1) for image in (predicted, truth))
 
-    def moved(down: int, right: int) -> tuple[slice, slice]:
+    def window_at(down: int, right: int) -> tuple[slice, slice]:
+        """Rows and columns of all pixels inside the margin, moved by an offset."""
         rows = slice(1 + margin + down, 1 + height - margin + down)
-        return rows, slice(1 + margin + right, 1 + width - margin + right)
+        columns = slice(1 + margin + right, 1 + width - margin + right)
+        return rows, columns
 
     counts = []
-    pairs = 0
+    pair_count = 0
     ratios = np.array(_RATIOS)[:, None]
-    here = moved(0, 0)
+    pixels = window_at(0, 0)
     for offset in offsets:
-        # the pixels and their neighbours, and by which factor these are farther
-        there = moved(*offset)
-        known = (truth[here] > 0) & (truth[there] > 0)
-        pairs += int(np.count_nonzero(known))
+        # The pairs of known true depth.
+        neighbours = window_at(*offset)
+        is_known = (truth[pixels] > 0) & (truth[neighbours] > 0)
+        pair_count += int(np.count_nonzero(is_known))
+        # By which factor the neighbour is farther, in each image; 0 where depth is unknown.
         factors = []
         for image in (predicted, truth):
-            depth = image[here][known].astype(np.float64)
-            beside = image[there][known].astype(np.float64)
+            depth = image[pixels][is_known].astype(np.float64)
+            beside = image[neighbours][is_known].astype(np.float64)
             factors.append(np.divide(beside, depth, out=np.zeros_like(depth), where=depth > 0))
-        is_own, is_true = (factor > ratios for factor in factors)
-        counts.append([edges.sum(axis=1) for edges in (is_own & is_true, is_own, is_true)])
-    return np.array(counts, np.float64).swapaxes(0, 1) * (1.0 if pairs else math.nan)
+        # (ratios, pairs) whether it is a boundary of this ratio.
+        in_prediction, in_truth = (factor > ratios for factor in factors)
+        in_both = in_prediction & in_truth
+        counts.append([edges.sum(axis=1) for edges in (in_both, in_prediction, in_truth)])
+    by_image = np.array(counts, np.float64).swapaxes(0, 1)
+    return by_image if pair_count else np.full_like(by_image, math.nan)
 
 
-def _weigh(hits: Floats, of: Floats, weights: Sequence[float]) -> float:
-    """The weighted mean of hits / of, which is 0 where there is nothing."""
+def _mean_quotient(numerators: Floats, denominators: Floats, weights: Sequence[float]) -> float:
+    """The weighted mean over the ratios of numerator / denominator, 0 where both are 0."""
     import numpy as np
 
-    return float(np.average(hits / np.where(of > 0, of, 1), weights=weights))
+    divisors = np.where(denominators > 0, denominators, 1)
+    return float(np.average(numerators / divisors, weights=weights))
 
 
 # The measures that are computed on request alone.
@@ -310,38 +364,56 @@ BOUNDARY_F1_1PX, BOUNDARY_F1_2PX, BOUNDARY_F1_3PX = (
 )
 
 
+_SPARSIFICATION_STEPS = 20  # of 5 % of the pixels each
+
+
 def _within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:
-    """Fraction of errors that are at most `factor` standard deviations; NaN without any pixel."""
+    """Fraction of pixels whose error is at most `factor` times their σ; NaN without any pixel.
+
+    All images are (H, W) in metres, 0 where unknown; sigma is the predicted standard deviation.
+    """
     errors, deviations = _errors_with_sigma(predicted, truth, sigma)
     return float((errors <= factor * deviations).mean()) if len(errors) else math.nan
 
 
 def _sparsification_error(predicted: Image, truth: Image, sigma: Image) -> float:
-    """Area under the sparsification error (Ilg et al., ECCV 2018) in units of the MAE."""
+    """Area under the sparsification error (Ilg et al., ECCV 2018) in units of the MAE.
+
+    The sparsification error is the MAE without the most uncertain pixels, less the MAE without as
+    many pixels of largest error. It is 0 for a σ that orders the pixels as their errors do. NaN
+    without any pixel.
+
+    All images are (H, W) in metres, 0 where unknown; sigma is the predicted standard deviation.
+    """
     import numpy as np
 
     errors, deviations = _errors_with_sigma(predicted, truth, sigma)
     if not len(errors):
         return math.nan
-    # the MAE of what remains when the most uncertain pixels are removed, or those of largest error
-    removed = np.arange(20) / 20
+    # How many pixels are kept in each step, all in the first.
+    removed = np.arange(_SPARSIFICATION_STEPS) / _SPARSIFICATION_STEPS
     kept = np.maximum(1, np.round((1 - removed) * len(errors))).astype(int)
+    # Their MAE, when the most uncertain pixels are removed, and those of largest error.
     by_sigma, by_error = (
         np.cumsum(errors[order])[kept - 1] / kept
         for order in (np.argsort(deviations, kind="stable"), np.argsort(errors))
     )
     difference = by_sigma - by_error
-    area = (difference[1:] + difference[:-1]).sum() / 2 / 20  # trapezia
-    return float(area / by_sigma[0]) if by_sigma[0] else 0.0
+    area = (difference[1:] + difference[:-1]).sum() / 2 / _SPARSIFICATION_STEPS  # of trapezia
+    mae = by_sigma[0]
+    return float(area / mae) if mae else 0.0
 
 
 def _errors_with_sigma(predicted: Image, truth: Image, sigma: Image) -> tuple[Floats, Floats]:
-    """(N,) absolute errors and standard deviations, float64, of the pixels with all three."""
+    """(N,) absolute errors and (N,) standard deviations of the pixels where all three are known.
+
+    The images are (H, W) in metres, 0 where unknown; the results are float64 in metres.
+    """
     import numpy as np
 
-    known = (truth > 0) & (predicted > 0) & (sigma > 0)
-    errors = np.abs(predicted[known].astype(np.float64) - truth[known])
-    return errors, sigma[known].astype(np.float64)
+    is_known = (truth > 0) & (predicted > 0) & (sigma > 0)
+    errors = np.abs(predicted[is_known].astype(np.float64) - truth[is_known])
+    return errors, sigma[is_known].astype(np.float64)
 
 
 OF_SIGMA = (
@@ -404,7 +476,7 @@ class Scores(Mapping[str, float]):
         return len(self.values_by_key)
 
     def to_json(self) -> dict[str, int | float | None]:
-        """Returns the measures, the number of pixels and the coverage by their names."""
+        """Returns the measures by key, and the number of pixels and the coverage by name."""
         return {**self, "pixels": self.pixels, "coverage": self.coverage}
 
 
@@ -414,37 +486,45 @@ def score(
     """Returns the scores of a prediction against the ground truth.
 
     Args:
-        predicted: Depth in metres, of any shape; 0, negative or not finite where missing.
-        ground_truth: Ground truth depth of the same shape, likewise.
-        measures: Measures, of which those that are formulas of pixels are computed.
+        predicted: Depth in metres, of any shape; 0, negative or not finite where unknown.
+        ground_truth: Ground truth of the same shape, in metres and unknown likewise.
+        measures: Measures to compute; those without a formula of pixels are left out.
     """
-    known = ground_truth.isfinite() & (ground_truth > 0)
-    scored = known & predicted.isfinite() & (predicted > 0)
-    p = predicted[scored].double()
-    g = ground_truth[scored].double()
+    # The pixels where both depths are known, in 64 bits.
+    has_truth = ground_truth.isfinite() & (ground_truth > 0)
+    is_scored = has_truth & predicted.isfinite() & (predicted > 0)
+    predicted_depth = predicted[is_scored].double()
+    true_depth = ground_truth[is_scored].double()
+    pixel_count = len(true_depth)
     return Scores(
         values_by_key={
-            measure.key: float(measure.of_pixels(p, g))
+            measure.key: float(measure.of_pixels(predicted_depth, true_depth))
             for measure in measures
             if measure.of_pixels is not None
         },
-        pixels=len(g),
-        coverage=len(g) / int(known.sum()) if known.any() else math.nan,
+        pixels=pixel_count,
+        coverage=pixel_count / int(has_truth.sum()) if has_truth.any() else math.nan,
     )
 
 
 def parse_keys(text: str) -> tuple[str, ...]:
-    """Returns the keys in a text such as `rmse,mae`."""
+    """Returns the keys in a text such as `rmse,mae`, each once, in the order of the text."""
     return tuple(dict.fromkeys(text.split(",")))
 
 
 def choose_measures(measures: Sequence[Measure], keys: Sequence[str] | None) -> tuple[Measure, ...]:
-    """Returns the measures with these keys, in their order; all for None.
+    """Returns the measures with these keys, in the order of the keys.
+
+    Args:
+        measures: Measures to choose from.
+        keys: Keys that the user gave. None: those of all measures.
 
     Raises:
-        UsageError: If one is unknown.
+        UsageError: A key is that of no measure.
     """
     by_key = {measure.key: measure for measure in measures}
-    if unknown := [key for key in keys or () if key not in by_key]:
+    chosen = tuple(by_key) if keys is None else keys
+    unknown = [key for key in chosen if key not in by_key]
+    if unknown:
         raise UsageError(f"--columns {unknown[0]} is not one of {', '.join(by_key)}")
-    return tuple(by_key[key] for key in (by_key if keys is None else keys))
+    return tuple(by_key[key] for key in chosen)

@@ -47,6 +47,7 @@ class FramePart:
     """Vertical position of the crop, which is centred horizontally."""
 
     def __str__(self) -> str:
+        """Such as "912×228 at the bottom of the frame", for a person."""
         size = "all" if self.crop is None else f"{self.crop[1]}×{self.crop[0]} at the {self.anchor}"
         text = f"{size} of the halved frame" if self.halved else f"{size} of the frame"
         if self.blocks > 1:
@@ -59,29 +60,52 @@ class FramePart:
         return 2 if self.halved else self.blocks
 
     def apply(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Returns the part of an image (H, W) or (H, W, C). Raises InputError if it is smaller."""
+        """Returns this part of an image (H, W) or (H, W, C).
+
+        Raises:
+            InputError: The image is smaller than the crop.
+        """
         top, left, height, width = self._window((image.shape[0], image.shape[1]))
         # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
         small = image[1::2, 1::2] if self.halved else _block_means(image, self.blocks)
         return small[top : top + height, left : left + width]
 
     def points_in_crop(self, points: Points) -> Points:
-        """Returns the points in that part, from those of the whole image."""
+        """Returns the points that lie in this part, in its pixel coordinates.
+
+        Args:
+            points: Points in pixel coordinates of the whole image.
+        """
+        # Whole numbers are pixel centres, so that the image begins at -0.5.
         xy = (points.xy.astype("f8") + 0.5) / self.factor - 0.5
         small = replace(points, xy=xy.astype("f4"))
         return small.cropped(*self._window(points.size))
 
     def camera_in_crop(self, camera: Camera, size: tuple[int, int]) -> Camera:
-        """Returns the camera of that part, from that of the whole image of (H, W)."""
+        """Returns the camera that sees this part.
+
+        Args:
+            camera: Camera of the whole image.
+            size: (H, W) of the whole image.
+        """
         top, left, height, width = self._window(size)
         intrinsics = camera.intrinsics.copy()
-        intrinsics[:2] /= self.factor  # x becomes (x + 0.5) / factor - 0.5
+        # A coordinate x becomes (x + 0.5) / factor - 0.5, as whole numbers are pixel centres.
+        intrinsics[:2] /= self.factor
         intrinsics[:2, 2] -= 0.5 - 0.5 / self.factor
+        # The coordinates begin at the crop.
         intrinsics[:2, 2] -= (left, top)
         return replace(camera, intrinsics=intrinsics, size=(height, width))
 
     def _window(self, size: tuple[int, int]) -> _Window:
-        """The crop of an image (H, W) after halving or averaging."""
+        """The crop, in pixels of the halved or averaged image.
+
+        Args:
+            size: (H, W) of the whole image.
+
+        Raises:
+            InputError: The image is smaller than the crop.
+        """
         height, width = (side // self.factor for side in size)
         if self.crop is None:
             return _Window(0, 0, height, width)
@@ -98,16 +122,25 @@ class FramePart:
 
 
 def _block_means(image: NDArray[Any], side: int) -> NDArray[Any]:
-    """The means of blocks of an image (H, W, C), of depth (H, W) over those above 0."""
+    """The mean of each block of side × side pixels, float32.
+
+    The mean of a depth map is over the pixels with known depth, and 0 where there are none.
+
+    Args:
+        image: Image (H, W, C), or a depth map (H, W) that is 0 where unknown.
+        side: Side of the blocks in pixels.
+    """
     if side == 1:
         return image
     import numpy as np
 
+    # (rows of blocks, rows in a block, columns of blocks, columns in a block, channels)
     height, width = (length // side for length in image.shape[:2])
-    whole = image[: height * side, : width * side]
-    blocks = whole.reshape(height, side, width, side, *image.shape[2:])
-    known = (blocks > 0).sum(axis=(1, 3)) if image.ndim == 2 else side**2
-    return np.asarray(blocks.sum(axis=(1, 3)) / np.maximum(known, 1), np.float32)
+    whole_blocks = image[: height * side, : width * side]
+    blocks = whole_blocks.reshape(height, side, width, side, *image.shape[2:])
+    is_depth = image.ndim == 2
+    counts = (blocks > 0).sum(axis=(1, 3)) if is_depth else side**2
+    return np.asarray(blocks.sum(axis=(1, 3)) / np.maximum(counts, 1), np.float32)
 
 
 WHOLE = FramePart()
@@ -139,6 +172,7 @@ class Protocol:
     seed: int | None = None
     """Random seed of the points. None: the user's."""
     foreground: ForegroundFilter | None = None
+    """Filter of the points of a LiDAR. None: no filter."""
 
     # for `eval`
     scale: float = 256.0
@@ -150,7 +184,7 @@ class Protocol:
     clip: bool = False
     """Whether predictions are clipped to these bounds, empty ones too."""
     crop: str = "none"
-    """The rectangle of the part that is scored."""
+    """Name of the rectangle of the part in which pixels are scored; "none" for all of it."""
     exclude_sparse: bool = False
     """Whether pixels with a sparse point are not scored."""
 

@@ -30,9 +30,10 @@ from pnpdepth_cli.io.colmap_model import (
     name_in_model,
     read_model,
 )
-from pnpdepth_cli.io.depth import describe_range, points_from_stored
+from pnpdepth_cli.io.depth import describe_range
 from pnpdepth_cli.io.file_bytes import fingerprint
 from pnpdepth_cli.io.formats import SATURATED_CODE, DepthFile, Reading
+from pnpdepth_cli.io.point_files import points_from_stored
 from pnpdepth_cli.points import METRES, MODEL_UNITS, Size, in_frame
 from pnpdepth_cli.protocols import FramePart
 from pnpdepth_cli.sensors.lens import unproject

@@ -21,8 +21,9 @@ from pnpdepth_cli.dataset.frame_files import (
 )
 from pnpdepth_cli.dataset.plausible import OF_DATA_SET
 from pnpdepth_cli.errors import UsageError
-from pnpdepth_cli.io.depth import holds_integers, holds_scan, load_numbers, load_stored
+from pnpdepth_cli.io.depth import holds_integers, load_stored
 from pnpdepth_cli.io.formats import DepthFile
+from pnpdepth_cli.io.point_files import holds_scan, load_numbers
 
 _LIST_SUFFIXES = (".npy", ".csv", ".txt")
 """Suffixes of files whose rows may be x y z of a scan, or x y depth of pixels."""

@@ -14,11 +14,17 @@ from pathlib import Path
 from pnpdepth_cli.errors import OutputError, StorageError
 
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}(\.[A-Za-z0-9]+)?")
+"""Names of the temporary files and folders that `atomic_path` and `atomic_folder` make."""
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+"""Error numbers of a full disk, and of a user's full share of it."""
 _OF_THE_NAME = {errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL, errno.EISDIR, errno.ENOTDIR}
+"""Error numbers that another file name would avoid."""
 LOCKS = ".batch*.lock"
 """Pattern of the names of all lock files."""
 _WHOLE = ".batch.lock"
+"""Name of the lock of a run of all frames."""
+_LOCK_TIMEOUT_S = 0.2
+"""Longer than another process holds a lock only to find out whether it is free."""
 
 
 @contextmanager
@@ -47,7 +53,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Replaces `folder` by what is written to the yielded one; untouched if anything fails.
 
-    The yielded folder is beside it. OSErrors become OutputErrors.
+    The yielded folder is empty and beside `folder`. OSErrors become OutputErrors.
     """
     target = Path(os.path.realpath(folder))
     make_folder(target.parent)
@@ -66,7 +72,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def all_or_none(paths: Iterable[Path]) -> Iterator[None]:
-    """Removes those of the files that did not exist before, if anything inside fails."""
+    """Removes the files again if the block fails, except those that were there before it."""
     new = [path for path in paths if not path.exists()]
     try:
         yield
@@ -85,7 +91,8 @@ def make_folder(folder: Path, *, below: Path | None = None) -> None:
         below: The folder that the user named; none between the two may be a link.
 
     Raises:
-        OutputError: It cannot be created, or a link leads out of the folder that the user named.
+        OutputError: It cannot be created, or a folder on the way is a link, which may lead out of
+            the folder that the user named.
     """
     for path in (folder, *folder.parents):
         if below in path.parents and path.is_symlink():
@@ -97,7 +104,16 @@ def make_folder(folder: Path, *, below: Path | None = None) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Removes what killed writers left in it and below, while nobody writes; returns how many."""
+    """Removes the temporary files and folders that killed processes left in a folder.
+
+    Those in its subfolders are removed too. Nobody may write to the folder at the same time.
+
+    Returns:
+        How many there were.
+
+    Raises:
+        OutputError: One cannot be removed.
+    """
     leftovers = [path for path in folder.rglob(".*") if _TEMPORARY.fullmatch(path.name)]
     try:
         for path in leftovers:
@@ -119,7 +135,10 @@ def remove_file(path: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """Returns the error that says why; a StorageError where no other file name would help."""
+    """Returns the error that says why a path cannot be written.
+
+    It is a StorageError where another file name would not help, as on a full disk.
+    """
     reason = " ".join(str(error.strerror or error).split()).lower()
     kind = OutputError if error.errno in _OF_THE_NAME else StorageError
     room = "make room, or " if error.errno in _FULL else ""
@@ -128,13 +147,15 @@ def cannot_write(path: Path, error: OSError) -> OutputError:
 
 @contextmanager
 def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
-    """Holds the lock of a run or of a shard until the end of the block.
+    """Keeps other runs that would write the same frames out of a folder during the block.
 
-    The operating system locks the file, so that the lock ends with the process, however that ends.
+    A run of all frames keeps all others out. A shard, which is a run of every n-th frame, keeps
+    out runs of all frames and the same shard. The operating system locks the file, so that the
+    lock ends with the process, however that ends.
 
     Args:
         folder: The output folder.
-        shard: Number i of n that run at once, (i, n); None for all frames.
+        shard: Number of this shard and number of shards, (i, n); None for a run of all frames.
 
     Raises:
         OutputError: Another run writes there, or the folder cannot be written to.
@@ -144,8 +165,8 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
         number, shards = shard
         lock = folder / f".batch.{number}of{shards}.lock"
     with _hold(lock):
-        # A run of all frames excludes every shard, and a shard only such a run. Whether another
-        # process holds a lock is found out by holding it for a moment.
+        # The locks that nobody else may hold. Whether one is free is found out by holding it for a
+        # moment.
         excluded = sorted(folder.glob(LOCKS)) if shard is None else [folder / _WHOLE]
         for other_lock in excluded:
             if other_lock != lock and other_lock.exists():
@@ -156,18 +177,25 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
 
 @contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
-    """No other shard is inside at the same time; each waits for the one before."""
+    """Lets one shard of a folder at a time into the block; the others wait for it."""
     with _hold(folder / ".batch.summary.lock", timeout_s=-1):
         yield
 
 
 @contextmanager
-def _hold(path: Path, timeout_s: float = 0.2) -> Iterator[None]:
-    """Holds a lock; a negative timeout waits for ever. OutputError if another process does."""
-    # The default is longer than another process holds it that looks for shards.
-    from filelock import FileLock, Timeout  # it imports asyncio
+def _hold(path: Path, timeout_s: float = _LOCK_TIMEOUT_S) -> Iterator[None]:
+    """Holds the lock of a file until the end of the block.
 
-    if not path.parent.is_dir():  # filelock would make it
+    Args:
+        path: The lock file, in an existing folder.
+        timeout_s: Longest wait for a process that holds the lock; below 0, without end.
+
+    Raises:
+        OutputError: Another process holds the lock, or the file cannot be written.
+    """
+    from filelock import FileLock, Timeout  # here, as it imports asyncio
+
+    if not path.parent.is_dir():  # filelock would make the folder
         raise cannot_write(path.parent, FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)))
     try:
         held = FileLock(path).acquire(timeout=timeout_s)

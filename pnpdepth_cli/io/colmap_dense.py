@@ -20,13 +20,18 @@ def is_dense_map(data: bytes) -> bool:
 
 
 def read_dense_map(path: Path, data: bytes) -> DepthFile:
-    """Returns the depth (H, W) in units of the model, 0 where unknown, of a map of one channel.
+    """Returns the depth (H, W) in a map of one channel, float32 in units of the COLMAP model.
 
-    float32 follow the header, x fastest.
+    Depth is 0 where unknown. In the file, the numbers follow the header, row by row.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
 
     Raises:
         InputError: The file is cut short, or holds more channels, as maps of normals do.
     """
+    # The header.
     header = _HEADER.match(data)
     if header is None:
         raise damaged(path, "COLMAP map", "has no header width&height&channels&")
@@ -37,6 +42,7 @@ def read_dense_map(path: Path, data: bytes) -> DepthFile:
             " stereo/depth_maps"
         )
     check_pixel_count(path, width, height, pixel_bytes=4)
+    # The numbers.
     body = data[header.end() :]
     if len(body) != 4 * width * height:
         raise damaged(

@@ -48,7 +48,8 @@ class ColmapModel:
     negative where it was not computed; the track, the number of images that observe the point."""
 
 
-_RADIAL, _FISHEYE = "radial-tangential", "fisheye"
+_RADIAL = "radial-tangential"
+_FISHEYE = "fisheye"
 MODELS = {
     "SIMPLE_PINHOLE": (0, 1, _RADIAL, 0),
     "PINHOLE": (1, 2, _RADIAL, 0),
@@ -65,13 +66,23 @@ MODELS = {
 """COLMAP's camera models whose lenses are in `choices.LENSES`: the number in binary files, how many
 focal lengths, the lens, and how many of its coefficients."""
 _NAMES = {number: name for name, (number, *_) in MODELS.items()}
-_LARGEST = 1e9
+"""Names of the camera models by their numbers in binary files."""
+_LARGEST = 1e9  # parameter of a camera, in pixels or of distortion; beyond it, products overflow
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # beyond which four numbers are no quaternion
+_NO_POINT = -1  # number of the point of a keypoint that observes none
+_TEXT_POINT_WORDS = 8  # number, x y z, r g b and error; the track follows
 
 MODEL_PARTS = ("cameras", "images", "points3D")
+"""Names of the three files of a model, without suffix."""
 _LOCK = threading.Lock()  # threads that read frames of one model wait for it
 # Records of binary files.
-_COUNT, _NUMBER, _BYTE, _TRACK_ENTRY = (np.dtype(kind) for kind in ("<u8", "<f8", "u1", "<i8"))
+_COUNT = np.dtype("<u8")
+_NUMBER = np.dtype("<f8")
+_BYTE = np.dtype("u1")
+_TRACK_ENTRY = np.dtype("<i8")
+"""Numbers of an image and of a keypoint in it, 4 bytes each."""
 _CAMERA = np.dtype("<u4, <i4, <u8, <u8")
+"""Number, camera model, width and height."""
 _IMAGE = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera", "<u4")])
 _OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 POINT = np.dtype(
@@ -80,7 +91,7 @@ POINT = np.dtype(
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Returns the three files of a model; none if this is no folder with a model."""
+    """Returns the files of cameras, images and points in a folder; [] if one is missing."""
     for suffix in (".bin", ".txt"):  # binary first, as COLMAP itself
         files = [folder / f"{name}{suffix}" for name in MODEL_PARTS]
         if all(file.is_file() for file in files):
@@ -89,10 +100,10 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def find_model(path: Path) -> Path:
-    """Returns the folder of the model: this folder or its 0/, sparse/0/ or sparse/.
+    """Returns the folder of a COLMAP model: this folder or its 0/, sparse/0/ or sparse/.
 
     Raises:
-        InputError: There is none.
+        InputError: No such folder has a model.
     """
     for folder in (path, path / "0", path / "sparse" / "0", path / "sparse"):
         if model_files(folder):
@@ -104,8 +115,10 @@ def find_model(path: Path) -> Path:
 def read_model(path: Path) -> ColmapModel:
     """Returns the sparse model in a folder, or in its 0/, sparse/0/ or sparse/.
 
+    A model is read once for all images of a batch, and again if its files change.
+
     Raises:
-        InputError: There is none, or it is damaged or cut short.
+        InputError: There is no model, or it is damaged or cut short.
     """
     files = model_files(find_model(path))
     states = tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files)
@@ -115,33 +128,46 @@ def read_model(path: Path) -> ColmapModel:
 
 @functools.lru_cache(maxsize=2)
 def _read(states: tuple[tuple[Path, int, int], ...]) -> ColmapModel:
-    """The model in files of this size and time; kept for other images of a batch."""
+    """The model in three files, of cameras, images and points.
+
+    Args:
+        states: Path, size and time of the last change of each file, by which the cache knows it.
+    """
     camera_file, image_file, point_file = (path for path, _, _ in states)
     is_binary = camera_file.suffix == ".bin"
-    with _naming(camera_file):
-        cameras = dict((_binary_cameras if is_binary else _text_cameras)(camera_file))
+    # The cameras, by their numbers.
+    read_cameras = _binary_cameras if is_binary else _text_cameras
+    with _wrap_errors(camera_file):
+        cameras = dict(read_cameras(camera_file))
     # The images, each of a name of its own and a camera that is there.
+    read_images = _binary_images if is_binary else _text_images
     images: dict[str, ColmapImage] = {}
-    with _naming(image_file):
-        for name, camera, pose, seen in (_binary_images if is_binary else _text_images)(image_file):
-            if name in images or camera not in cameras:
+    with _wrap_errors(image_file):
+        for name, camera_number, pose, observed in read_images(image_file):
+            if name in images or camera_number not in cameras:
                 raise ValueError(f"the name or the camera of {name!r}")
-            points = np.unique(seen[seen != -1])
-            images[name] = ColmapImage(camera=cameras[camera], pose=pose, points=points)
+            point_numbers = np.unique(observed[observed != _NO_POINT])
+            images[name] = ColmapImage(
+                camera=cameras[camera_number], pose=pose, points=point_numbers
+            )
     # The points.
-    with _naming(point_file):
-        found = (_binary_points if is_binary else _text_points)(point_file)
-        if not np.isfinite(np.column_stack([found["xyz"], found["error"]])).all():
+    read_points = _binary_points if is_binary else _text_points
+    with _wrap_errors(point_file):
+        points = read_points(point_file)
+        if not np.isfinite(np.column_stack([points["xyz"], points["error"]])).all():
             raise ValueError("points without finite coordinates")
-    found = found[np.argsort(found["number"], kind="stable")]
-    return ColmapModel(folder=camera_file.parent, images=images, points=found)
+    by_number = np.argsort(points["number"], kind="stable")
+    return ColmapModel(folder=camera_file.parent, images=images, points=points[by_number])
 
 
 def name_in_model(model: ColmapModel, image: Path) -> str:
-    """Returns the name under which the model has a photo: the longest that ends its path.
+    """Returns the name under which a COLMAP model has a photo.
+
+    It is the longest name of the model that the photo's path ends with, or else the only one with
+    the name of the photo's file.
 
     Raises:
-        InputError: The model lacks it, or has several of its name.
+        InputError: The model lacks the photo, or has several of its name.
     """
     # A name of the model is a path below its image folder, so it ends the photo's path.
     path = image.absolute().as_posix()
@@ -159,18 +185,30 @@ def name_in_model(model: ColmapModel, image: Path) -> str:
 
 
 def _parameter_count(name: str) -> int:
-    """How many numbers a camera of this model has. ValueError for an unknown model."""
+    """How many parameters a camera of this COLMAP model has. ValueError for an unknown model."""
     if name not in MODELS:
         raise ValueError(
             f"camera model {name[:40]!r} is unknown; `colmap image_undistorter` writes pinhole"
             " cameras"
         )
     _, focals, _, coefficients = MODELS[name]
-    return focals + 2 + coefficients
+    return focals + 2 + coefficients  # with the principal point, cx and cy
 
 
 def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
-    """The camera of a model with its parameters in COLMAP's order."""
+    """The camera that an entry of COLMAP's list describes.
+
+    Args:
+        path: The file, for messages.
+        name: Name of the camera model, one of `MODELS`.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
+        parameters: One or two focal lengths, the principal point and the coefficients of the lens.
+
+    Raises:
+        ValueError: The model is unknown, or the parameters are not those of a camera.
+        InputError: The images have no pixels, or more than the budget allows.
+    """
     check_pixel_count(path, width, height)
     if len(parameters) != _parameter_count(name):
         raise ValueError(f"a {name} camera has other parameters")
@@ -181,8 +219,9 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
         raise ValueError(f"a {name} camera with parameters {list(parameters)}")
     distortion = tuple(parameters[focals + 2 :])
     if lens == _RADIAL and distortion:
-        distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    # Whole numbers are at pixel centres, where COLMAP has .5.
+        while len(distortion) < 4:  # k1 k2 p1 p2, which OpenCV has at least
+            distortion = (*distortion, 0.0)
+    # Whole numbers are at pixel centres here, where COLMAP has .5.
     intrinsics = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     return Camera(
         intrinsics=intrinsics,
@@ -194,15 +233,27 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
 
 
 def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
-    """The pose of qw qx qy qz tx ty tz."""
-    values = np.array(numbers, np.float64)
-    if not np.isfinite(values).all() or not 1e-6 < np.linalg.norm(values[:4]) < 1e6:
+    """The pose of the model's coordinates in the camera's, of qw qx qy qz tx ty tz.
+
+    Raises:
+        ValueError: A number is not finite, or the quaternion is so short or long that it is none.
+    """
+    quaternion, translation = np.split(np.array(numbers, np.float64), [4])
+    is_finite = np.isfinite(quaternion).all() and np.isfinite(translation).all()
+    shortest, longest = _QUATERNION_LENGTHS
+    if not is_finite or not shortest < np.linalg.norm(quaternion) < longest:
         raise ValueError("a pose that is not made of finite numbers")
-    return Extrinsics(rotation_of(values[:4]), values[4:])
+    return Extrinsics(rotation_of(quaternion), translation)
 
 
 def _records(stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1) -> NDArray[_Kind]:
-    """The next `count` records of a file, which must hold them."""
+    """The next records of a binary file, (count,). ValueError if the file ends before.
+
+    Args:
+        stream: The file, at the first of the records.
+        layout: NumPy type of a record.
+        count: Number of records, as the file claims it.
+    """
     begin = stream.tell()
     size = count * layout.itemsize
     data = stream.read(min(size, sys.maxsize))
@@ -212,11 +263,12 @@ def _records(stream: io.BytesIO, layout: np.dtype[_Kind], count: int = 1) -> NDA
 
 
 def _count(stream: io.BytesIO) -> int:
+    """The next number of a binary file, which says how many records follow."""
     return int(_records(stream, _COUNT).item())
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
-    """Number and camera of each entry of cameras.bin."""
+    """Yields number and camera of each entry of cameras.bin. ValueError if it is damaged."""
     stream = io.BytesIO(read_bytes(path))
     for _ in range(_count(stream)):
         number, model, width, height = _records(stream, _CAMERA).item()
@@ -226,11 +278,18 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]]:
-    """Yields name, number of the camera, pose and points of each image; -1 is no point."""
+    """Yields name, number of the camera, pose and observed points of each entry of images.bin.
+
+    Points are given by their numbers, `_NO_POINT` for a keypoint that observes none.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
     data = read_bytes(path)
     stream = io.BytesIO(data)
     for _ in range(_count(stream)):
         _, pose, camera = _records(stream, _IMAGE)[0]
+        # The name ends with a null byte; without one, more bytes are asked for than there are.
         end = data.find(b"\0", stream.tell())
         length = (len(data) if end < 0 else end) - stream.tell()
         name = _records(stream, _BYTE, length + 1)[:-1].tobytes().decode("utf-8", "replace")
@@ -239,16 +298,18 @@ def _binary_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]
 
 
 def _binary_points(path: Path) -> NDArray[np.void]:
-    """The points of points3D.bin, each of which is followed by its track."""
+    """The points of points3D.bin, (N,) of type `POINT`. ValueError if it is damaged."""
     stream = io.BytesIO(read_bytes(path))
     points = [np.empty(0, POINT)]
     for _ in range(_count(stream)):
-        points.append(_records(stream, POINT))
-        _records(stream, _TRACK_ENTRY, int(points[-1]["track"].item()))
+        point = _records(stream, POINT)
+        points.append(point)
+        _records(stream, _TRACK_ENTRY, int(point["track"].item()))  # the track, which is left out
     return np.concatenate(points)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    """Yields number and camera of each line of cameras.txt. ValueError if it is damaged."""
     for _, text in numbered_lines(read_bytes(path)):
         number, name, width, height, *words = text.split()
         parameters = [float(word) for word in words]
@@ -256,32 +317,50 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, int, Extrinsics, Integers]]:
-    """Each image has two lines, of which the second may be empty."""
-    whole = read_bytes(path).decode("utf-8", "replace").removesuffix("\n").split("\n")
-    lines = (line for line in whole if not line.startswith("#"))
-    for text in lines:
-        if not text.strip():
+    """Yields name, number of the camera, pose and observed points of each image in images.txt.
+
+    Points are given by their numbers, `_NO_POINT` for a keypoint that observes none. An image has
+    two lines. The second one has its keypoints, x y and point of each, and may be empty.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    text = read_bytes(path).decode("utf-8", "replace")
+    all_lines = text.removesuffix("\n").split("\n")
+    lines = (line for line in all_lines if not line.startswith("#"))
+    for line in lines:
+        if not line.strip():
             continue
-        _, *pose, camera, name = text.strip().split(maxsplit=9)
-        keypoints = next(lines, "cut short").split()  # these two words are no keypoints
+        _, *pose, camera, name = line.strip().split(maxsplit=9)
+        # Without a second line, these two words are refused, as keypoints have three each.
+        keypoints = next(lines, "cut short").split()
         if len(pose) != 7 or len(keypoints) % 3:
             raise ValueError("a pose has 7 numbers, and each keypoint 3")
         yield name, int(camera), _pose(pose), np.array(keypoints[2::3], np.int64)
 
 
 def _text_points(path: Path) -> NDArray[np.void]:
+    """The points of points3D.txt, (N,) of type `POINT` without colours. ValueError if damaged."""
     points = []
     for _, text in numbered_lines(read_bytes(path)):
         words = text.split()
-        if len(words) < 8 or len(words) % 2:
+        # After the point itself, its track: an image and a keypoint in it for each observation.
+        if len(words) < _TEXT_POINT_WORDS or len(words) % 2:
             raise ValueError("a point has 8 numbers, and each observation 2")
-        points.append((words[0], tuple(words[1:4]), 0, words[7], len(words) // 2 - 4))
+        number, *xyz = words[:4]
+        error = words[_TEXT_POINT_WORDS - 1]
+        observations = (len(words) - _TEXT_POINT_WORDS) // 2
+        points.append((number, tuple(xyz), 0, error, observations))
     return np.array(points, POINT)
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Names the file in an error of what is in it."""
+def _wrap_errors(path: Path) -> Iterator[None]:
+    """Turns a ValueError or OverflowError inside the block into an InputError that names a file.
+
+    They are raised by the readers above, and by Python where a text is no number or a number is too
+    large.
+    """
     try:
         yield
     except (ValueError, OverflowError) as error:

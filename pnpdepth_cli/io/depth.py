@@ -1,4 +1,4 @@
-"""Depth in files: images of every format, and lists of `x y depth` rows, which lose nothing."""
+"""Depth images in files of every format, and how their numbers become metres."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.choices import FORMATS
-from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
+from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io import formats
 from pnpdepth_cli.io.atomic import atomic_path
-from pnpdepth_cli.io.file_bytes import PIXELS, check_pixel_count, read_bytes, read_json, read_rows
+from pnpdepth_cli.io.file_bytes import check_pixel_count, read_bytes, read_json
 from pnpdepth_cli.io.formats import KITTI_SCALE, DepthFile, Reading, images
-from pnpdepth_cli.points import SparsePoints
 
 PNG = formats.DepthFormat(
     name="PNG",
@@ -61,26 +60,18 @@ TIFF = formats.DepthFormat(
     write=images.write_tiff,
 )
 
-DEPTH_SUFFIXES: tuple[str, ...] = tuple(s for kind in FORMATS.values() for s in kind.suffixes)
+DEPTH_SUFFIXES: tuple[str, ...] = tuple(
+    suffix for depth_format in FORMATS.values() for suffix in depth_format.suffixes
+)
 """The suffixes that depth can be written to; PNG holds integer codes, the others float32 metres."""
 
-SPARSE_SUFFIXES = (*DEPTH_SUFFIXES, ".csv")
-"""What `write_sparse` can write; .csv keeps coordinates between pixel centres."""
-
-Points = SparsePoints[NDArray[np.float32]]
-
-_TEXT_SUFFIXES = (".csv", ".txt")
 _OPEN3D_FILE = "intrinsic.json"
-_WIDE = 2.4  # widths over heights, of images that are cut for driving
-_MANY_CODES = 1000  # of a map; fewer tell nothing of their order
+_WIDE = 2.4  # width over height, above which an image is cut for driving
+_MANY_CODES = 1000  # known pixels of a map, below which nothing tells the order of their bytes
 _ROUGHER = 3.0  # times; of maps of four sets, exchanged bytes are 40 times rougher
-_NEAR_END, _LEAST_AT_END = 64_000, 0.001  # codes, and of the codes, that a sensor does not reach
-_MOST_COLUMNS = 8  # of a scan; a wider array is a depth map
-_MANY_ROWS = 200  # of so few columns, which no depth map has
-_BELOW_ZERO = 0.1  # of the rows
-_LARGEST_IMAGE_PX = 65_535  # side of an image, in PNG, JPEG and TIFF of every program
-_LARGEST_RELATIVE = 2.0  # smaller coordinates are relative to an image, and share its first pixels
-_OWN_PIXEL = 0.5  # of the points of a list have a pixel that no other has
+_NEAR_END = 64_000  # code that a sensor does not exceed
+_LEAST_NEAR_END = 0.001  # fraction of the codes above it, from which on a map was stretched
+_SMALLEST_DEVIATION = 1e-9  # in codes; avoids a division by 0 where all codes are equal
 
 _FARTHEST_INDOORS_M = 40.0
 """Below it, a map read by KITTI's scale may be a room in millimetres: 40 m are 10.2 m then."""
@@ -89,10 +80,14 @@ _OTHER_SIZE_SCALE = 1000.0
 
 
 def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
-    """Returns the depth image in a file of any of `choices.FORMATS`.
+    """Returns the depth image in a file, (H, W) float32 metres, 0 where unknown.
 
-    Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code. The
-    content tells the format. `scale` is in codes per metre; float files hold metres and ignore it.
+    Zero, NaN, infinite and negative values are unknown, and so is the largest 16-bit code.
+
+    Args:
+        path: A file of any of `choices.FORMATS`, which its content tells.
+        scale: Codes per metre of an integer file. None: as the file says, else as is usual. Float
+            files hold metres and ignore it.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth image.
@@ -103,7 +98,11 @@ def read_depth(path: Path, *, scale: float | None = None) -> DepthFile:
 
 
 def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
-    """Returns the one array in the file, of whatever shape; of truth values only if it is a mask.
+    """Returns the one array in a depth file, as stored and of whatever shape.
+
+    Args:
+        path: The file.
+        is_mask: Whether the file is a mask, whose values may be true and false.
 
     Raises:
         InputError: The file is missing, damaged, beyond the budget, or not a depth file.
@@ -111,25 +110,27 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
     data = read_bytes(path)
     depth_format = formats.format_of_content(data)
     if depth_format is None:
-        if (kind := formats.kind_of(data)) is not None:
+        kind = formats.kind_of(data)
+        if kind is not None:
             raise formats.no_depth(path, f"an 8-bit {kind}")
         raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
     stored = depth_format.read(path, data)
+    # Integers whose scale the file itself does not state may have it in a file beside it.
     if stored.values.dtype.kind in "iu" and stored.reading.scale is None:
-        beside = _scale_beside(path)
-        if beside is not None:
+        scale = _scale_beside(path)
+        if scale is not None:
             source = f"{stored.reading.source}, depth_scale of {_OPEN3D_FILE}"
-            stored = replace(stored, reading=Reading(source, beside))
+            stored = replace(stored, reading=Reading(source, scale))
     if stored.values.dtype.kind == "b" and not is_mask:
         raise InputError(f"{path} holds bool values; depth is float or integer")
     return stored
 
 
 def _scale_beside(path: Path) -> float | None:
-    """The scale of a depth image that Open3D's recorder of RealSense cameras states beside it.
+    """Codes per metre of a depth image, as Open3D's recorder of RealSense cameras states them.
 
-    It writes `depth/NUMBER.png`, `color/NUMBER.jpg` and `intrinsic.json`, with `depth_scale` codes
-    per metre, and a matrix of the camera.
+    The recorder writes `depth/NUMBER.png`, `color/NUMBER.jpg` and `intrinsic.json`, which has
+    `depth_scale` and the matrix of the camera. None for an image that does not lie so.
 
     Raises:
         InputError: The file states no scale that depth can have.
@@ -139,7 +140,7 @@ def _scale_beside(path: Path) -> float | None:
         return None
     content = read_json(sidecar)
     if not {"intrinsic_matrix", "depth_scale"} <= set(content):
-        return None
+        return None  # a file of another program
     scale = content["depth_scale"]
     if not isinstance(scale, (int, float)) or not 0 < scale < math.inf:
         raise InputError(f"{sidecar}: depth_scale {scale!r} is no number above 0; correct it")
@@ -147,23 +148,29 @@ def _scale_beside(path: Path) -> float | None:
 
 
 def holds_integers(stored: DepthFile, *, of_scale: float | None = None) -> bool:
-    """Returns whether stored numbers are depth as integers, which need a scale.
+    """Returns whether stored numbers are integer codes, to which a scale applies.
 
     Args:
-        stored: The numbers, as `load_numbers` returns them.
-        of_scale: A scale that is stated. Integers of another one that their file states need none.
+        stored: Numbers, as `point_files.load_numbers` returns them.
+        of_scale: Codes per metre. Only integers whose file states this scale, or none, count then.
+            None: all integers count.
     """
-    own = stored.reading.scale
-    return stored.values.dtype.kind in "iu" and (of_scale is None or own in (None, of_scale))
+    if stored.values.dtype.kind not in "iu":
+        return False
+    return of_scale is None or stored.reading.scale in (None, of_scale)
 
 
 def depth_from_stored(
     path: Path, stored: DepthFile, scale: float | None, size: tuple[int, int] | None = None
 ) -> DepthFile:
-    """Returns the stored numbers as one channel of float32 metres, 0 where unknown.
+    """Returns the stored numbers as a depth image (H, W), float32 metres, 0 where unknown.
 
-    Without a scale, integers have the file's own, else KITTI's, or millimetres if they are
-    not of the size (H, W) of their image.
+    Args:
+        path: The file, for messages.
+        stored: Numbers, as `load_stored` returns them.
+        scale: Codes per metre of integers. None: those that the file states, else KITTI's, or
+            millimetres if the numbers are not of the size of their image.
+        size: (H, W) of their image. None: it is not known.
 
     Raises:
         InputError: The numbers are no image of one channel, or exceed the budget.
@@ -173,36 +180,42 @@ def depth_from_stored(
         raise InputError(f"{path} has the shape {stored.values.shape}; a depth image is (H, W)")
     check_pixel_count(path, values.shape[1], values.shape[0])
     source = stored.reading.source
-    below = int(np.count_nonzero(np.less(values, 0)))
-    lost = f", {below:,} pixels below 0 taken as unknown" if below else ""
+    negative_count = int(np.count_nonzero(np.less(values, 0)))
+    negatives = f", {negative_count:,} pixels below 0 taken as unknown" if negative_count else ""
     # Floats are metres.
     if values.dtype.kind == "f":
-        return DepthFile(values=known_metres(values), reading=Reading(source + lost))
-    # Integers are codes, of which so many are a metre: as stated, by the file, or as is usual.
+        return DepthFile(values=known_metres(values), reading=Reading(source + negatives))
+    # Integers are codes, of which so many are a metre: as the caller says, else as the file does,
+    # else as is usual.
     _check_codes(path, values, is_stated=scale is not None)
-    of_file = stored.reading.scale
-    assumed = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
-    if values.shape[1] > _WIDE * values.shape[0]:  # of no phone or depth camera
-        assumed = KITTI_SCALE
-    divisor = scale or of_file or assumed
+    scale_of_file = stored.reading.scale
+    assumed_scale = KITTI_SCALE if size in (None, values.shape) else _OTHER_SIZE_SCALE
+    if values.shape[1] > _WIDE * values.shape[0]:  # no phone or depth camera has such images
+        assumed_scale = KITTI_SCALE
+    divisor = scale or scale_of_file or assumed_scale
     source += f" ÷ {divisor:.12g}"
-    if scale is None and of_file is not None:
+    if scale is None and scale_of_file is not None:
         source += " (from the file)"
-    elif of_file not in (None, divisor):
-        source += f" (not {of_file:.12g}, as the file says)"
+    elif scale_of_file not in (None, divisor):
+        source += f" (not {scale_of_file:.12g}, as the file says)"
     # The largest code is no depth.
-    saturated = (values == formats.SATURATED_CODE) & (values.dtype == np.uint16)
-    if saturated.any():
-        count = int(saturated.sum())
+    is_saturated = values == formats.SATURATED_CODE
+    if values.dtype == np.uint16 and is_saturated.any():
+        count = int(is_saturated.sum())
         source += f", {count:,} pixels of value {formats.SATURATED_CODE} taken as unknown"
-        values = np.where(saturated, 0, values)
-    metres = values.astype(np.float64) / divisor
-    reading = Reading(source + lost, divisor, assumed=scale is None and of_file is None)
-    return DepthFile(values=known_metres(metres), reading=reading)
+        values = np.where(is_saturated, 0, values)
+    is_assumed = scale is None and scale_of_file is None
+    depth = known_metres(values.astype(np.float64) / divisor)
+    reading = Reading(source + negatives, divisor, assumed=is_assumed)
+    return DepthFile(values=depth, reading=reading)
 
 
 def without_single_axes(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Returns an array of (1, H, W), (H, W, 1), (1, 1, H, W), as networks give it, as (H, W)."""
+    """Returns the array as (H, W) if all its other axes, first or last, have length 1.
+
+    Networks give depth as (1, H, W), (H, W, 1) or (1, 1, H, W). Any other array of more than two
+    axes keeps some of them.
+    """
     while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):
         values = values[0] if len(values) == 1 else values[..., 0]
     return values
@@ -213,14 +226,20 @@ def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) ->
 
     Codes that reach the largest one without a gap were stretched to 16 bits, and are no depth
     unless a scale is stated.
+
+    Args:
+        path: The file, for messages.
+        values: Integers (H, W), 0 where unknown.
+        is_stated: Whether the caller states a scale.
     """
     check_byte_order(path, values)
     codes = _known_codes(values)
-    if codes is None:
+    if codes is None or is_stated:
         return
+    # A sensor has a gap between its farthest depth and the largest code, which means unknown.
     near_end = int(np.count_nonzero(codes > _NEAR_END))
     at_end = int(np.count_nonzero(values == formats.SATURATED_CODE))
-    if not is_stated and at_end and near_end >= max(at_end, _LEAST_AT_END * len(codes)):
+    if at_end and near_end >= max(at_end, _LEAST_NEAR_END * len(codes)):
         raise InputError(
             f"{path}: its numbers reach {formats.SATURATED_CODE} without a gap, as those of a map"
             " that was normalised to 16 bits; save metres × a scale, or give the scale with"
@@ -229,9 +248,14 @@ def _check_codes(path: Path, values: NDArray[np.generic], *, is_stated: bool) ->
 
 
 def check_byte_order(path: Path, values: NDArray[np.generic]) -> None:
-    """Raises InputError for 16-bit codes whose bytes are exchanged.
+    """Raises InputError for 16-bit codes whose two bytes are exchanged.
 
-    Neighbours in a row are nearly alike, but not if their bytes are exchanged.
+    Neighbours in a row are nearly alike, but not if their bytes are exchanged. Other numbers, and
+    maps of few known pixels, pass.
+
+    Args:
+        path: The file, for messages.
+        values: Numbers (H, W), 0 where unknown.
     """
     codes = _known_codes(values)
     if codes is not None and _roughness(codes) > _ROUGHER * _roughness(codes.byteswap()):
@@ -242,23 +266,33 @@ def check_byte_order(path: Path, values: NDArray[np.generic]) -> None:
 
 
 def _known_codes(values: NDArray[np.generic]) -> NDArray[np.uint16] | None:
-    """The 16-bit codes of known depth, in their order; None of other numbers, and of few."""
+    """(N,) the 16-bit codes of known depth, row by row.
+
+    None for numbers that are no 16-bit codes, and for too few to tell anything of them.
+    """
     if values.dtype != np.uint16:
         return None
-    known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
-    if np.count_nonzero(known) < _MANY_CODES:
+    is_known = np.greater(values, 0) & np.less(values, formats.SATURATED_CODE)
+    if np.count_nonzero(is_known) < _MANY_CODES:
         return None
-    return np.asarray(values[known], np.uint16)
+    return np.asarray(values[is_known], np.uint16)
 
 
 def _roughness(codes: NDArray[np.uint16]) -> float:
-    """Mean difference of neighbours in units of the standard deviation; 0 of equal codes."""
+    """Mean absolute difference of successive codes, over the standard deviation of all codes.
+
+    It is 0 if all codes are equal.
+    """
     values = codes.astype(np.float64)
-    return float(np.abs(np.diff(values)).mean() / (values.std() + 1e-9))
+    return float(np.abs(np.diff(values)).mean() / (values.std() + _SMALLEST_DEVIATION))
 
 
 def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Returns float32 of the same shape with 0 for everything but a finite depth above 0."""
+    """Returns a copy in float32 in which all that is no finite depth above 0 is 0.
+
+    Args:
+        values: Depth in metres, of any shape.
+    """
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         metres = np.array(values, dtype=np.float32, order="C")
         metres[~(np.isfinite(metres) & (metres > 0))] = 0
@@ -266,9 +300,12 @@ def known_metres(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_SCALE) -> None:
-    """Writes depth in the format that the suffix names; not finite or <= 0 becomes 0, unknown.
+    """Writes depth in the format that the suffix names.
 
-    Depth is (H, W) metres. A PNG has `scale` codes per metre, which it keeps as text.
+    Args:
+        path: The file; it is replaced.
+        depth: (H, W) metres. What is not finite or not above 0 is written as 0, unknown.
+        scale: Codes per metre of a PNG, which states them as text. Other formats hold metres.
 
     Raises:
         OutputError: The suffix is unknown, the file cannot be written, or a depth is too large for
@@ -278,17 +315,28 @@ def write_depth(path: Path, depth: NDArray[np.float32], *, scale: float = KITTI_
     depth_format = formats.format_of_suffix(path)
     if depth.ndim != 2 or 0 in depth.shape:
         raise InputError(f"{path}: depth of shape {depth.shape} is no image; give (H, W)")
-    values: NDArray[np.generic] = known_metres(depth)
+    metres_or_0 = known_metres(depth)
+    values: NDArray[np.generic] = metres_or_0
     text = dict[str, str]()
     if depth_format.integer:
-        values = _codes(path, known_metres(depth), scale)
+        values = _codes(path, metres_or_0, scale)
         text[formats.SCALE_KEY] = repr(float(scale)).removesuffix(".0")
     with atomic_path(path) as temporary:
         depth_format.write(temporary, values, text)
 
 
 def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.uint16]:
-    """The codes of 16 bits of depth (H, W). OutputError if they cannot hold it."""
+    """The 16-bit codes (H, W) of depth, 0 where unknown.
+
+    Args:
+        path: The file to write, for messages.
+        metres: (H, W) depth, 0 where unknown.
+        scale: Codes per metre.
+
+    Raises:
+        OutputError: A depth is too large for 16 bits, or so small that it would become 0.
+        UsageError: The scale is not above 0.
+    """
     formats.check_scale(scale)
     codes = np.rint(metres.astype(np.float64) * scale)
     if codes.max() > formats.LARGEST_CODE:
@@ -296,154 +344,13 @@ def _codes(path: Path, metres: NDArray[np.float32], scale: float) -> NDArray[np.
             f"{path}: the largest depth, {metres.max():.6g} m, does not fit in 16 bits with"
             f" {scale:g} codes per metre; write .exr, .npy or .tiff"
         )
-    lost = (metres > 0) & (codes == 0)
-    if lost.any():
+    is_lost = (metres > 0) & (codes == 0)
+    if is_lost.any():
         raise OutputError(
-            f"{path}: {int(lost.sum()):,} depths down to {metres[lost].min():.3g} m would be"
+            f"{path}: {int(is_lost.sum()):,} depths down to {metres[is_lost].min():.3g} m would be"
             f" unknown in 16 bits with {scale:g} codes per metre; write .exr, .npy or .tiff"
         )
     return codes.astype(np.uint16)
-
-
-def read_sparse(
-    path: Path, *, size: tuple[int, int] | None = None, scale: float | None = None
-) -> tuple[Points, Reading]:
-    """Returns the points with known depth of a depth image or a point list, and how it was read.
-
-    See `points_from_stored`.
-
-    Raises:
-        NoPointsError: No depth is known.
-        InputError: The file cannot be read, or is a list, and no size was given.
-    """
-    formats.check_scale(scale)
-    return points_from_stored(path, load_numbers(path), size=size, scale=scale)
-
-
-def load_numbers(path: Path) -> DepthFile:
-    """Returns the numbers that a file stores: an array of whatever shape, or the rows of a text.
-
-    Raises:
-        InputError: The file is missing, damaged, beyond the budget, or holds no numbers.
-    """
-    data = read_bytes(path)
-    if path.suffix.lower() not in _TEXT_SUFFIXES or formats.kind_of(data) is not None:
-        return load_stored(path)
-    rows, header = read_rows(path, data)
-    return DepthFile(values=rows, reading=Reading("text"), is_image=False, header=tuple(header))
-
-
-def points_from_stored(
-    path: Path,
-    stored: DepthFile,
-    *,
-    size: tuple[int, int] | None = None,
-    scale: float | None = None,
-) -> tuple[Points, Reading]:
-    """Returns the points with known depth of the numbers of a file, and how they are read.
-
-    Points of an image are in row-major order. A list is a float array of shape (N, 3) in NPY or
-    NPZ, or text with one `x y depth` per line (.csv, .txt), in metres; its order is kept.
-
-    Args:
-        path: The file, for messages.
-        stored: Its numbers, as `load_numbers` returns them.
-        size: (H, W) of the frame that a list belongs to. An image has its own; where they differ,
-            integers are millimetres unless a scale is known.
-        scale: Codes per metre of an integer image.
-
-    Raises:
-        NoPointsError: No depth is known.
-        InputError: The file is a list, and no size was given.
-        UsageError: The scale is not above 0.
-    """
-    formats.check_scale(scale)
-    # A list: a text, or an array with few columns and many rows.
-    if stored.header is not None:
-        return _from_rows(path, stored.values, "point list", size)
-    shape = stored.values.shape
-    columns = 0 if stored.is_image or len(shape) != 2 else shape[1]
-    if columns == 3 or (3 < columns <= _MOST_COLUMNS and shape[0] > _MANY_ROWS):
-        return _from_rows(path, stored.values, f"point list, {stored.reading.source}", size)
-    # Anything else is an image.
-    image = depth_from_stored(path, stored, scale, size)
-    known = image.values > 0
-    yx = np.argwhere(known)
-    if not len(yx):
-        raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
-    height, width = image.values.shape
-    points = SparsePoints(
-        xy=yx[:, ::-1].astype(np.float32), depth=image.values[known], size=(height, width)
-    )
-    return points, image.reading
-
-
-def _from_rows(
-    path: Path, rows: NDArray[np.floating], source: str, size: tuple[int, int] | None
-) -> tuple[Points, Reading]:
-    """The points of rows x, y, depth; those without depth or pixel are left out and counted."""
-    if rows.dtype.kind != "f":
-        raise InputError(f"{path} is a list of {rows.dtype}; save x, y, depth as floats")
-    if rows.shape[1] != 3:
-        raise InputError(
-            f"{path}: {rows.shape[1]} numbers a row are not x, y and depth; if they are x y z of a"
-            " scan, give --calib"
-        )
-    depth = known_metres(rows[:, 2])
-    known = (depth > 0) & np.isfinite(rows[:, :2]).all(axis=1)
-    if not known.any():
-        raise NoPointsError(f"{path} holds no depth above 0; give a file with sparse depth")
-    if size is None:
-        raise InputError(f"{path} is a list of points, which needs an image for the frame's size")
-    lost = len(rows) - int(np.count_nonzero(known))
-    if lost:
-        source += f", without {lost:,} rows that have no depth above 0 or no pixel"
-    xy = rows[known, :2].astype(np.float32)
-    return SparsePoints(xy=xy, depth=depth[known], size=size), Reading(source)
-
-
-def holds_scan(stored: DepthFile, *, is_stated: bool = False) -> bool:
-    """Returns whether the numbers of a list are x y z of a scan, not x y depth of pixels.
-
-    By its header or by more than three numbers a row, or as stated; else many x or y are no pixels:
-    far below 0, beyond the largest image, or several points share most of them.
-
-    Args:
-        stored: The numbers of the list.
-        is_stated: Whether the user states of the list what only a scan has.
-    """
-    rows = stored.values
-    if stored.header:
-        return list(stored.header[:3]) != PIXELS
-    if stored.is_image or rows.ndim != 2 or rows.dtype.kind != "f":
-        return False
-    if not 3 <= rows.shape[1] <= _MOST_COLUMNS:
-        return False
-    if rows.shape[1] > 3 or is_stated:
-        return True
-    xy = rows[np.isfinite(rows).all(axis=1), :2]
-    if not len(xy):
-        return False
-    no_pixel = ((xy < -0.5) | (xy > _LARGEST_IMAGE_PX)).any(axis=1)
-    if np.count_nonzero(no_pixel) > _BELOW_ZERO * len(rows):
-        return True
-    pixels = len(np.unique(np.rint(xy), axis=0))
-    return bool(xy.max() > _LARGEST_RELATIVE and pixels < _OWN_PIXEL * len(xy))
-
-
-def write_sparse(
-    path: Path, xy: NDArray[np.float32], depth: NDArray[np.float32], image: NDArray[np.float32]
-) -> None:
-    """Writes N points, of pixels (N, 2) and metres (N,), in the format that the suffix names.
-
-    Every format but .csv holds the image, the same points as (H, W) metres.
-    """
-    if path.suffix.lower() != ".csv":
-        write_depth(path, image)
-        return
-    rows = np.column_stack([xy, depth])
-    with atomic_path(path) as temporary:
-        np.savetxt(temporary, rows, "%.9g", ",", header="x,y,depth", comments="")
 
 
 def describe_range(
@@ -456,29 +363,43 @@ def describe_range(
 ) -> str:
     """Returns a line such as `1,842 points, 2.1–63.4 m (16-bit PNG ÷ 256)`.
 
-    An assumed scale adds the option that changes it and, where KITTI's scale gives near depths
-    only, their range if they are millimetres. Unknown depth is 0 or not finite.
+    If the scale is assumed, the line names the option that changes it. Where KITTI's scale gives
+    near depths only, it also has their range as millimetres.
+
+    Args:
+        depth: Depths of any shape in `unit`, 0 or not finite where unknown.
+        reading: How they were read.
+        noun: What the depths are of, in the plural with a final s.
+        option: Option that states the scale.
+        unit: Name of the unit.
     """
-    values = np.asarray(depth, dtype=np.float64)
-    known = values[np.isfinite(values) & (values > 0)]
+    all_depths = np.asarray(depth, dtype=np.float64)
+    depths = all_depths[np.isfinite(all_depths) & (all_depths > 0)]
     hint = f"; {option} to change" if reading.assumed else ""
-    if known.size == 0:
+    if depths.size == 0:
         return f"no {noun} with known depth ({reading.source}{hint})"
     # Near depths by KITTI's scale may be millimetres of a room.
-    by_kitti = reading.assumed and reading.source.endswith(f"÷ {KITTI_SCALE:g}")
-    if by_kitti and float(known.max()) < _FARTHEST_INDOORS_M:
-        low, high = (metres(float(end) * KITTI_SCALE / 1000) for end in (known.min(), known.max()))
+    nearest = float(depths.min())
+    farthest = float(depths.max())
+    is_by_kitti = reading.assumed and reading.source.endswith(f"÷ {KITTI_SCALE:g}")
+    if is_by_kitti and farthest < _FARTHEST_INDOORS_M:
+        low, high = (metres(end * KITTI_SCALE / 1000) for end in (nearest, farthest))
         hint = f" assumed; if it holds millimetres, {option} 1000 makes it {low}–{high} m"
     # How many there are, and from where to where.
-    count = f"{known.size:,} {noun[:-1] if known.size == 1 else noun}"
-    low = metres(float(known.min()))
-    high = metres(float(known.max()))
+    count = f"{depths.size:,} {noun.removesuffix('s') if depths.size == 1 else noun}"
+    low = metres(nearest)
+    high = metres(farthest)
     extent = low if low == high else f"{low}–{high}"
     return f"{count}, {extent} {unit} ({reading.source}{hint})"
 
 
 def metres(value: float) -> str:
-    """Returns the number as a person writes it: one decimal from 1 m on, two digits below."""
+    """Returns metres as a person writes them: one decimal from 1 m on, two digits below.
+
+    Powers of ten stand for what is too large or too small to be a depth.
+    """
     if value >= 1e6 or (0 < value < 1e-3):
         return f"{value:.1e}"
-    return f"{value:,.1f}" if value >= 0.95 else f"{value:.2g}"
+    if value >= 0.95:  # which is rounded to 1.0
+        return f"{value:,.1f}"
+    return f"{value:.2g}"

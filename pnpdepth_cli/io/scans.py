@@ -24,17 +24,23 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.io.file_bytes import damaged, read_bytes, read_rows
 from pnpdepth_cli.io.formats import kind_of, parse_npy
 
-_FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)  # the last are of painted points
-_USUAL = 8  # fields a point, at most
-_LEAST_ROWS = 100  # points that a file must have to be recognised as one of more fields
+_FIELD_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
+"""How many numbers a point of a .bin may have; the last are of points with scores of classes."""
+_USUAL = 8  # numbers of a point, at most; more are believed only of a file of `_LEAST_ROWS`
+_LEAST_ROWS = 100  # points
 _BIN_SOURCES = {4: "KITTI scan", 5: "nuScenes scan"}
-_EXACT_M = 1e-3  # error of coordinates that counts
+_EXACT_M = 1e-3  # error of a coordinate from which on 64 bits are kept
+_MANY_ROUNDED = 0.25  # fraction of the coordinates with such an error
 _EARTH_M = 1e8  # larger than the coordinates of any place on earth
 _COLMAP_MAP = re.compile(rb"\d{1,6}&\d{1,6}&\d&")  # width, height, channels
-_SMALLEST = 1e-3  # numbers near 0 are alike
+_SMALLEST = 1e-3  # numbers nearer to 0 are of one order of magnitude
 _AS_MUCH = 0.85  # of the variance that the best count explains; its divisors explain less
-_LEAST_EXPLAINED = 0.03  # of the variance; numbers in any order have less
-_PCD_TYPES = {k + n: k.lower() + n for k in "IUF" for n in "1248" if k + n not in ("F1", "F2")}
+_LEAST_EXPLAINED = 0.03  # fraction of the variance; numbers in any order have less
+_PCD_TYPES = {
+    "I1": "i1", "I2": "i2", "I4": "i4", "I8": "i8",
+    "U1": "u1", "U2": "u2", "U4": "u4", "U8": "u8",
+    "F4": "f4", "F8": "f8",
+}  # fmt: skip
 """NumPy types by TYPE and SIZE of a PCD."""
 _PLY_KINDS = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -42,9 +48,13 @@ _PLY_KINDS = {
 }  # fmt: skip
 _PLY_KINDS |= {np.dtype(kind).name: kind for kind in _PLY_KINDS.values()}  # such as float32
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
-_LONGEST_HEADER = 1 << 16
+"""Byte orders by the format of a PLY; None for text."""
+_LONGEST_HEADER = 1 << 16  # bytes of a PCD or PLY
 _MOST_COMPRESSED = 100
 """Times as many bytes as compressed ones; three bytes of LZF make at most 264."""
+_PCD_SIZES = struct.Struct("<II")
+"""Bytes of a compressed PCD's body, compressed and not, which are in front of it."""
+_BLOCK_BYTES = 1 << 20  # that are copied at once
 
 Points = NDArray[np.float32] | NDArray[np.float64]
 
@@ -60,20 +70,25 @@ def read_scan(path: Path) -> tuple[Points, str]:
         read, for a person.
 
     Raises:
-        InputError: The file is damaged or ambiguous.
+        InputError: The file is missing, damaged, no scan, or ambiguous.
     """
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        raise InputError(f"{path} is not a scan; give a file of {', '.join(_READERS)}")
+    parse = _PARSERS.get(path.suffix.lower())
+    if parse is None:
+        raise InputError(f"{path} is not a scan; give a file of {', '.join(_PARSERS)}")
     data = read_bytes(path)
     kind = kind_of(data)
     if kind not in (None, "NPY"):
         raise InputError(f"{path} is a {kind} file, not a scan; check what is given as scan")
-    return read(path, data)
+    return parse(path, data)
 
 
 def check_no_colmap_map(path: Path, data: bytes) -> None:
-    """Raises InputError for a depth map of COLMAP's dense reconstruction, which is .bin, too."""
+    """Raises InputError for a depth map of COLMAP's dense reconstruction, which is .bin, too.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+    """
     if _COLMAP_MAP.match(data) is not None:
         raise InputError(
             f"{path} is a map of COLMAP's dense reconstruction; save its depth as NPY (H, W), by"
@@ -82,7 +97,17 @@ def check_no_colmap_map(path: Path, data: bytes) -> None:
 
 
 def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
-    """The first columns of float32 numbers, of which a point has as many as the content tells."""
+    """x y z of a file of float32 numbers, and what was read, for a person.
+
+    How many numbers a point has, x y z first, is found in the content.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The content is of no such points, or does not tell how many numbers they have.
+    """
     check_no_colmap_map(path, data)
     fields = _fields_of_bin(path, data)
     if len(data) % (4 * fields):
@@ -95,18 +120,33 @@ def _parse_bin(path: Path, data: bytes) -> tuple[Points, str]:
 
 
 def _fields_of_bin(path: Path, data: bytes) -> int:
-    """How many numbers a point has: those of one field are alike, those of two are not."""
+    """How many numbers a point of a .bin has, which no such file states.
+
+    Numbers of one field, such as all z, are alike, and those of two fields are not. So the count
+    is right if the position of a number in its point explains much of how numbers differ.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file, float32 numbers point after point.
+
+    Raises:
+        InputError: No count explains much.
+    """
     numbers = np.frombuffer(data, "<f4", len(data) // 4).astype(np.float64)
     numbers = np.where(np.isfinite(numbers), numbers, 0)
-    # Alike by sign, order of magnitude, and whether it is a whole number, such as a laser's index.
-    size = np.log10(np.abs(numbers) + _SMALLEST)
-    features = np.stack([np.sign(numbers), size, numbers == np.rint(numbers)])
+    # (3, N) what makes numbers alike: sign, order of magnitude, and whether they are whole, as the
+    # index of a laser is.
+    magnitude = np.log10(np.abs(numbers) + _SMALLEST)
+    features = np.stack([np.sign(numbers), magnitude, numbers == np.rint(numbers)])
     # Beams without return say nothing: more zeros in a row than a point has numbers.
     most_fields = max(_FIELD_COUNTS)
-    zeros = np.convolve(numbers == 0, np.ones(most_fields + 1), "same")[: len(numbers)]
-    masked = np.ma.array(features, mask=np.broadcast_to(zeros > most_fields, features.shape))
-    # What the position in a point explains of these, by how many numbers a point would have.
-    counts = [n for n in _FIELD_COUNTS if n <= _USUAL or len(numbers) >= _LEAST_ROWS * n]
+    zeros_around = np.convolve(numbers == 0, np.ones(most_fields + 1), "same")[: len(numbers)]
+    is_empty = np.broadcast_to(zeros_around > most_fields, features.shape)
+    masked = np.ma.array(features, mask=is_empty)
+    # What the position in a point explains, by the number of fields that a point would have.
+    counts = [
+        count for count in _FIELD_COUNTS if count <= _USUAL or len(numbers) >= _LEAST_ROWS * count
+    ]
     explained = {count: _explained_variance(masked, count) for count in counts}
     most = max(explained.values())
     if most < _LEAST_EXPLAINED:
@@ -114,26 +154,43 @@ def _fields_of_bin(path: Path, data: bytes) -> int:
             f"{path} does not tell which of {', '.join(map(str, _FIELD_COUNTS))} numbers a point"
             " has; save its x, y, z as NPY (N, 3)"
         )
-    # Multiples of the true count explain as much, so the first one is it.
-    return next(n for n, fraction in explained.items() if fraction >= _AS_MUCH * most)
+    # Multiples of the true count explain as much as it does, so the smallest is right.
+    return next(count for count, fraction in explained.items() if fraction >= _AS_MUCH * most)
 
 
 def _explained_variance(
     features: np.ma.MaskedArray[tuple[int, ...], np.dtype[np.float64]], count: int
 ) -> float:
-    """Mean fraction 0…1 of the variance of features (F, N) that N modulo `count` explains."""
-    rows = features.shape[1] // count
-    fields = features[:, : rows * count].reshape(len(features), rows, count)
-    number = fields.count(axis=1)
-    if (number < 2).any():
+    """The fraction of the variance of features that a number's position in its point explains.
+
+    Args:
+        features: (F, N) features of N successive numbers; those that say nothing are masked.
+        count: How many numbers a point would have.
+
+    Returns:
+        Mean over the features, at most 1; 0 if a position has fewer than two numbers.
+    """
+    points = features.shape[1] // count
+    by_position = features[:, : points * count].reshape(len(features), points, count)
+    sizes = by_position.count(axis=1)
+    if (sizes < 2).any():
         return 0.0
-    within = (fields.var(axis=1, ddof=1) * number).sum(axis=1) / number.sum(axis=1)
-    # a feature that does not vary is masked
+    # The variance that is left among the numbers at one position, on average.
+    within = (by_position.var(axis=1, ddof=1) * sizes).sum(axis=1) / sizes.sum(axis=1)
+    # NumPy masks the quotient of a feature that does not vary, so the mean leaves it out.
     return float(np.ma.filled((1 - within / features.var(axis=1)).mean(), 0))
 
 
 def _parse_array(path: Path, data: bytes) -> tuple[Points, str]:
-    """The first columns of (N, 3 or more) floats."""
+    """x y z of an NPY file of (N, 3 or more) floats, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, or holds no such floats.
+    """
     if kind_of(data) != "NPY":
         raise InputError(f"{path} is not an NPY file; save it with numpy.save")
     array = parse_npy(path, data)
@@ -150,149 +207,237 @@ Column = tuple[str, str, int]
 
 
 def _parse_pcd(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of a PCD, ASCII, binary or compressed."""
+    """x y z of a PCD, ASCII, binary or compressed, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, or has no x, y and z.
+    """
     try:
-        header, body = _header(data, b"DATA")
+        header, body = _split_header(data, b"DATA")
         entries = {words[0].upper(): words[1:] for words in header}
         # The fields, and how they are stored.
         names, kinds, sizes = (entries[entry] for entry in ("FIELDS", "TYPE", "SIZE"))
-        fields = zip(names, kinds, sizes, entries.get("COUNT", ["1"] * len(names)), strict=True)
-        columns = [(name, _PCD_TYPES[kind + size], int(n)) for name, kind, size, n in fields]
-        number = int(entries["POINTS"][0])
-        stored = entries["DATA"][0].lower()
-        order = {"ascii": None, "binary": "<", "binary_compressed": "<"}[stored]
+        counts = entries.get("COUNT", ["1"] * len(names))
+        columns = [
+            (name, _PCD_TYPES[kind + size], int(count))
+            for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True)
+        ]
+        point_count = int(entries["POINTS"][0])
+        storage = entries["DATA"][0].lower()
+        order = {"ascii": None, "binary": "<", "binary_compressed": "<"}[storage]
         # The rows.
-        if stored == "binary_compressed":
-            body = _decompress_rows(columns, number, body)
-        return _xyz(columns, number, body, order), f"{stored} PCD"
-    except (LookupError, ValueError) as error:
+        if storage == "binary_compressed":
+            body = _decompress_rows(columns, point_count, body)
+        return _xyz(columns, point_count, body, order), f"{storage} PCD"
+    except (LookupError, ValueError) as error:  # of a header or a row that is not as it should be
         raise damaged(path, "PCD", f"cannot be read ({_reason(error)})") from error
 
 
 def _reason(error: Exception) -> str:
-    """What is wrong with a file, for a person."""
+    """What is wrong with a PCD or a PLY, for a person.
+
+    Args:
+        error: Error that its parser raised: a name that a dictionary lacks, a missing word, or
+            numbers that do not fit, which its text describes.
+    """
     if isinstance(error, KeyError):
         return f"its header lacks, or has an unknown, {error}"
     return "its header is incomplete" if isinstance(error, LookupError) else str(error)
 
 
-def _decompress_rows(columns: list[Column], number: int, body: bytes) -> bytes:
-    """The rows of a compressed PCD: two sizes, then all numbers of each field, compressed."""
-    sizes = [np.dtype(kind).itemsize * count for _, kind, count in columns]
-    packed, claimed = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
-    is_whole = claimed == number * sum(sizes) and packed <= len(body) - 8
-    if not is_whole or min(sizes, default=-1) < 0 or claimed > _MOST_COMPRESSED * (packed + 1):
+def _decompress_rows(columns: list[Column], point_count: int, body: bytes) -> bytes:
+    """The body that a compressed PCD would have uncompressed, point after point.
+
+    Args:
+        columns: Fields of a point, in their order.
+        point_count: Number of points that the header claims.
+        body: The bytes after the header: two sizes, then all numbers of each field, compressed.
+
+    Raises:
+        ValueError: The body is cut short or damaged, or does not fit the header.
+    """
+    field_bytes = [np.dtype(kind).itemsize * count for _, kind, count in columns]
+    # The two sizes: of the compressed bytes, and of what they become.
+    if len(body) < _PCD_SIZES.size:
         raise ValueError("it is cut short, or no compressed one")
-    data = _lzf(body[8 : 8 + packed])
-    if len(data) != claimed:
+    packed_bytes, claimed_bytes = _PCD_SIZES.unpack_from(body)
+    packed = body[_PCD_SIZES.size :][:packed_bytes]
+    # A point without fields, and a field of less than no numbers, are no points either.
+    if (
+        len(packed) < packed_bytes
+        or min(field_bytes, default=-1) < 0
+        or claimed_bytes != point_count * sum(field_bytes)
+        or claimed_bytes > _MOST_COMPRESSED * (packed_bytes + 1)
+    ):
+        raise ValueError("it is cut short, or no compressed one")
+    data = _decompress_lzf(packed)
+    if len(data) != claimed_bytes:
         raise ValueError("it cannot be decompressed")
-    # Field after field, put beside each other.
-    fields = np.split(np.frombuffer(data, np.uint8), number * np.cumsum(sizes[:-1]))
+    # The numbers of each field, as a column of bytes, are put beside each other.
+    ends = point_count * np.cumsum(field_bytes[:-1])
+    fields = np.split(np.frombuffer(data, np.uint8), ends)
     columns_of_bytes = [
-        field.reshape(number, size) for field, size in zip(fields, sizes, strict=True)
+        field.reshape(point_count, size) for field, size in zip(fields, field_bytes, strict=True)
     ]
     return np.concatenate(columns_of_bytes, axis=1).tobytes()
 
 
-def _lzf(packed: bytes) -> bytes:
-    """Decompresses LZF: literals, and copies of what is already there."""
-    out = bytearray()
-    rest = iter(packed)
-    for control in rest:
-        # A byte below 32 is followed by that many literals and one.
+def _decompress_lzf(packed: bytes) -> bytes:
+    """What LZF compressed: runs of bytes as they are, and copies of what was there before.
+
+    Raises:
+        ValueError: A copy begins before the first byte.
+    """
+    output = bytearray()
+    stream = iter(packed)
+    for control in stream:
+        # A control byte below 32 is followed by that many bytes, and one more, as they are.
         if control < 32:
-            out += bytes(itertools.islice(rest, control + 1))
+            output += bytes(itertools.islice(stream, control + 1))
             continue
-        # Another has the length of a copy, less 2, in 3 bits (7: the next byte is added), and 13
-        # bits of the distance back, less 1, in the rest and the next byte.
+        # Any other begins a copy. Its upper 3 bits are the length, less 2; if they are all set, the
+        # next byte is added. Its lower 5 bits and the next byte are the distance back, less 1.
         length = (control >> 5) + 2
         if length == 9:
-            length += next(rest, 0)
-        start = len(out) - ((control & 31) << 8) - next(rest, 0) - 1
+            length += next(stream, 0)
+        distance = ((control & 31) << 8) + next(stream, 0) + 1
+        start = len(output) - distance
         if start < 0:
             raise ValueError("it cannot be decompressed")
-        copied = out[start : start + length]  # shorter where a copy repeats itself
-        out += (copied * length)[:length]
-    return bytes(out)
+        # A copy that is longer than the distance repeats itself.
+        copied = output[start : start + length]
+        output += (copied * length)[:length]
+    return bytes(output)
 
 
 def _parse_ply(path: Path, data: bytes) -> tuple[Points, str]:
-    """x y z of the vertices of a PLY, ASCII or binary."""
+    """x y z of the vertices of a PLY, ASCII or binary, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The file is damaged, has no x, y and z, or does not begin with its vertices.
+    """
     try:
-        header, body = _header(data, b"end_header")
-        marks = [i for i, words in enumerate(header) if words[0] in ("element", "end_header")]
-        if len(marks) < 2 or len(header[marks[0]]) != 3:
+        header, body = _split_header(data, b"end_header")
+        # The lines of the first element, from its name and count up to the next element.
+        starts = [
+            number for number, words in enumerate(header) if words[0] in ("element", "end_header")
+        ]
+        if len(starts) < 2 or len(header[starts[0]]) != 3:
             raise ValueError("its header has no element of so many points")
         if header[0] != ["ply"] or header[1][0] != "format":
             raise ValueError("its header does not begin with ply and format")
-        _, element, number = header[marks[0]]
-        stored = header[1][1]
+        first_line, *other_lines = header[starts[0] : starts[1]]
+        _, element, point_count = first_line
+        storage = header[1][1]
         if element != "vertex":
             raise ValueError("its first element is not vertex; save points first")
-        # The properties of the first element, up to the next mark.
-        of_vertex = header[marks[0] : marks[1]]
-        properties = [words for words in of_vertex if words[0] == "property"]
+        # Its properties, of one number each.
+        properties = [words for words in other_lines if words[0] == "property"]
         columns = [(name, _PLY_KINDS[kind], 1) for _, kind, name in properties]
-        points = _xyz(columns, int(number), body, _PLY_ORDERS[stored])
-    except (LookupError, ValueError) as error:
+        points = _xyz(columns, int(point_count), body, _PLY_ORDERS[storage])
+    except (LookupError, ValueError) as error:  # of a header or a row that is not as it should be
         raise damaged(path, "PLY", f"cannot be read ({_reason(error)})") from error
-    return points, "ascii PLY" if stored == "ascii" else "binary PLY"
+    return points, "ascii PLY" if storage == "ascii" else "binary PLY"
 
 
-def _header(data: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
-    """The words of each header line up to the one that begins with `last`, and what follows."""
+def _split_header(data: bytes, last: bytes) -> tuple[list[list[str]], bytes]:
+    """The words of each line of the header of a PCD or a PLY, and the bytes after it.
+
+    Args:
+        data: Content of the file.
+        last: First word of the last line of the header.
+
+    Raises:
+        ValueError: There is no such line.
+    """
     lines: list[list[str]] = []
     stream = io.BytesIO(data)
     while stream.tell() < min(len(data), _LONGEST_HEADER):
         line = stream.readline()
-        if words := line.decode("latin-1").split():
+        words = line.decode("latin-1").split()
+        if words:
             lines.append(words)
         if line.lstrip().startswith(last):
             return lines, data[stream.tell() :]
     raise ValueError(f"no header that ends with {last.decode()}")
 
 
-def _xyz(columns: list[Column], number: int, body: bytes, order: str | None) -> Points:
-    """x y z of rows of these columns, in bytes of this order, or in text where it is None."""
+def _xyz(columns: list[Column], point_count: int, body: bytes, order: str | None) -> Points:
+    """x y z (N, 3) of the points of a PCD or a PLY.
+
+    Args:
+        columns: Fields of a point, in their order.
+        point_count: Number of points that the header claims.
+        body: The bytes after the header, which may go on after the points.
+        order: Byte order, "<" or ">", of binary numbers. None: the body is text, a line a point.
+
+    Raises:
+        ValueError: There is no x, y or z, or the points are cut short.
+    """
     names = [name.lower() for name, _, _ in columns]
     counts = [count for _, _, count in columns]
     for name in "xyz":
         if names.count(name) != 1 or counts[names.index(name)] != 1:
             raise ValueError(f"there is not one {name} among {', '.join(names)}")
-    if not number:
+    if not point_count:
         return np.empty((0, 3), np.float32)
-    if not 0 <= number * sum(counts) <= len(body):  # each number has a byte at least
-        raise ValueError(f"it claims {number:,} points in {len(body):,} bytes")
-    fields = [(f"f{i}", order + t if order else "f8", (n,)) for i, (_, t, n) in enumerate(columns)]
+    if not 0 <= point_count * sum(counts) <= len(body):  # each number has a byte at least
+        raise ValueError(f"it claims {point_count:,} points in {len(body):,} bytes")
+    # A row has a field f0, f1, … for each column, as names may occur twice.
+    fields = []
+    for index, (_, kind, count) in enumerate(columns):
+        fields.append((f"f{index}", "f8" if order is None else order + kind, (count,)))
     layout = np.dtype(fields)
-    if order is None:  # a PLY may continue with faces
-        rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=number)
+    if order is None:
+        rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=point_count)
     else:
-        rows = np.frombuffer(body, layout, min(number, len(body) // layout.itemsize))
-    if len(rows) < number:
-        raise ValueError(f"it is cut short: {len(rows):,} of {number:,} points")
+        rows = np.frombuffer(body, layout, min(point_count, len(body) // layout.itemsize))
+    if len(rows) < point_count:
+        raise ValueError(f"it is cut short: {len(rows):,} of {point_count:,} points")
     return _first_columns(np.hstack([rows[f"f{names.index(name)}"] for name in "xyz"]))
 
 
 def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:
-    """The first numbers of lines of text."""
-    return _first_columns(read_rows(path, data)[0]), "text scan"
+    """x y z, the first numbers of lines of text, and what was read, for a person.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: A line is not made of as many numbers as the first.
+    """
+    rows, _ = read_rows(path, data)
+    return _first_columns(rows), "text scan"
 
 
 def _first_columns(rows: NDArray[np.generic]) -> Points:
-    """x y z; in 64 bits where 32 would round them by more than a millimetre, as those of UTM."""
+    """x y z (N, 3), the first columns of rows (N, 3 or more), as float32.
+
+    They are float64 where float32 would round many by more than a millimetre, as those of UTM.
+    """
     stored = rows[:, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         single = np.ascontiguousarray(stored, np.float32)
         if stored.dtype != np.float64:
             return single
-        xyz = np.asarray(stored, np.float64)
-        known = np.isfinite(xyz) & (np.abs(xyz) < _EARTH_M)
-        rounded = known & (np.abs(single - xyz) > _EXACT_M)
-    return np.ascontiguousarray(xyz) if rounded.sum() > known.sum() / 4 else single
+        double = np.asarray(stored, np.float64)
+        is_on_earth = np.isfinite(double) & (np.abs(double) < _EARTH_M)
+        is_rounded = is_on_earth & (np.abs(single - double) > _EXACT_M)
+    if is_rounded.sum() > _MANY_ROUNDED * is_on_earth.sum():
+        return np.ascontiguousarray(double)
+    return single
 
 
-_READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
+_PARSERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".bin": _parse_bin,
     ".npy": _parse_array,
     ".pcd": _parse_pcd,
@@ -300,6 +445,7 @@ _READERS: dict[str, Callable[[Path, bytes], tuple[Points, str]]] = {
     ".csv": _parse_text,
     ".txt": _parse_text,
 }
+"""Functions of a path (for messages) and a content that return what `read_scan` does, by suffix."""
 
 _PROPERTIES = (
     ("<f4", ["float x", "float y", "float z"]),
@@ -313,11 +459,12 @@ Part = tuple[Points, Points | None, NDArray[np.uint8] | None]
 
 
 def write_cloud(path: Path, parts: Iterable[Part]) -> int:
-    """Writes a cloud whole or not at all.
+    """Writes a point cloud as a binary PLY, whole or not at all.
 
     Args:
         path: The file; it is replaced.
-        parts: Parts of the cloud, one after another.
+        parts: Parts of the cloud, one after another; all have normals, or none, and so with
+            colours.
 
     Returns:
         The number of points.
@@ -329,14 +476,14 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
     _, properties = _PROPERTIES[0]  # of a cloud without parts
     with atomic_path(path) as temporary, TemporaryFile(dir=temporary.parent) as body:
         for cloud in parts:
-            # The values that this cloud has, point after point.
+            # The bytes of what this part of the cloud has, point after point.
             properties = []
-            columns = []
+            columns_of_bytes = []
             for values, (kind, names) in zip(cloud, _PROPERTIES, strict=True):
                 if values is not None:
-                    columns.append(np.ascontiguousarray(values, kind).view(np.uint8))
+                    columns_of_bytes.append(np.ascontiguousarray(values, kind).view(np.uint8))
                     properties += names
-            body.write(np.hstack(columns).tobytes())
+            body.write(np.hstack(columns_of_bytes).tobytes())
             count += len(cloud[0])
         # The header has the number of points, which is known last.
         header = [
@@ -349,5 +496,5 @@ def write_cloud(path: Path, parts: Iterable[Part]) -> int:
         body.seek(0)
         with temporary.open("wb") as file:
             file.write("\n".join(header).encode())
-            shutil.copyfileobj(body, file, 1 << 20)
+            shutil.copyfileobj(body, file, _BLOCK_BYTES)
     return count

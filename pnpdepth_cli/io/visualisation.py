@@ -13,22 +13,26 @@ from numpy.typing import NDArray
 
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.io.atomic import atomic_path
+from pnpdepth_cli.io.colours import DepthScale, Pixels, depth_scale, paint_signed, signed_bar
 
-Pixels = NDArray[np.uint8]
 Array = NDArray[np.float32]
 Panel = tuple[str, str, Pixels]
 """Title, a fainter remark beside it, and an image (H, W, 3)."""
 
-UNKNOWN = 70
-"""The grey of a pixel without depth: turbo has no such colour."""
+_LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
+_UNIFORM_GREY = 0.3  # 0…1, of the ground without an image
+_DIM_DARKEST = 20  # levels, of 0 to 255, of a dark image
+_DIM_RANGE = 115
+_MAP_DIM = 0.6  # of the light of that image, behind a map of signed values
+_MAP_LIGHT = 0.66  # 0…1, of a value of 0 in a map where the image is black
+_MAP_LIGHT_RANGE = 0.3  # that the image adds to it
+_DOT_LIGHT = 0.8  # 0…1, of a point without a change
 
-_SIGNED = {"gain": ((25, 90, 190), (220, 105, 0)), "change": ((1, 102, 94), (118, 42, 131))}
-"""Colours of 1 and -1: better and worse, farther and nearer. Blue and orange are told apart by
-colour-blind eyes."""
-
-LOGARITHMIC_FROM = 8.0
-"""Ratio of far to near from which the scale is logarithmic; on a linear one, nearly all of a street
-would have the colour of its far end."""
+_DOT_SHIFT = 4  # bits of a coordinate below the whole pixel, as OpenCV draws points
+_DOT_SPACING = 0.24  # radius of a point by the mean distance of points
+_DOT_RADII_PX = (1.4, 6.0)  # the smallest and the largest
+_BAR_COLOURS = 256
+_NO_DEPTH_ERROR = 1e9  # metres, of a pixel whose depth before is unknown or infinite
 
 # Pixels of a figure.
 FIGURE_WIDTH = 1600
@@ -42,7 +46,12 @@ _FONT_SIZE = 19
 _SMALL_FONT_SIZE = 17
 _INK = (32, 33, 36)
 _FAINT_INK = (95, 99, 104)
-_LABELS = 9  # of the bar
+_TITLE_TOP = 4  # of a title, below the top of its line
+_REMARK_TOP = 5  # of a remark, which is smaller, and of the title of the bar
+_REMARK_GAP = 14  # between a title and its remark
+_MARK_LENGTH = 6  # of a mark beside the bar
+_LABEL_GAP = 11  # between the bar and a label
+_LABELS = 9  # number of labels of a bar of depth
 # Wider images than this (KITTI is 3.3 : 1) are stacked; two in a row would be too small.
 _WIDE = 2.0
 _STRONGEST_PERCENTILE = 95.0
@@ -51,82 +60,50 @@ _GAINS = "Change of error"
 _FAST = 2  # zlib's level: a third of the time of its default 6, files a tenth larger
 
 
-@dataclass(frozen=True, kw_only=True)
-class DepthScale:
-    """The colour of each depth: turbo from `low_m`, near and warm, to `high_m`, far and cold."""
-
-    low_m: float
-    high_m: float
-
-    @property
-    def logarithmic(self) -> bool:
-        """True if the colours follow log depth."""
-        return self.high_m / self.low_m > LOGARITHMIC_FROM
-
-    def paint(self, depth: NDArray[np.floating]) -> Pixels:
-        """Returns (..., 3) colours of depths of any shape; `UNKNOWN` where there is none."""
-        known = np.isfinite(depth) & (depth > 0)
-        depths = np.clip(np.where(known, depth, self.low_m), self.low_m, self.high_m, dtype=float)
-        position = (depths - self.low_m) / (self.high_m - self.low_m)
-        if self.logarithmic:
-            position = np.log(depths / self.low_m) / math.log(self.high_m / self.low_m)
-        # The last tenths of turbo are so dark at both ends that near and far look alike.
-        levels = np.rint(12 + 231 * (1 - position)).astype(np.intp)
-        table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
-        return np.where(known[..., None], table[:, 0, ::-1][levels], np.uint8(UNKNOWN))
-
-
-def depth_scale(*depths: NDArray[np.floating]) -> DepthScale:
-    """Returns the scale over the 2nd to 98th percentile of all known depths together."""
-    known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
-    if not known.size:
-        return DepthScale(low_m=1.0, high_m=2.0)
-    low, high = np.percentile(known.astype(np.float64), (2, 98)).tolist()
-    if high - low < 0.01 * low:  # a single depth still needs a bar with two ends
-        low = 0.95 * low
-        high = 1.05 * high
-    return DepthScale(low_m=low, high_m=high)
-
-
 def _grey_of(rgb: Array | None, size: tuple[int, ...]) -> Array:
-    """(H, W) luma in 0..1 of an (H, W, 3) image in 0..1; without one, a uniform grey."""
+    """The grey (H, W) of an image, 0…1; a uniform one without an image.
+
+    Args:
+        rgb: (H, W, 3) in 0..1, or None.
+        size: (H, W) of the result without an image.
+    """
     if rgb is None:
-        return np.full(size, 0.3, np.float32)
-    weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+        return np.full(size, _UNIFORM_GREY, np.float32)
+    weights = np.array(_LUMA_WEIGHTS, dtype=np.float32)
     return np.asarray(np.clip(np.nan_to_num(rgb), 0, 1) @ weights, dtype=np.float32)
 
 
 def _dim(grey: Array) -> Pixels:
-    """An (H, W, 3) dark grey image, on which coloured points stand out."""
-    levels = np.rint(20 + 115 * grey).astype(np.uint8)
+    """The dark image (H, W, 3) of grey (H, W) in 0…1, on which coloured points stand out."""
+    levels = np.rint(_DIM_DARKEST + _DIM_RANGE * grey).astype(np.uint8)
     return np.repeat(levels[:, :, None], 3, axis=2)
 
 
-def _paint_signed(values: NDArray[np.floating], light: NDArray[np.floating], colors: str) -> Pixels:
-    """(..., 3) colours of `_SIGNED` from -1 to 1, around the grey `light` 0..1 at 0."""
-    above, below = np.array(_SIGNED[colors], np.float32)
-    signed = values[..., None].astype(np.float32)
-    amount = np.clip(np.abs(signed), 0, 1)
-    base = 255 * light[..., None].astype(np.float32)
-    hue = np.where(signed > 0, above, below)
-    return np.asarray(np.rint((1 - amount) * base + amount * hue), np.uint8)
-
-
-def signed_bar(colors: str, length: int) -> Pixels:
-    """Returns (length, 3) colours of a legend of a signed map."""
-    return _paint_signed(np.linspace(-1, 1, length), np.full(length, 0.88), colors)
-
-
 def _magnification(shape: tuple[int, ...], *, columns: int = 1) -> float:
-    """The factor by which an image (H, W, ...) fits its column, a whole number if it enlarges."""
+    """The factor at which an image fits its column of a figure, a whole number if it enlarges.
+
+    Args:
+        shape: Shape of the image, which begins with H and W.
+        columns: Number of images in a row of the figure.
+    """
     height, width = shape[:2]
     room = FIGURE_WIDTH - 2 * MARGIN - (columns - 1) * GAP - _LEGEND_WIDTH
     fit = min(room / columns / width, _MAX_PANEL_HEIGHT / height)
     return math.floor(fit) if fit >= 1 else fit
 
 
+def _columns(size: tuple[int, ...]) -> int:
+    """The number of panels in a row of a figure: wide images (H, W) are below each other."""
+    height, width = size
+    return 1 if width > _WIDE * height else 2
+
+
 def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
-    """The image at `factor` times its size; enlarged pixels stay square unless `smooth`."""
+    """The image (H, W, 3) at `factor` times its size.
+
+    A smaller one averages the pixels. In a larger one pixels become squares, or the image is
+    interpolated if it is to be smooth.
+    """
     height, width = pixels.shape[:2]
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     enlarging = cv2.INTER_CUBIC if smooth else cv2.INTER_NEAREST
@@ -135,31 +112,59 @@ def _resize(pixels: Pixels, factor: float, *, smooth: bool = False) -> Pixels:
 
 
 def _points_panel(grey: Array, xy: Array, depth: Array, scale: DepthScale, factor: float) -> Panel:
-    """The points in the colours of their depth on the dark grey image, nearest on top."""
+    """The panel of points in the colours of their depth on a dark image, the nearest on top.
+
+    Args:
+        grey: (H, W) in 0…1, the image.
+        xy: (N, 2) pixel coordinates of the points.
+        depth: (N,) in the unit of the scale.
+        scale: Colours of depths.
+        factor: Size of the panel, times that of the image.
+    """
     nearest_last = np.argsort(-depth, kind="stable")
     canvas = _dots(grey, xy[nearest_last], scale.paint(depth[nearest_last]), factor)
     return "Sparse depth", f"{len(depth):,} point{'' if len(depth) == 1 else 's'}", canvas
 
 
 def _dots(grey: Array, xy: Array, colours: Pixels, factor: float) -> Pixels:
-    """The dark grey image with points in these colours, the last on top."""
+    """The dark image with a dot at each point, the last on top, (h, w, 3).
+
+    Args:
+        grey: (H, W) in 0…1, the image.
+        xy: (N, 2) pixel coordinates of the points in it.
+        colours: (N, 3) colours of the points.
+        factor: Size of the result, times that of the image.
+    """
     canvas = np.ascontiguousarray(_resize(_dim(grey), factor, smooth=True))
-    spacing = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
-    # OpenCV takes coordinates in sixteenths of a pixel.
-    radius = round(16 * min(max(0.24 * spacing, 1.4), 6.0))
-    centres = np.rint(16 * ((xy.astype(np.float64) + 0.5) * factor - 0.5)).astype(int).tolist()
+    # The fewer points there are, the larger are the dots.
+    spacing_px = math.sqrt(canvas.shape[0] * canvas.shape[1] / max(len(xy), 1))
+    smallest_px, largest_px = _DOT_RADII_PX
+    radius_px = min(max(_DOT_SPACING * spacing_px, smallest_px), largest_px)
+    # OpenCV takes coordinates in fractions of a pixel, as whole numbers.
+    fractions = 1 << _DOT_SHIFT
+    radius = round(fractions * radius_px)
+    centres_px = (xy.astype(np.float64) + 0.5) * factor - 0.5
+    centres = np.rint(fractions * centres_px).astype(int).tolist()
     for centre, colour in zip(centres, colours.tolist(), strict=True):
-        cv2.circle(canvas, centre, radius, colour, -1, cv2.LINE_AA, 4)
+        cv2.circle(canvas, centre, radius, colour, cv2.FILLED, cv2.LINE_AA, _DOT_SHIFT)
     return canvas
 
 
 def _save_depth_figure(
     path: Path, panels: list[Panel], scale: DepthScale, unit: str = "m", *, columns: int = 1
 ) -> FigureRecord:
-    """Writes a PNG of panels beside a bar of depth colours."""
+    """Writes a PNG of panels beside a bar of the colours of depth.
+
+    Args:
+        path: The PNG.
+        panels: Panels of one size.
+        scale: Colours of depths.
+        unit: Name of the unit of depth.
+        columns: Number of panels in a row.
+    """
     space = np.geomspace if scale.logarithmic else np.linspace
-    bar, marks = (space(scale.low_m, scale.high_m, count) for count in (256, _LABELS))
-    labels = [f"{depth:.3g}" for depth in marks]
+    bar = space(scale.low_m, scale.high_m, _BAR_COLOURS)
+    labels = [f"{depth:.3g}" for depth in space(scale.low_m, scale.high_m, _LABELS)]
     noun = "metres" if unit == "m" else unit
     figure = _save_figure(path, panels, scale.paint(bar), labels, noun, columns)
     return replace(figure, scale_m=(scale.low_m, scale.high_m))
@@ -168,9 +173,22 @@ def _save_depth_figure(
 def _save_figure(
     path: Path, panels: list[Panel], bar: Pixels, labels: Sequence[str], noun: str, columns: int = 1
 ) -> FigureRecord:
-    """Writes panels of one size, `columns` to a row; a bar (N, 3) and labels from the lower end."""
+    """Writes a PNG of panels beside a bar of colours, its legend.
+
+    Args:
+        path: The PNG.
+        panels: Panels of one size.
+        bar: (N, 3) colours of the bar, from its lower end.
+        labels: Texts beside the bar at equal distances, from its lower end.
+        noun: Title of the bar.
+        columns: Number of panels in a row.
+
+    Returns:
+        Size of the figure, and where its panels are.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
+    # The empty figure.
     height, width = panels[0][2].shape[:2]
     rows = math.ceil(len(panels) / columns)
     row_height = _TITLE_HEIGHT + height
@@ -180,28 +198,30 @@ def _save_figure(
     draw = ImageDraw.Draw(figure)
     # Pillow's own font: the same everywhere. It has no en dash, minus or multiplication sign.
     font, small = (ImageFont.load_default(size) for size in (_FONT_SIZE, _SMALL_FONT_SIZE))
-    # The panels, and where they are.
+    # The panels, each below its title and its remark, and where they are.
     boxes = {}
     for index, (title, remark, pixels) in enumerate(panels):
         row, column = divmod(index, columns)
         x = MARGIN + column * (width + GAP)
         y = MARGIN + row * (row_height + GAP // 2)
-        draw.text((x, y + 4), title, font=font, fill=_INK)
-        indent = draw.textlength(title, font=font) + 14
-        draw.text((x + indent, y + 5), remark, font=small, fill=_FAINT_INK)
+        draw.text((x, y + _TITLE_TOP), title, font=font, fill=_INK)
+        indent = draw.textlength(title, font=font) + _REMARK_GAP
+        draw.text((x + indent, y + _REMARK_TOP), remark, font=small, fill=_FAINT_INK)
         figure.paste(Image.fromarray(np.ascontiguousarray(pixels)), (x, y + _TITLE_HEIGHT))
         boxes[title] = (x, y + _TITLE_HEIGHT, width, height)
-    # The bar, far at the top, as on an axis.
+    # The bar, with its upper end at the top, as on an axis, and a mark at each label.
     left = width_px - MARGIN - _LEGEND_WIDTH + GAP
     top = MARGIN + _TITLE_HEIGHT
     length = height_px - MARGIN - top
-    draw.text((left, MARGIN + 5), noun, font=font, fill=_INK)
+    draw.text((left, MARGIN + _REMARK_TOP), noun, font=font, fill=_INK)
     strip = Image.fromarray(np.ascontiguousarray(bar[::-1, None])).resize((_BAR_WIDTH, length))
     figure.paste(strip, (left, top))
     ends = np.linspace(top + length - 1, top, len(labels)).tolist()
     for y, label in zip(ends, labels, strict=True):
-        draw.line((left + _BAR_WIDTH, y, left + _BAR_WIDTH + 6, y), fill=_INK, width=1)
-        draw.text((left + _BAR_WIDTH + 11, y), label, font=small, fill=_INK, anchor="lm")
+        right = left + _BAR_WIDTH
+        draw.line((right, y, right + _MARK_LENGTH, y), fill=_INK, width=1)
+        draw.text((right + _LABEL_GAP, y), label, font=small, fill=_INK, anchor="lm")
+    # The file.
     with atomic_path(path) as temporary:
         figure.save(temporary, "PNG", compress_level=_FAST)
     return FigureRecord(size=figure.size, panels=boxes)
@@ -225,24 +245,23 @@ def preview(
         rgb: (H, W, 3) in 0..1; None for a network without image.
         sparse_xy: (N, 2) pixel coordinates.
         sparse_depth: (N,) in `unit`, as all depths.
-        before: (H, W) before refinement.
-        after: (H, W) after refinement.
+        before: (H, W) before refinement, 0 or not finite where unknown.
+        after: (H, W) after refinement, likewise.
         path: The PNG.
-        unit: Name in the legend.
+        unit: Name of the unit of depth in the legend.
         made_by: Names of what made the depth before and the depth after.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    height, width = before.shape
-    columns = 1 if width > _WIDE * height else 2
+    columns = _columns(before.shape)
     factor = _magnification(before.shape, columns=columns)
     scale = depth_scale(sparse_depth, before, after)
     grey = _grey_of(rgb, before.shape)
     # The change, where both depths are known.
-    both = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
-    change = (after[both] - before[both]).astype(np.float64)
-    pixels, strongest = _paint(change, both, grey, "change")
+    both_known = (before > 0) & (after > 0) & np.isfinite(before) & np.isfinite(after)
+    change = (after[both_known] - before[both_known]).astype(np.float64)
+    pixels, strongest = _paint(change, both_known, grey, "change")
     remark = f"after - before: teal farther, purple nearer, full at {strongest:.3g} {unit}"
     # The panels, the image first.
     panels = [
@@ -258,9 +277,16 @@ def preview(
 
 
 def overlay(rgb: Array, xy: Array, depth: Array, path: Path) -> None:
-    """Writes a PNG with N points in the colours of their depth on the grey image, nearest on top.
+    """Writes a PNG of points in the colours of their depth on a dark image, the nearest on top.
 
-    The image is (H, W, 3) in 0..1, the points are (N, 2) pixel coordinates and (N,) metres.
+    Args:
+        rgb: (H, W, 3) in 0..1.
+        xy: (N, 2) pixel coordinates of the points.
+        depth: (N,) metres.
+        path: The PNG.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
     scale = depth_scale(depth)
     grey = _grey_of(rgb, rgb.shape)
@@ -279,15 +305,26 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 def _paint(
     values: NDArray[np.float64], where: NDArray[np.bool_], grey: Array, colors: str
 ) -> tuple[Pixels, float]:
-    """A map of signed values in colours on the dark grey image, and the value of full colour."""
+    """A map (H, W, 3) of signed values on a dark image, and the value that has the full colour.
+
+    Args:
+        values: (N,) signed values.
+        where: (H, W) true at the N pixels of the values.
+        grey: (H, W) in 0…1, the image.
+        colors: Name of the two colours in `colours.SIGNED`.
+    """
     strongest = _strongest(values)
-    pixels = _dim(np.asarray(0.6 * grey, np.float32))
-    pixels[where] = _paint_signed(values / strongest, 0.66 + 0.3 * grey[where], colors)
+    pixels = _dim(np.asarray(_MAP_DIM * grey, np.float32))
+    light = _MAP_LIGHT + _MAP_LIGHT_RANGE * grey[where]
+    pixels[where] = paint_signed(values / strongest, light, colors)
     return pixels, strongest
 
 
 def _strongest(values: NDArray[np.float64]) -> float:
-    """The value of full colour: a high percentile of those that are not 0; 1 without any."""
+    """The amount of a signed value from which on it has the full colour.
+
+    It is the 95th percentile of the amounts that are not 0; 1 if there are none.
+    """
     changed = np.abs(values[values != 0])
     return float(np.percentile(changed, _STRONGEST_PERCENTILE)) if changed.size else 1.0
 
@@ -302,9 +339,9 @@ def improvement(
 
     Args:
         rgb: (H, W, 3) in 0..1, the ground of the map; None for a network without image.
-        before: (H, W) before refinement.
-        after: (H, W) after refinement.
-        truth: (H, W) as measured, some of it known.
+        before: (H, W) before refinement, 0 or not finite where unknown.
+        after: (H, W) after refinement, likewise.
+        truth: (H, W) as measured, likewise; the gain is known at one pixel at least.
         path: The PNG.
         unit: Name of the unit of depth.
 
@@ -312,26 +349,27 @@ def improvement(
         OutputError: The file cannot be written.
     """
     # The map.
-    gains = gain(before, after, truth)
-    known = np.isfinite(gains)
-    gains = gains[known]
-    pixels, strongest = _paint(gains, known, _grey_of(rgb, truth.shape), "gain")
+    all_gains = gain(before, after, truth)
+    is_known = np.isfinite(all_gains)
+    gains = all_gains[is_known]
+    pixels, strongest = _paint(gains, is_known, _grey_of(rgb, truth.shape), "gain")
     pixels = _resize(pixels, _magnification(truth.shape))
-    # The figure, and its texts for a report.
+    # The texts for a report: how many pixels improved, and why others are dark.
     improved = 100 * float((gains > 0).mean())
     worse = 100 * float((gains < 0).mean())
     footer = f"{improved:.1f} % of {gains.size:,} pixels improved, {worse:.1f} % worse"
     unknown = None
-    if not known.all():
-        unknown = "unknown" if (truth[~known] > 0).any() else "no ground truth"
+    if not is_known.all():
+        unknown = "unknown" if (truth[~is_known] > 0).any() else "no ground truth"
     remark = f"{footer}; dark: {unknown}" if unknown else footer
+    # The figure.
     figure = _save_gains(path, [(_GAINS, remark, pixels)], strongest, unit)
     return replace(figure, unknown=unknown, footer=footer)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointErrors:
-    """N points at which depths are compared with a measured one, which none of them has seen."""
+    """N points at which depths are compared with a measured one, which none of them has used."""
 
     xy: Array  # (N, 2) pixel coordinates
     truth: Array  # (N,) as measured
@@ -339,7 +377,7 @@ class PointErrors:
     after: Array  # (N,) the result
     linear: Array  # (N,) linear interpolation of other points
     what: str
-    """What they are, such as "validation points"."""
+    """Name of the points in texts, such as "validation points"."""
 
 
 def improvement_at_points(
@@ -347,12 +385,12 @@ def improvement_at_points(
 ) -> FigureRecord:
     """Writes a PNG of the points at which |depth - truth| fell, blue, and rose, orange.
 
-    Beside the result, linear interpolation is compared with the same depth before. A point where
-    the depth that is shown is unknown is left out.
+    One panel compares the result with the depth before, the other linear interpolation of other
+    points with the same depth before. A panel leaves out the points where its depth is unknown.
 
     Args:
         rgb: (H, W, 3) in 0..1, the ground of the figure; None for a network without image.
-        points: The points.
+        points: Points, and the depths at them.
         size: (H, W) of the image.
         path: The PNG.
         unit: Name of the unit of depth.
@@ -360,29 +398,31 @@ def improvement_at_points(
     Raises:
         OutputError: The file cannot be written.
     """
-    columns = 1 if size[1] > _WIDE * size[0] else 2
+    columns = _columns(size)
     grey = _grey_of(rgb, size)
     factor = _magnification(size, columns=columns)
-    shown = {_GAINS: points.after, "Linear interpolation": points.linear}
-    gains = {name: gain(points.before, depth, points.truth) for name, depth in shown.items()}
+    # The gains of what each panel shows, by the panel's title.
+    depths = {_GAINS: points.after, "Linear interpolation": points.linear}
+    gains = {title: gain(points.before, depth, points.truth) for title, depth in depths.items()}
     # One scale for both panels.
     strongest = _strongest(
         np.concatenate([values[np.isfinite(values)] for values in gains.values()])
     )
     panels = []
     remarks = {}
-    for name, gains_at_points in gains.items():
-        known = np.isfinite(gains_at_points)
-        values = gains_at_points[known]
+    for title, gains_at_points in gains.items():
+        is_known = np.isfinite(gains_at_points)
+        values = gains_at_points[is_known]
         # The points in their colours, the largest change on top.
         order = np.argsort(np.abs(values), kind="stable")
-        colours = _paint_signed(values[order] / strongest, np.full(len(values), 0.8), "gain")
-        dots = _dots(grey, points.xy[known][order], colours, factor)
+        light = np.full(len(values), _DOT_LIGHT)
+        colours = paint_signed(values[order] / strongest, light, "gain")
+        dots = _dots(grey, points.xy[is_known][order], colours, factor)
         better = 100 * float((values > 0).mean()) if len(values) else 0.0
         worse = 100 * float((values < 0).mean()) if len(values) else 0.0
-        remarks[name] = f"{better:.1f} % better, {worse:.1f} % worse"
-        panels.append((name, remarks[name], dots))
-    # That of the result says how many points there are.
+        remarks[title] = f"{better:.1f} % better, {worse:.1f} % worse"
+        panels.append((title, remarks[title], dots))
+    # The panel of the result, the first one, says how many points it has, and so does the report.
     footer = f"at {np.isfinite(gains[_GAINS]).sum():,} {points.what}: {remarks[_GAINS]}"
     title, _, dots = panels[0]
     panels[0] = (title, footer, dots)
@@ -392,20 +432,36 @@ def improvement_at_points(
 def _save_gains(
     path: Path, panels: list[Panel], strongest: float, unit: str, columns: int = 1
 ) -> FigureRecord:
-    """Writes a PNG of panels beside a bar of gains, whose ends have the value of full colour."""
+    """Writes a PNG of panels beside a bar of gains, the amounts by which errors fell.
+
+    Args:
+        path: The PNG.
+        panels: Panels of one size.
+        strongest: Gain in `unit` at the upper end of the bar, and less 0 at the lower end.
+        unit: Name of the unit of depth.
+        columns: Number of panels in a row.
+    """
     labels = [f"{share * strongest:+.3g}" for share in (-1, -0.5, 0, 0.5, 1)]
-    bar = signed_bar("gain", 256)
+    bar = signed_bar("gain", _BAR_COLOURS)
     figure = _save_figure(path, panels, bar, labels, f"gain, {unit}", columns)
     amount = f"by {strongest:.3g} {unit} or more"
     return replace(figure, ends=(f"worse {amount}", f"better {amount}"))
 
 
 def gain(before: Array, after: Array, truth: Array) -> NDArray[np.float64]:
-    """Returns by how much |depth - truth| fell; NaN where the truth or the depth after is unknown.
+    """Returns by how much |depth - truth| fell, in float64; above 0 where depth is better.
 
-    Infinite depth, and NaN before, count as an error of 1e9.
+    It is NaN where the truth or the depth after is unknown. Infinite depth, and NaN before, count
+    as an error of 1e9.
+
+    Args:
+        before: Depth before, of any shape.
+        after: Depth after, of the same shape, 0 or NaN where unknown.
+        truth: Depth as measured, of the same shape, 0 or not finite where unknown.
     """
-    known = np.isfinite(truth) & (truth > 0) & (after > 0)
+    is_known = np.isfinite(truth) & (truth > 0) & (after > 0)
     errors = (np.abs(depth.astype(np.float64) - truth) for depth in (before, after))
-    was, now = (np.nan_to_num(error, nan=1e9, posinf=1e9) for error in errors)
-    return np.where(known, was - now, np.nan)
+    error_before, error_after = (
+        np.nan_to_num(error, nan=_NO_DEPTH_ERROR, posinf=_NO_DEPTH_ERROR) for error in errors
+    )
+    return np.where(is_known, error_before - error_after, np.nan)

@@ -20,9 +20,10 @@ from PIL import Image
 from pnpdepth_cli.budget import set_max_pixels
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
 from pnpdepth_cli.io.file_bytes import read_json, sha256_of
 from pnpdepth_cli.io.formats import list_npz
+from pnpdepth_cli.io.point_files import read_sparse
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import read_scan
 from tests.models.weights.files import little

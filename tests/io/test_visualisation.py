@@ -9,10 +9,9 @@ import pytest
 from PIL import Image
 
 from pnpdepth_cli.file_record import FigureRecord
+from pnpdepth_cli.io.colours import UNKNOWN, depth_scale
 from pnpdepth_cli.io.visualisation import (
-    UNKNOWN,
     PointErrors,
-    depth_scale,
     improvement,
     improvement_at_points,
     preview,

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.io.depth import read_sparse
+from pnpdepth_cli.io.point_files import read_sparse
 from pnpdepth_cli.io.poses import read_poses
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.sensors.accumulation import (

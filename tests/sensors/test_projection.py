@@ -16,7 +16,8 @@ from pnpdepth_cli.commands.requests.refine_request import RefineRequest
 from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.file_record import SamplePattern
 from pnpdepth_cli.io.calibration import read_calibration
-from pnpdepth_cli.io.depth import read_depth, read_sparse, write_depth
+from pnpdepth_cli.io.depth import read_depth, write_depth
+from pnpdepth_cli.io.point_files import read_sparse
 from pnpdepth_cli.io.scans import read_scan
 from pnpdepth_cli.sensors.projection import (
     Points,

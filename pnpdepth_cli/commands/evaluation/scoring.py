@@ -30,8 +30,9 @@ from pnpdepth_cli.dataset.frame_record import FrameRecord, Scores
 from pnpdepth_cli.dataset.plausible import OF_DATA_SET, plausible_map
 from pnpdepth_cli.errors import InputError, PnpDepthError, unequal_sizes
 from pnpdepth_cli.file_record import FileRecord
-from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored, read_sparse
+from pnpdepth_cli.io.depth import depth_from_stored, known_metres, load_stored
 from pnpdepth_cli.io.formats import DepthFile, Reading
+from pnpdepth_cli.io.point_files import read_sparse
 from pnpdepth_cli.measures import AFTER, GT, OF_SIGMA, score
 from pnpdepth_cli.points import in_frame
 from pnpdepth_cli.protocols import Protocol

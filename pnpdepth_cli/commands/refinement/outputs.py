@@ -21,12 +21,12 @@ from pnpdepth_cli.errors import OutputError, UsageError
 from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.io.atomic import remove_file
+from pnpdepth_cli.io.colours import depth_scale
 from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, write_depth
 from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
 from pnpdepth_cli.io.visualisation import (
     PointErrors,
-    depth_scale,
     improvement,
     improvement_at_points,
     preview,

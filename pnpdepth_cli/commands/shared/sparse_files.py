@@ -15,8 +15,9 @@ from pnpdepth_cli.dataset.plausible import plausible_map
 from pnpdepth_cli.errors import OutputError
 from pnpdepth_cli.file_record import FileRecord, what_applies
 from pnpdepth_cli.io.atomic import make_folder
-from pnpdepth_cli.io.depth import SPARSE_SUFFIXES, describe_range, read_depth, write_sparse
+from pnpdepth_cli.io.depth import describe_range, read_depth
 from pnpdepth_cli.io.file_bytes import plain, write_json
+from pnpdepth_cli.io.point_files import SPARSE_SUFFIXES, write_sparse
 from pnpdepth_cli.io.visualisation import overlay
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 from pnpdepth_cli.version import __version__

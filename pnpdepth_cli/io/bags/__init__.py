@@ -46,7 +46,7 @@ Message = Any
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether this is a bag file, or a folder that ROS 2 recorded."""
+    """Returns whether a path is a bag file, by its suffix, or a folder that ROS 2 recorded."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return path.suffix.lower() in (".bag", ".mcap", ".db3")
@@ -62,17 +62,21 @@ class Bag:
     """Function of a message's bytes and the name of its type."""
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
-        """Returns the topics of these message types with their number of messages."""
+        """Returns the number of messages by topic, of topics with one of these message types."""
         with _as_our_errors(self.path):
             topics = sorted(self.reader.topics.items())
-            return {name: int(info.msgcount) for name, info in topics if info.msgtype in kinds}
+            return {name: int(topic.msgcount) for name, topic in topics if topic.msgtype in kinds}
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Message]]:
-        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log."""
+        """Yields (topic, nanoseconds at which it was logged, message) in the order of the log.
+
+        Args:
+            topics: Names of topics; those that the bag does not have are ignored.
+        """
         wanted = [
             connection for connection in self.reader.connections if connection.topic in topics
         ]
-        if not wanted:
+        if not wanted:  # rosbags would yield all messages
             return
         with _as_our_errors(self.path):
             for connection, time_ns, data in self.reader.messages(connections=wanted):
@@ -83,8 +87,10 @@ class Bag:
 def open_bag(path: Path) -> Iterator[Bag]:
     """Yields the bag in a file (.bag, .mcap, .db3) or in a folder with metadata.yaml.
 
+    The bag is closed at the end of the block.
+
     Raises:
-        InputError: There is none, or it is cut short, or no bag.
+        InputError: The path has no bag, or the bag is damaged or cut short.
         UsageError: rosbags is not installed.
     """
     try:
@@ -92,12 +98,14 @@ def open_bag(path: Path) -> Iterator[Bag]:
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
         raise UsageError(f"reading {path} needs rosbags: pip install 'pnpdepth[ros]'") from None
+    # Checked before rosbags opens it, which must not decompress or compute more than is bounded.
     ros1 = path.suffix.lower() == ".bag"
     bound_decompression()
     with _as_our_errors(path):
         _check_bag(path)
         reader = Reader1(path) if ros1 else Reader2(path)
         reader.open()
+    # Messages of ROS 1 and ROS 2 are encoded differently.
     try:
         types = message_types(ros1=ros1)
         decode = types.deserialize_ros1 if ros1 else types.deserialize_cdr
@@ -107,7 +115,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def message_types(*, ros1: bool) -> Typestore:
-    """Returns rosbags' type store of ROS 1 Noetic or ROS 2 Humble."""
+    """Returns rosbags' store of message types, by which it decodes and encodes messages.
+
+    Args:
+        ros1: Whether the types are those of ROS 1 Noetic, not of ROS 2 Humble.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if not ros1:
@@ -119,21 +131,25 @@ def message_types(*, ros1: bool) -> Typestore:
 
 
 def choose_topic(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], what: str) -> str:
-    """Returns the one of these topics that is named, or else the only one.
+    """Returns the one of several topics that the user named, or else the only one.
 
     Args:
-        bag: Bag of the topics.
-        wanted: Names of topics of any kind.
-        topics: Numbers of messages by topic, from `Bag.topics`.
-        what: Name of what the topics hold, for a message.
+        bag: Bag of the topics, for messages.
+        wanted: Names of topics of any kind, which the user gave.
+        topics: Number of messages by topic, as `Bag.topics` returns it, to choose from.
+        what: Name of what the topics hold, for messages.
 
     Raises:
         UsageError: There are several or none.
     """
-    # An image and its compressed copies are one camera.
-    copies = [n for n in topics if n.rpartition("/")[0] in topics and n.endswith(COMPRESSED)]
-    named = [name for name in wanted if name in topics]
-    names = named or [name for name in topics if name not in copies]
+    names = [name for name in wanted if name in topics]
+    if not names:
+        # The compressed copy of an image, image/compressed, is no further camera.
+        names = [
+            name
+            for name in topics
+            if not name.endswith(COMPRESSED) or name.rpartition("/")[0] not in topics
+        ]
     if len(names) != 1:
         listing = ", ".join(f"{name} ({count:,} messages)" for name, count in topics.items())
         raise UsageError(
@@ -144,7 +160,13 @@ def choose_topic(bag: Bag, wanted: Sequence[str], topics: Mapping[str, int], wha
 
 
 def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
-    """Raises UsageError for a topic that is not there, or not of these message types."""
+    """Raises UsageError unless the bag has all topics that the user named.
+
+    Args:
+        bag: The bag.
+        wanted: Names of topics, which the user gave.
+        kinds: Message types that the topics may have.
+    """
     topics = bag.topics(kinds)
     missing = [name for name in wanted if name not in topics]
     if missing:
@@ -156,19 +178,26 @@ def check_topics(bag: Bag, wanted: Sequence[str], kinds: Sequence[str]) -> None:
 
 @contextmanager
 def _as_our_errors(path: Path) -> Iterator[None]:
-    """Makes what rosbags and its parts raise on damaged files an error of ours."""
+    """Turns what rosbags raises inside the block on a damaged bag into an InputError.
+
+    Args:
+        path: The bag, for messages.
+    """
     from rosbags.rosbag1 import ReaderError as Reader1Error
     from rosbags.rosbag2 import ReaderError as Reader2Error
     from rosbags.serde import SerdeError
 
+    # The libraries that rosbags decodes by raise errors of their own.
     mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
     database = importlib.import_module("rosbags.rosbag2.storage_sqlite3")
-    libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
-    content = (ValueError, LookupError, OverflowError, TypeError, AssertionError)
-    others = (*libraries, *content, OSError, EOFError, RuntimeError)
+    of_libraries = (sqlite3.Error, database.apsw.Error, mcap.zstd.ZstdError, struct.error)
+    # rosbags does not check all that it reads, so Python's errors of odd content come through.
+    of_content = (ValueError, LookupError, OverflowError, TypeError, AssertionError)
+    of_reading = (OSError, EOFError, RuntimeError)
+    of_rosbags = (Reader1Error, Reader2Error, SerdeError)
     try:
         yield
-    except (Reader1Error, Reader2Error, SerdeError, *others) as error:
+    except (*of_rosbags, *of_libraries, *of_content, *of_reading) as error:
         raise InputError(
             f"{path} cannot be read as a bag ({type(error).__name__}: {one_line(error)}); if cut"
             " short, repair it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`"
@@ -176,7 +205,8 @@ def _as_our_errors(path: Path) -> Iterator[None]:
 
 
 _CHUNK_BYTES = 1 << 28
-"""Chunks are closed at 768 KiB by default, and a message of a sensor is far below this."""
+"""Largest decompressed chunk: they are closed at 768 KiB by default, and a message of a sensor is
+far smaller."""
 
 _COMPUTED = """
     SELECT name FROM sqlite_master
@@ -185,11 +215,16 @@ _COMPUTED = """
     SELECT m.name FROM sqlite_master m JOIN pragma_table_xinfo(m.name) x
     WHERE m.type = 'table' AND x.hidden
 """
-"""Views, triggers, virtual tables, and tables with generated columns."""
+"""Query of the names of views, triggers, virtual tables, and tables with generated columns."""
 
 
 def _check_bag(path: Path) -> None:
-    """Raises InputError if a bag is compressed as a whole, or its database computes values."""
+    """Raises InputError for a bag that rosbags must not open.
+
+    Such a bag is compressed as a whole, has a database that would compute what is read, or lacks
+    its metadata.
+    """
+    # The folder of a ROS 2 bag: its metadata, and the files of its database.
     files = [path]
     if path.is_dir():
         files = sorted(path.glob("*.db3"))
@@ -202,6 +237,7 @@ def _check_bag(path: Path) -> None:
                     raise InputError(f"{path}: the bag is compressed; `ros2 bag convert` it")
             case _:
                 raise InputError(f"{metadata} is no metadata of a bag; repair it: ros2 bag reindex")
+    # Each file.
     for file in files:
         size_of_regular_file(file)
         if file.suffix.lower() == ".db3":
@@ -210,17 +246,22 @@ def _check_bag(path: Path) -> None:
 
 def _check_database(path: Path) -> None:
     """Raises InputError if an SQLite database would compute what is read from it."""
+    # Immutable, so that SQLite neither locks the file nor writes beside it.
     uri = f"{path.absolute().as_uri()}?immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as connection:
-        computed = connection.execute(_COMPUTED).fetchone()
-    if computed is not None:
-        name = one_line(computed[0])[:40]
+        first_computed = connection.execute(_COMPUTED).fetchone()
+    if first_computed is not None:
+        name = one_line(first_computed[0])[:40]
         raise InputError(f"{path}: {name!r} is no plain table, as ROS writes; record it again")
 
 
 @functools.cache
 def bound_decompression() -> None:
-    """Makes rosbags decompress chunks within the budget, in the whole process."""
+    """Makes rosbags decompress chunks within the budget, in the whole process.
+
+    rosbags looks up the function of each compression in a dictionary of its module, whose entries
+    are replaced.
+    """
     import lz4.frame
 
     rosbag1 = importlib.import_module("rosbags.rosbag1.reader")
@@ -230,9 +271,19 @@ def bound_decompression() -> None:
 
 
 def _bound(open_stream: Callable[[BytesIO], IO[bytes]]) -> Callable[..., bytes]:
-    """Returns a function of compressed bytes and, for MCAP, the size that the chunk claims."""
+    """Returns a function that decompresses a chunk, as rosbags calls it, within the budget.
+
+    Args:
+        open_stream: Function of a compressed stream that returns the decompressed one.
+    """
 
     def decompress(data: bytes, claimed: int = _CHUNK_BYTES) -> bytes:
+        """Returns the content of a chunk; ValueError if it is larger than the budget or claimed.
+
+        Args:
+            data: Compressed bytes.
+            claimed: Size in bytes of the content that the chunk claims, which MCAP states.
+        """
         limit = min(_CHUNK_BYTES, max_file_bytes(), claimed)
         with open_stream(BytesIO(data)) as stream:
             content = stream.read(limit + 1)

@@ -28,11 +28,15 @@ class OutgoingMessage(NamedTuple):
     time_ns: int
     """Nanoseconds at which it is logged."""
     fields: Mapping[str, Any]
-    """Its fields, nested; what is left out is zero."""
+    """Its fields by name, nested as in the message's type; what is left out is zero or empty."""
 
 
 def write_mcap(folder: Path, outgoing: Iterable[OutgoingMessage]) -> None:
     """Writes a new folder with NAME.mcap and metadata.yaml, as `ros2 bag record` does.
+
+    Args:
+        folder: The folder, which does not exist yet.
+        outgoing: Messages, in the order in which they are logged.
 
     Raises:
         UsageError: rosbags is not installed.
@@ -47,6 +51,7 @@ def write_mcap(folder: Path, outgoing: Iterable[OutgoingMessage]) -> None:
         with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
             connections = dict[str, Any]()
             for topic, kind, time_ns, fields in outgoing:
+                # A topic is announced with its first message.
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 data = store.serialize_cdr(_message(store, kind, fields), kind)
@@ -55,20 +60,29 @@ def write_mcap(folder: Path, outgoing: Iterable[OutgoingMessage]) -> None:
         raise cannot_write(folder, error) from error
 
 
-def _message(store: Typestore, kind: str, given: Mapping[str, Any]) -> Message:
-    """A message of nested fields; what is not given is zero."""
+def _message(store: Typestore, kind: str, fields: Mapping[str, Any]) -> Message:
+    """A message of this type; a field that is left out is zero or empty.
+
+    Args:
+        store: The message types.
+        kind: Name of the message's type.
+        fields: Fields of the message by name; those that are messages are mappings themselves.
+    """
     from rosbags.interfaces import Nodetype
 
     values: dict[str, Any] = {}
-    fields: Any = store.fielddefs[kind][1]  # nested pairs, which rosbags' types do not tell apart
-    for name, (node, of) in fields:
-        value = given.get(name)
+    # rosbags describes a field as (kind of its type, the type). It is (NAME, type of a message),
+    # (BASE, (type of a number or text, …)), or an array: (…, (description of an element, length)).
+    definitions: Any = store.fielddefs[kind][1]
+    for name, (node, detail) in definitions:
+        value = fields.get(name)
         if node is Nodetype.NAME:
-            values[name] = _message(store, of, value or {})
+            values[name] = _message(store, detail, value or {})
         elif node is Nodetype.BASE:
-            values[name] = ("" if of[0] == "string" else 0) if value is None else value
-        elif of[0][0] is Nodetype.NAME:
-            values[name] = [_message(store, of[0][1], element) for element in value or ()]
+            zero = "" if detail[0] == "string" else 0
+            values[name] = zero if value is None else value
+        elif detail[0][0] is Nodetype.NAME:
+            values[name] = [_message(store, detail[0][1], element) for element in value or ()]
         else:
-            values[name] = np.zeros(of[1]) if value is None else value
+            values[name] = np.zeros(detail[1]) if value is None else value
     return store.types[kind](**values)

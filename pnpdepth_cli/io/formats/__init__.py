@@ -68,6 +68,7 @@ _ARCHIVE_ERRORS = (
 _MOST_AXES = 32  # of an array of NumPy 1
 _LOCK = threading.Lock()
 """NumPy evaluates a header as Python, and threads of CPython 3.11 that do so at once may fail."""
+_PFM_VALUE_BYTES = 4  # a float32
 
 
 class Reading(NamedTuple):
@@ -79,6 +80,7 @@ class Reading(NamedTuple):
     """Whether the scale is assumed, as neither the file nor the user nor the data set states it."""
 
     def __str__(self) -> str:
+        """How depth was read, for a person."""
         return f"{self.source}, assumed" if self.assumed else self.source
 
 
@@ -113,12 +115,16 @@ class DepthFormat:
 
 
 def format_of_content(data: bytes) -> DepthFormat | None:
-    """The format whose magic the content begins with; None for another kind of file."""
+    """Returns the format whose magic the content begins with; None for another kind of file."""
     return next((kind for kind in FORMATS.values() if data.startswith(kind.magic)), None)
 
 
 def format_of_suffix(path: Path) -> DepthFormat:
-    """The format that is written for a suffix in any case. OutputError for an unknown one."""
+    """Returns the format that is written for the suffix of a path, in upper or lower case.
+
+    Raises:
+        OutputError: No format of depth has the suffix.
+    """
     by_suffix: dict[str, DepthFormat] = {
         suffix: depth_format
         for depth_format in FORMATS.values()
@@ -130,21 +136,28 @@ def format_of_suffix(path: Path) -> DepthFormat:
 
 
 def kind_of(data: bytes) -> str | None:
-    """Returns "PNG", "JPEG", "TIFF", "WEBP" or the name of another depth format; None if unknown.
+    """Returns the name of a file's format by its content; None for an unknown one.
+
+    It is "JPEG", "WEBP", or the name of a depth format, such as "PNG".
 
     Args:
         data: Content of the file, or at least its first 16 bytes.
     """
     if data.startswith(b"\xff\xd8\xff"):
         return "JPEG"
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":  # the size is in between
         return "WEBP"
     depth_format = format_of_content(data)
     return None if depth_format is None else depth_format.name
 
 
 def no_depth(path: Path, what: str) -> InputError:
-    """Returns the error for an image of pixels that hold no depth."""
+    """Returns the error for an image whose pixels cannot hold depth.
+
+    Args:
+        path: The file.
+        what: What it is, such as "an 8-bit PNG".
+    """
     way_out = "give the 16-bit PNG, EXR or NPY that it is an image of"
     return InputError(f"{path} is {what}, which cannot hold depth; {way_out}")
 
@@ -164,12 +177,23 @@ class _Header(NamedTuple):
 
 
 def _parse_header(path: Path, stream: io.BytesIO, kind: str) -> _Header:
-    """The header at the stream's position. InputError if it is damaged."""
+    """What the header at the stream's position says; the stream is after the header then.
+
+    Args:
+        path: The file, for messages.
+        stream: An NPY file at its beginning.
+        kind: Name of the file's format, for messages.
+
+    Raises:
+        InputError: The header is damaged.
+    """
     try:
+        version = npy.read_magic(stream)
+        read_header = _HEADERS[version]
         with _LOCK:
-            shape, is_fortran, dtype = _HEADERS[npy.read_magic(stream)](stream)
-        are_sizes = (type(side) is int and 0 <= side <= sys.maxsize for side in shape)
-        if len(shape) > _MOST_AXES or not all(are_sizes):
+            shape, is_fortran, dtype = read_header(stream)
+        has_sizes = all(type(side) is int and 0 <= side <= sys.maxsize for side in shape)
+        if not has_sizes or len(shape) > _MOST_AXES:
             raise ValueError(f"a shape of {shape}")
     except _HEADER_ERRORS as error:
         raise damaged(path, kind, f"cannot be read ({type(error).__name__}: {error})") from error
@@ -177,40 +201,65 @@ def _parse_header(path: Path, stream: io.BytesIO, kind: str) -> _Header:
 
 
 def parse_npy(path: Path, data: bytes, kind: str = "NPY") -> NDArray[np.generic]:
-    """Returns the array of an NPY file, of any shape; numbers only, never pickled objects.
+    """Returns the array of an NPY file, of any shape.
 
-    Messages name `path` and `kind`. Raises InputError if it is damaged or holds no numbers.
+    Args:
+        path: The file, for messages.
+        data: Content of the NPY file.
+        kind: Name of the format of `path`, for messages.
+
+    Raises:
+        InputError: The content is damaged, or holds pickled objects or other values that are no
+            numbers.
     """
     # The header.
     stream = io.BytesIO(data)
     shape, is_fortran, dtype = _parse_header(path, stream, kind)
     if dtype.hasobject:
         raise InputError(f"{path} holds pickled objects; save numbers with allow_pickle=False")
-    if dtype.kind not in "fiub":
+    if dtype.kind not in "fiub":  # floats, integers with and without sign, and truth values
         raise InputError(f"{path} holds {dtype} values; save numbers")
     # The numbers that it claims.
     count = math.prod(shape)
     start = stream.tell()
     check_value_count(path, count, value_bytes=dtype.itemsize)
-    if len(data) - start < count * dtype.itemsize:
+    available_bytes = len(data) - start
+    needed_bytes = count * dtype.itemsize
+    if available_bytes < needed_bytes:
         raise damaged(
             path,
             kind,
-            f"cannot be read ({len(data) - start:,} bytes of data instead of"
-            f" {count * dtype.itemsize:,})",
+            f"cannot be read ({available_bytes:,} bytes of data instead of {needed_bytes:,})",
         )
     array = np.frombuffer(data, dtype, count=count, offset=start)
     return array.reshape(shape, order="F" if is_fortran else "C")
 
 
 def read_npy(path: Path, data: bytes) -> DepthFile:
-    """Returns the array of an NPY file."""
+    """Returns the array of an NPY file, of any shape.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: As `parse_npy` has it.
+    """
     array = parse_npy(path, data)
     return DepthFile(values=array, reading=Reading(f"{array.dtype} NPY"), is_image=False)
 
 
 def write_npy(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as an NPY file."""
+    """Writes an NPY file.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with file.open("wb") as stream:
         np.save(stream, metres)
 
@@ -224,7 +273,16 @@ COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def read_npz(path: Path, data: bytes) -> DepthFile:
-    """Returns the only array of an NPZ archive."""
+    """Returns the only array of an NPZ archive, of any shape.
+
+    Args:
+        path: The archive, for messages.
+        data: Content of the archive.
+
+    Raises:
+        InputError: The archive is damaged or beyond the budget, or has no or several arrays, or one
+            whose name says that it is no depth.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
@@ -235,11 +293,12 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
             array = _parse_member(path, archive, member)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
-    name = member.filename.removesuffix(".npy")
-    no_depth = _NO_DEPTH.search(name.lower())
-    if no_depth is not None:
+    # An array that its own name calls something else is not taken for depth.
+    name = member.filename.removesuffix(_OF_ARRAY)
+    match = _NO_DEPTH.search(name.lower())
+    if match is not None:
         raise InputError(
-            f"{path} holds the array {name!r}, which is {no_depth[0]} and no depth by its name;"
+            f"{path} holds the array {name!r}, which is {match[0]} and no depth by its name;"
             " save depth as `depth`, or give an NPY file with --sparse-kind if it is disparity"
         )
     reading = Reading(f"{array.dtype} NPZ array {name}")
@@ -249,7 +308,17 @@ def read_npz(path: Path, data: bytes) -> DepthFile:
 def _parse_member(
     path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
 ) -> NDArray[np.generic]:
-    """The array of one member. InputError if it is compressed otherwise, or beyond the budget."""
+    """The array of one member of an NPZ archive, of any shape.
+
+    Args:
+        path: The archive, for messages.
+        archive: The archive, which is open.
+        member: Entry of the array in it.
+
+    Raises:
+        InputError: The member is compressed by a method that NumPy does not use, is beyond the
+            budget, or holds no numbers.
+    """
     if member.compress_type not in COMPRESSIONS:
         raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
     check_claim(
@@ -269,23 +338,31 @@ class ArrayKind(NamedTuple):
 
 
 def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
-    """Returns what the archive says of its arrays, by their names.
+    """Returns shape and type of each array in an NPZ archive, by the arrays' names.
+
+    Args:
+        path: The archive, for messages.
+        data: Content of the archive.
 
     Raises:
-        InputError: The archive is damaged, or has no arrays, as a ZIP of other files.
+        InputError: The archive is damaged, has too many arrays, or has none, as a ZIP of other
+            files.
     """
     arrays = dict[str, ArrayKind]()
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = [m for m in archive.infolist() if m.filename.endswith(_OF_ARRAY)]
+            members = [
+                member for member in archive.infolist() if member.filename.endswith(_OF_ARRAY)
+            ]
             claim = f"{path} holds {len(members):,} arrays"
             check_claim(claim, len(members), _MOST_ARRAYS, way_out="save those of this image")
+            # Only the header of each array is decompressed.
             for member in members:
                 if member.compress_type not in COMPRESSIONS:
                     raise InputError(f"{path} is compressed; save it by numpy.savez_compressed")
                 with archive.open(member) as stream:
-                    begin = io.BytesIO(stream.read(_LONGEST_HEADER))
-                shape, _, dtype = _parse_header(path, begin, "NPZ")
+                    beginning = io.BytesIO(stream.read(_LONGEST_HEADER))
+                shape, _, dtype = _parse_header(path, beginning, "NPZ")
                 arrays[member.filename.removesuffix(_OF_ARRAY)] = ArrayKind(shape, dtype)
     except _ARCHIVE_ERRORS as error:
         raise damaged(path, "NPZ", f"cannot be read ({error})") from error
@@ -295,7 +372,16 @@ def list_npz(path: Path, data: bytes) -> dict[str, ArrayKind]:
 
 
 def read_npz_array(path: Path, data: bytes, name: str) -> DepthFile:
-    """Returns one of the arrays that `list_npz` has. Raises InputError if it is damaged."""
+    """Returns the array of this name in an NPZ archive, of any shape.
+
+    Args:
+        path: The archive, for messages.
+        data: Content of the archive.
+        name: Name of the array, as `list_npz` has it.
+
+    Raises:
+        InputError: The archive is damaged or has no such array, or the array is beyond the budget.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             array = _parse_member(path, archive, archive.getinfo(name + _OF_ARRAY))
@@ -306,7 +392,16 @@ def read_npz_array(path: Path, data: bytes, name: str) -> DepthFile:
 
 
 def write_npz(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as the array `depth` of an NPZ archive."""
+    """Writes an NPZ archive of one array, `depth`; equal depth gives equal bytes.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with file.open("wb") as stream:
         np.savez_compressed(stream, depth=metres)  # all members have the time 1980-01-01
 
@@ -319,28 +414,54 @@ _PFM_HEADER = re.compile(rb"Pf\s+(\d{1,9})\s+(\d{1,9})\s+(" + _NUMBER + rb")[ \t
 
 
 def read_pfm(path: Path, data: bytes) -> DepthFile:
-    """Returns the only channel of a PFM, whose scale factor's sign gives the byte order."""
+    """Returns the only channel of a PFM, (H, W) float32 as stored.
+
+    The sign of the scale factor in the header gives the byte order. Its amount is not applied, and
+    the reading says so.
+
+    Args:
+        path: The file, for messages.
+        data: Content of the file.
+
+    Raises:
+        InputError: The header or the size is wrong, or the image is beyond the budget.
+    """
+    # The header: size and scale factor.
     match = _PFM_HEADER.match(data)
     if match is None or float(match[3]) == 0:
         raise damaged(path, "PFM", "has no valid header of one channel (Pf)")
-    width, height = int(match[1]), int(match[2])
+    width, height = (int(side) for side in (match[1], match[2]))
     factor = float(match[3])
     check_pixel_count(path, width, height)
+    # The numbers, from the lowest row on.
     body = data[match.end() :]
-    if len(body) != 4 * width * height:
+    needed_bytes = _PFM_VALUE_BYTES * width * height
+    if len(body) != needed_bytes:
         raise damaged(
             path,
             "PFM",
-            f"holds {len(body):,} bytes where {width}x{height} needs {4 * width * height:,}",
+            f"holds {len(body):,} bytes where {width}x{height} needs {needed_bytes:,}",
         )
-    values = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
-    unused = "" if abs(factor) == 1 else f", scale factor {abs(factor):g} of its header not applied"
-    values = np.ascontiguousarray(values[::-1], dtype=np.float32)  # stored from the bottom
-    return DepthFile(values=values, reading=Reading(f"PFM{unused}"))
+    stored = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(height, width)
+    from_the_top = np.ascontiguousarray(stored[::-1], dtype=np.float32)
+    source = "PFM"
+    if abs(factor) != 1:
+        source += f", scale factor {abs(factor):g} of its header not applied"
+    return DepthFile(values=from_the_top, reading=Reading(source))
 
 
 def write_pfm(file: Path, metres: NDArray[np.float32], text: Mapping[str, str]) -> None:
-    """Writes depth (H, W) as a PFM of one channel."""
+    """Writes a PFM of one channel.
+
+    Args:
+        file: The file, which is replaced.
+        metres: (H, W) depth, 0 where unknown.
+        text: Texts by their keys, which the file does not keep.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     height, width = metres.shape
-    header = f"Pf\n{width} {height}\n-1.0\n".encode()  # little-endian
+    # A negative scale factor means little-endian; rows are stored from the bottom.
+    header = f"Pf\n{width} {height}\n-1.0\n".encode()
     file.write_bytes(header + metres[::-1].astype("<f4").tobytes())

@@ -19,7 +19,8 @@ from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.stored_depth import read_stored_sparse
 from pnpdepth_cli.errors import InputError, OutputError, PnpDepthError, UsageError
 from pnpdepth_cli.file_record import SamplePattern
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth, read_sparse
+from pnpdepth_cli.io.depth import DEPTH_SUFFIXES, read_depth
+from pnpdepth_cli.io.point_files import read_sparse
 from tests.commands.frames import ScanOnDisk, scan_on_disk
 
 
