@@ -98,7 +98,7 @@ class Residuals:
 
     features: Tensor  # (3 or 6, H, W), see `features_of`
     points: SparsePoints  # the points at pixel coordinates of the image, on the CPU
-    at: Tensor  # (N, 3 or 6), features at the points
+    point_features: Tensor  # (N, 3 or 6), features at the points
     residual: Tensor  # (N,) float64, log measured − log predicted depth
     # Covariance of a Gaussian process; `gaussian_process.fit` chooses it.
     depth_length: float = 2.5  # length scale of the predicted log depth
@@ -127,7 +127,7 @@ class Residuals:
         return replace(
             self,
             points=self.points.select(mask),
-            at=self.at[mask],
+            point_features=self.point_features[mask],
             residual=self.residual[mask],
         )
 
@@ -157,7 +157,7 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
     return Residuals(
         features=features,
         points=points,
-        at=_sample(features, points),
+        point_features=_sample(features, points),
         residual=points.depth.double().log() - predicted.log(),
     )
 
@@ -228,7 +228,7 @@ def fit(field: Residuals) -> Residuals:
         errors, _ = leave_one_out(candidate, near)
         return float(errors.abs().mean())
 
-    colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
+    colours = LENGTHS_COLOUR if field.point_features.shape[1] > 3 else LENGTHS_COLOUR[:1]
     lengths = product(LENGTHS_DEPTH, colours)
     best = min((replace(field, depth_length=d, colour_length=c) for d, c in lengths), key=error)
     noises = [replace(best, noise=noise) for noise in NOISES if noise != best.noise]
@@ -363,7 +363,7 @@ class _Systems(NamedTuple):
 
 def _systems(field: Residuals, near: Tensor) -> _Systems:
     """The equations of blocks whose points are near (B, k)."""
-    features = field.at[near].double()
+    features = field.point_features[near].double()
     at = field.scaled(features)
     u = features[..., DEPTH]
     covariance = _covariance(at, at).double()

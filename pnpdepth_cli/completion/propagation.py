@@ -90,7 +90,7 @@ def by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tenso
     if queries is not None:
         log_depth = queries.sample(log_depth)
         xy = queries.xy
-    at_points = residuals.at[:, DEPTH].double()
+    at_points = residuals.point_features[:, DEPTH].double()
     weights = torch.ones_like(residuals.residual)
     shift, slope = local_lines(residuals.points, xy, residuals.residual, at_points, weights)
     return (shift + slope * log_depth).float()
