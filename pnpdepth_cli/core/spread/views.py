@@ -18,7 +18,7 @@ from pnpdepth_cli.core.spread.boxes import (
     rule,
 )
 
-PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split", "unsafe_chunk")
+PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split")
 """Operations whose results are parts of their input."""
 
 
