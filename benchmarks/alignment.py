@@ -102,11 +102,13 @@ def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> f
     d = points.depth.double()
     low = float(d.min()) / 10
     high = float(d.max()) * 10
-    at = to_space(torch.from_numpy(x), reading.output).numpy()
-    scale, shift = np.polyfit(at, to_space(d, reading.space).numpy(), 1)
-    line = scale * to_space(torch.from_numpy(case.x), reading.output) + shift
-    ends = sorted(to_space(torch.tensor([low, high], dtype=torch.float64), reading.space).tolist())
-    return case.mae(alignment.from_space(line.clamp(*ends), reading.space).numpy())
+    at = to_space(torch.from_numpy(x), reading.x_space).numpy()
+    scale, shift = np.polyfit(at, to_space(d, reading.depth_space).numpy(), 1)
+    line = scale * to_space(torch.from_numpy(case.x), reading.x_space) + shift
+    ends = sorted(
+        to_space(torch.tensor([low, high], dtype=torch.float64), reading.depth_space).tolist()
+    )
+    return case.mae(alignment.from_space(line.clamp(*ends), reading.depth_space).numpy())
 
 
 def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated: bool) -> float:

@@ -64,19 +64,25 @@ _LARGEST_LOG = 60.0
 
 
 class Candidate(NamedTuple):
-    """A fit that is tried: a reading, its parameters, and the sign that its scale must have."""
+    """A fit that is tried: what the numbers are taken for, and which parameters are fitted."""
 
-    reading: str  # of `choices.READINGS`
-    kind: str  # of `choices.FITS`
-    sign: int = 0  # 1 or -1; 0 for either
+    reading: str
+    """What the network's numbers are taken for, one of `choices.READINGS`."""
+    kind: str
+    """The parameters that are fitted, one of `choices.FITS`."""
+    sign: int = 0
+    """The sign that the scale must have, 1 or −1; 0 for either."""
 
 
 class _Reading(NamedTuple):
-    """What a network's numbers can be, and the line that gives depth from them."""
+    """What a network's numbers x can be: a quantity of depth is linear in a quantity of x."""
 
-    title: str  # in a sentence
-    output: str  # of `choices.SPACES`: the scale is that of x, of 1/x or of log x
-    space: str  # of `choices.SPACES`: the quantity of depth that the line gives
+    title: str
+    """Its name in a sentence."""
+    x_space: str
+    """The quantity of x: "depth" for x itself, "inverse" for 1/x, "log" for log x."""
+    depth_space: str
+    """The quantity of depth that is linear in it, one of `choices.SPACES`."""
 
 
 _READINGS = {
@@ -89,68 +95,80 @@ _READINGS = {
 READING_OF_KIND = {"depth": "depth", "inverse": "disparity", "log": "log"}
 """The reading of a definition's `output_kind`."""
 
-_OF_SCALE = {"affine": ("affine",), "scale": ("scale", "affine")}
-"""Kinds of fits by a definition's `output_scale`; those of the others are `_ALL`."""
+_KINDS_OF_SCALE = {"affine": ("affine",), "scale": ("scale", "affine")}
+"""Kinds of fits by a definition's `output_scale`; those of the others are `_ALL_KINDS`."""
 
-_ALL = ("none", "scale", "affine")
+_ALL_KINDS = ("none", "scale", "affine")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
     """How the network's numbers are converted to metres."""
 
-    reading: str  # what the numbers are, one of `choices.READINGS`
-    kind: str  # kind of the fit, one of `choices.FITS`
+    reading: str
+    """What the numbers are, one of `choices.READINGS`."""
+    kind: str
+    """The parameters that were fitted, one of `choices.FITS`."""
     scale: float
+    """Slope of the line that takes a quantity of the numbers to one of depth (see this module)."""
     shift: float
+    """The line's value where that quantity of the numbers is 0."""
     bounds: tuple[float, float]
     """(nearest, farthest) metres; depth outside, or no positive depth at all, becomes the bound."""
     points: int
-    error: float = math.nan  # mean |log(aligned / measured depth)| of the best 70 % of the points
-    misfit: float = math.nan  # the same of all points, none counting more than 1.0
-    outliers: float = 0.0  # fraction of the points that are far off
+    """Number of points that it was fitted to."""
+    error: float = math.nan
+    """Mean |log(aligned / measured depth)| of the best 70 % of the points."""
+    misfit: float = math.nan
+    """The same of all points, none counting more than 1.0."""
+    outliers: float = 0.0
+    """Fraction of the points that are far off."""
 
     def depth(self, x: Tensor) -> Tensor:
-        """Returns metres within `bounds`, of the shape of x.
+        """Returns depth of the shape of x, metres within `bounds`.
 
         The gradient is that of the unclamped depth, so that a loss still pulls back a pixel that
         is outside.
+
+        Args:
+            x: The network's numbers.
         """
         low, high = self._limits
-        line = self._line(_clamp_value(x, low=self._least_output))
-        return from_space(_clamp_value(line, low, high), _READINGS[self.reading].space)
+        line = self._line(_clamp_value(x, low=self._least_x))
+        return from_space(_clamp_value(line, low, high), _READINGS[self.reading].depth_space)
 
     def beyond(self, x: Tensor) -> float:
-        """Returns the fraction of the values that `depth` clamps."""
+        """Returns the fraction 0…1 of the network's numbers x that `depth` clamps to a bound."""
         x = x.cpu().double()
         low, high = self._limits
-        least = self._least_output
-        line = self._line(x.clamp(min=least))
-        return float(((x < least) | (line < low) | (line > high)).double().mean())
+        line = self._line(x.clamp(min=self._least_x))
+        is_clamped = (x < self._least_x) | (line < low) | (line > high)
+        return float(is_clamped.double().mean())
 
     def _line(self, x: Tensor) -> Tensor:
-        """The line at x, in the reading's space and not clamped."""
-        return self.scale * to_space(x, _READINGS[self.reading].output) + self.shift
+        """The quantity of depth that is linear in x (or 1/x, log x) at x, not clamped."""
+        return self.scale * to_space(x, _READINGS[self.reading].x_space) + self.shift
 
     @property
     def _limits(self) -> tuple[float, float]:
-        """The bounds of the line in its space, the lower one first."""
+        """The bounds as values of the line, the lower one first: 1/farthest of a disparity."""
         bounds = torch.tensor(self.bounds, dtype=torch.float64)
-        low, high = sorted(to_space(bounds, _READINGS[self.reading].space).tolist())
+        low, high = sorted(to_space(bounds, _READINGS[self.reading].depth_space).tolist())
         return low, high
 
     @property
-    def _least_output(self) -> float:
-        """The least x whose depth is within the bounds; below it 1/x or log x must not go.
+    def _least_x(self) -> float:
+        """The least x whose depth is within the bounds, where 1/x or log x needs x above 0.
 
-        −∞ for a line in x itself, which has no such end.
+        −∞ where the line is one in x itself, which may be any number; ∞ where no positive x has a
+        depth within the bounds.
         """
-        output = _READINGS[self.reading].output
-        if output == "depth":
+        x_space = _READINGS[self.reading].x_space
+        if x_space == "depth":
             return -math.inf
-        # Where the line meets its bounds, as log x or as 1/x.
+        # Where the line meets its limits, as log x or as 1/x.
         ends = [(limit - self.shift) / self.scale for limit in self._limits]
-        if output == "log":
+        if x_space == "log":
             return math.exp(min(max(min(ends), -_LARGEST_LOG), _LARGEST_LOG))
         return 1 / max(ends) if max(ends) > 0 else math.inf
 
@@ -163,9 +181,13 @@ class Alignment:
         return f"negated {title}" if self.scale < 0 else title
 
     def __str__(self) -> str:
+        """What the numbers are and how they were fitted, as a sentence."""
         if self.scale == 0:
             return "the network's output is read as one depth everywhere"
-        farther = (self.scale < 0) == (self.reading == "disparity")
+        # Depth rises with the numbers, except with a disparity; a negative scale turns that round.
+        falls = self.reading == "disparity"
+        if self.scale < 0:
+            falls = not falls
         if self.reading == "power":
             fitted = f"fitted by factor and exponent {self.scale:.3g}"
         elif self.kind == "none":
@@ -174,44 +196,48 @@ class Alignment:
             fitted = "fitted by scale and shift"
         else:
             fitted = f"fitted by {self.kind}"
-        sense = "farther" if farther else "nearer"
+        sense = "nearer" if falls else "farther"
         return f"the network's output is read as {self.title} (larger is {sense}), {fitted}"
 
 
 def candidates(
-    asked: str, output_kind: str = "unknown", output_scale: str = "unknown"
+    align_setting: str, output_kind: str = "unknown", output_scale: str = "unknown"
 ) -> tuple[Candidate, ...]:
-    """Returns the fits that an alignment can have.
+    """Returns the fits to try, which are what the user and the network's definition leave open.
 
-    What is stated fixes the sign of the scale and the fewest parameters. An open kind can be any
-    reading, with either sign.
+    What they state fixes what the numbers are (the reading), the sign of the scale and the fewest
+    parameters. If neither says what the numbers are, they can be anything, with either sign.
 
     Args:
-        asked: One of `choices.ALIGNMENTS`, but "none". A reading is obeyed, whatever the definition
-            states; "auto" leaves all to the definition and the points.
-        output_kind: What a definition states, of `choices.OutputKind`.
-        output_scale: What a definition states, of `choices.OutputScale`.
+        align_setting: What the user states: a reading, which is obeyed whatever the definition
+            states, or a kind of fit, which fixes the parameters. "auto" leaves all to the
+            definition and the points. One of `choices.ALIGNMENTS`, but "none".
+        output_kind: What the definition states, of `choices.OutputKind`.
+        output_scale: What the definition states, of `choices.OutputScale`.
     """
-    stated = READING_OF_KIND.get(output_kind)
+    defined_reading = READING_OF_KIND.get(output_kind)
     # A reading that contradicts the definition leaves its scale open, too.
-    if asked in READINGS and asked != stated:
+    if align_setting in READINGS and align_setting != defined_reading:
         output_scale = "unknown"
-    reading = asked if asked in READINGS else stated
-    kinds = (asked,) if asked in FITS else _OF_SCALE.get(output_scale, _ALL)
+    reading = align_setting if align_setting in READINGS else defined_reading
+    kinds = _KINDS_OF_SCALE.get(output_scale, _ALL_KINDS)
+    if align_setting in FITS:
+        kinds = (align_setting,)
+    # Anything.
     if reading is None:
-        return tuple(
-            Candidate(name, kind) for name in READINGS for kind in kinds if _has(name, kind)
-        )
+        fits = [Candidate(any_reading, kind) for any_reading in READINGS for kind in kinds]
+        return tuple(fit for fit in fits if _has_kind(fit.reading, fit.kind))
+    # What is stated; the scale of a power is its exponent, which is negative for a disparity.
     sign = 0 if reading == "power" else 1
-    fits = [Candidate(reading, kind, sign) for kind in kinds if _has(reading, kind)]
+    fits = [Candidate(reading, kind, sign) for kind in kinds if _has_kind(reading, kind)]
     # Networks stretch or compress the range, which a power of what they state shows.
-    if asked == "auto" and reading != "log":
+    if align_setting == "auto" and reading != "log":
         fits.append(Candidate("power", "affine", -1 if reading == "disparity" else 1))
     return tuple(fits)
 
 
 def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignment:
-    """Returns the alignment of the network's numbers with the points.
+    """Returns how the network's numbers are converted to metres, fitted to the points.
 
     Of several candidates it is the best by BIC, so that a fit with more parameters must be worth
     them. Where the points contradict the sign that is stated, the scale can be 0: depth is the same
@@ -219,8 +245,8 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
 
     Args:
         x: (N,) the network's numbers at the points.
-        points: The points.
-        tried: The candidates, that of what is stated first.
+        points: The N points.
+        tried: The candidates, of `candidates`; errors name the first.
 
     Raises:
         NoPointsError: There are too few points.
@@ -230,36 +256,40 @@ def align(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Alignm
 
 
 def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> list[Alignment]:
-    """Returns the alignment with the points, and then those that explain them as well.
+    """Returns the best alignment of the network's numbers, and then those that are as good.
 
-    The latter are the best ones of other readings, the better first. They are worse by no more than
-    the standard error of the difference, which the points have by chance.
+    The latter take the numbers for something else (have another reading). Each is the best one that
+    does, the better first. They are worse by no more than the standard error of the difference,
+    which the points have by chance.
 
     Args:
         x: (N,) the network's numbers at the points.
-        points: The points.
-        tried: The candidates, that of what is stated first.
+        points: The N points.
+        tried: The candidates, of `candidates`; errors name the first.
 
     Raises:
         NoPointsError: There are too few points.
         ModelError: The numbers do not vary, or are not finite.
     """
     x = x.detach().cpu().double()
-    d = points.depth.detach().cpu().double()
+    depth = points.depth.detach().cpu().double()
     finite = x.isfinite()
     if not bool(finite.any()):
         raise ModelError(
             f"the network's prediction is not finite at any of {len(x):,} sparse points; are its"
             " weights, its input range (`normalise`) and precision right?"
         )
-    x, d = x[finite], d[finite]
-    fits = [fit for candidate in tried if (fit := _fit(x, d, candidate)) is not None]
+    x = x[finite]
+    depth = depth[finite]
+    possible = [_fit(x, depth, candidate) for candidate in tried]
+    fits = [fit for fit in possible if fit is not None]
     if fits:
-        # The best of each reading; the first of the best.
-        ordered = sorted(fits, key=_bic)
-        readings = {fit.reading: fit for fit in reversed(ordered)}
-        best, *others = (fit for fit in ordered if readings[fit.reading] is fit)
-        return [best, *(fit for fit in others if _is_alike(fit, best, x, d))]
+        # The best fit of each reading, the best one first; of equal ones the first that was tried.
+        best_of_reading: dict[str, Alignment] = {}
+        for fit in sorted(fits, key=_bic):
+            best_of_reading.setdefault(fit.reading, fit)
+        best, *others = best_of_reading.values()
+        return [best, *(fit for fit in others if _is_alike(fit, best, x, depth))]
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
@@ -279,29 +309,38 @@ def align_prediction(
     """Returns the prediction aligned with the points, (H, W) float32 metres, 0 = unknown.
 
     Args:
-        prediction: (H, W) depth, metric or not; not positive or not finite is unknown.
-        kind: Kind of the fit, one of `choices.FITS`.
-        reading: What the line is fitted to, "depth", or "disparity" for the inverse of both.
+        prediction: Depth (H, W), metric or not; not positive or not finite is unknown.
+        points: The points.
+        kind: The parameters that are fitted, one of `choices.FITS`.
+        reading: Quantity that is fitted: "depth", or "disparity" for 1/depth of prediction and
+            points.
 
     Raises:
         NoPointsError: No point has a prediction.
         ModelError: The prediction is the same at all points, or zero, so that no line fits.
     """
     known, points = where_predicted(prediction, points)
+    # 1 stands for what is unknown, as it can be inverted; it becomes 0 again.
     x = torch.where(known, prediction, 1.0)
-    x = x.reciprocal() if reading == "disparity" else x
+    if reading == "disparity":
+        x = x.reciprocal()
     fit = align(points.sample(x), points, [Candidate(reading, kind)])
     return torch.where(known, fit.depth(x), 0.0)
 
 
 def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, SparsePoints]:
-    """Returns where a prediction (H, W) is known, and the points that lie there.
+    """Returns (H, W) bool, where a prediction is known, and the points that lie there.
+
+    Args:
+        prediction: Depth (H, W); not positive or not finite is unknown.
+        points: The points. One between pixels lies there if all pixels around it are known.
 
     Raises:
         NoPointsError: There is no such point.
     """
     known = prediction.isfinite() & (prediction > 0)
-    seen = points.where(points.sample(torch.where(known, prediction, torch.nan)).isfinite())
+    at_points = points.sample(torch.where(known, prediction, torch.nan))  # NaN beside any unknown
+    seen = points.where(at_points.isfinite())
     if not len(seen):
         raise NoPointsError(
             f"none of the {len(points)} sparse points lies where the network has a prediction;"
@@ -310,40 +349,51 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
     return known, seen
 
 
-def _has(reading: str, kind: str) -> bool:
-    """Whether a reading has fits of this kind: those of one factor are depth's or disparity's."""
+def _has_kind(reading: str, kind: str) -> bool:
+    """Whether this reading can be fitted with these parameters.
+
+    What is linear in 1/x, or a power, is fitted by scale and shift alone.
+    """
     return kind == "affine" or reading in ("depth", "disparity", "log")
 
 
-def _fit(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment | None:
-    """The fit of a candidate; None where the x do not allow it.
+def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
+    """The best alignment with a candidate's reading, parameters and sign; None where there is none.
 
-    Where they contradict the sign that is stated, the best line is level.
+    Where the points contradict the sign, it is the one with the same depth everywhere.
+
+    Args:
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+        candidate: The candidate.
     """
-    line = _scale_and_shift(x, d, candidate.reading, candidate.kind)
+    line = _scale_and_shift(x, depth, candidate.reading, candidate.kind)
     if line is None or not all(map(math.isfinite, line)):
         return None
     scale, _ = line
     if candidate.sign and scale * candidate.sign <= 0:
+        # Depth that is the same everywhere needs a shift, and says something of two points or more.
         has_level = candidate.kind == "affine" and len(x) > 1
-        return _level(x, d, candidate) if has_level else None
-    return _with_errors(x, d, candidate, line) if scale else None
+        return _level(x, depth, candidate) if has_level else None
+    return _with_errors(x, depth, candidate, line) if scale else None
 
 
-def _level(x: Tensor, d: Tensor, candidate: Candidate) -> Alignment:
-    """The best line whose scale is 0: depth is the same everywhere."""
-    reading = candidate.reading if _READINGS[candidate.reading].output == "depth" else "depth"
-    depth = d.new_tensor(fit_location(d.log())).exp()
-    level = float(to_space(depth, _READINGS[reading].space))
-    return _with_errors(x, d, candidate._replace(reading=reading), (0.0, level))
+def _level(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment:
+    """The best alignment whose scale is 0: depth is the same everywhere. Arguments as of `_fit`."""
+    # Of scale 0, a line in 1/x or log x says no more than one in x, and has no `_least_x`.
+    is_in_x = _READINGS[candidate.reading].x_space == "depth"
+    reading = candidate.reading if is_in_x else "depth"
+    level_m = depth.new_tensor(fit_location(depth.log())).exp()
+    shift = float(to_space(level_m, _READINGS[reading].depth_space))
+    return _with_errors(x, depth, candidate._replace(reading=reading), (0.0, shift))
 
 
 def _with_errors(
-    x: Tensor, d: Tensor, candidate: Candidate, line: tuple[float, float]
+    x: Tensor, depth: Tensor, candidate: Candidate, line: tuple[float, float]
 ) -> Alignment:
-    """The fit with this line, and how far the points are from it."""
+    """The alignment by the line (scale, shift), with the points' errors; the rest as of `_fit`."""
     scale, shift = line
-    nearest, farthest = _bounds(d).tolist()
+    nearest, farthest = _bounds(depth).tolist()
     fit = Alignment(
         reading=candidate.reading,
         kind=candidate.kind,
@@ -352,91 +402,129 @@ def _with_errors(
         bounds=(nearest, farthest),
         points=len(x),
     )
-    errors = (fit.depth(x).log() - d.log()).abs()
-    best = errors.sort().values[: max(1, round(_BEST * len(errors)))]
-    gross = max(_GROSS_STDS * MAD_TO_STD * float(errors.median()), _GROSS)
+    errors = (fit.depth(x).log() - depth.log()).abs()
+    best_errors = errors.sort().values[: max(1, round(_BEST * len(errors)))]
+    least_outlying = max(_GROSS_STDS * MAD_TO_STD * float(errors.median()), _GROSS)
     return replace(
         fit,
-        error=float(best.mean()),
+        error=float(best_errors.mean()),
         misfit=mean_error(errors),
-        outliers=float((errors > gross).double().mean()),
+        outliers=float((errors > least_outlying).double().mean()),
     )
 
 
-def _scale_and_shift(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
-    """The line of a reading, level where the x are all the same; None where there is no line."""
+def _scale_and_shift(
+    x: Tensor, depth: Tensor, reading: str, kind: str
+) -> tuple[float, float] | None:
+    """Scale and shift of the line that fits best; None where x allows none.
+
+    A scale of 0 says that no line fits, because the numbers are the same at all points.
+
+    Args:
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+        reading: What the numbers are taken for, a key of `_READINGS`.
+        kind: The parameters that are fitted, one of `choices.FITS`.
+    """
     if kind == "none":
         return 1.0, 0.0
     if kind != "affine":
-        return _factor(x, d, reading, kind)
-    output = _READINGS[reading].output
-    space = _READINGS[reading].space
-    if output != "depth" and not bool((x > 0).all()):
+        return _factor(x, depth, reading, kind)
+    _, x_space, depth_space = _READINGS[reading]
+    if x_space != "depth" and not bool((x > 0).all()):  # 1/x or log x
         return None
-    x = to_space(x, output)
+    x = to_space(x, x_space)
     if float(x.max() - x.min()) <= _DISTINCT * float(x.abs().max()):
         return 0.0, 0.0
-    low, high = sorted(to_space(_bounds(d), space).tolist())
-    return fit_line(x, to_space(d, space), space, (low, high))
+    low, high = sorted(to_space(_bounds(depth), depth_space).tolist())
+    return fit_line(x, to_space(depth, depth_space), depth_space, (low, high))
 
 
-def _factor(x: Tensor, d: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
-    """Scale and shift of a reading whose one parameter is a factor of depth."""
+def _factor(x: Tensor, depth: Tensor, reading: str, kind: str) -> tuple[float, float] | None:
+    """Scale and shift where the only parameter is a factor of depth; None where none fits.
+
+    Args:
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+        reading: What the numbers are taken for: "depth", "disparity" or "log".
+        kind: "scale" for a robust mean of the points' own factors, "median" for their median.
+    """
     if reading == "log":  # a factor of depth is an addend of its logarithm
-        return 1.0, _location(d.log() - x, kind)
+        return 1.0, _common_addend(depth.log() - x, kind)
     # Numbers of the rarer sign, or 0, give no depth at any factor.
     sign = 1.0 if float(x.median()) >= 0 else -1.0
-    used = sign * x > 0
-    if not bool(used.any()):
+    is_used = sign * x > 0
+    if not bool(is_used.any()):
         return None
     # d = scale·x, or 1/d = scale·x: log d is log x, or −log x, and what the scale adds to it.
-    log_x = (sign * x[used]).log()
-    log_d = d[used].log()
+    log_x = (sign * x[is_used]).log()
+    log_depth = depth[is_used].log()
     if reading == "depth":
-        return sign * math.exp(_location(log_d - log_x, kind)), 0.0
-    return sign * math.exp(-_location(log_d + log_x, kind)), 0.0
+        return sign * math.exp(_common_addend(log_depth - log_x, kind)), 0.0
+    return sign * math.exp(-_common_addend(log_depth + log_x, kind)), 0.0
 
 
-def _location(addends: Tensor, kind: str) -> float:
-    """The addend of all points, from the one that each would need."""
+def _common_addend(addends: Tensor, kind: str) -> float:
+    """One addend of log depth for all points, from the one (N,) that each would need.
+
+    Args:
+        addends: The addends.
+        kind: "median", or "scale" for their robust mean.
+    """
     return float(addends.median()) if kind == "median" else fit_location(addends)
 
 
 def _bic(fit: Alignment) -> float:
-    """The Bayesian information criterion of a fit, for Laplace's distribution of the errors."""
+    """The Bayesian information criterion of a fit, of which less is better.
+
+    Errors of log depth are taken as distributed by Laplace, whose log likelihood of N of them is
+    −N·log(mean error) and a constant.
+    """
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
     error = max(fit.misfit, _LEAST_ERROR) if fit.points > parameters else _UNTESTED
     return 2 * fit.points * math.log(error) + parameters * math.log(fit.points)
 
 
-def _is_alike(fit: Alignment, best: Alignment, x: Tensor, d: Tensor) -> bool:
+def _is_alike(fit: Alignment, best: Alignment, x: Tensor, depth: Tensor) -> bool:
     """Whether a fit explains the points as well as the best one, within what they have by chance.
 
-    The criterion has the logarithm of the mean error. The standard error of the difference of two
-    follows from the differences that single points make.
+    The criterion `_bic` is 2N times the logarithm of the mean error. To first order, a point moves
+    it by twice its error over the mean. So the standard error of the difference of two criteria
+    follows from what single points contribute to it.
+
+    Args:
+        fit: The fit.
+        best: The fit with the least criterion.
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
     """
-    shares = [
-        (of.depth(x).log() - d.log()).abs().clamp_max(MAX_ERROR) / max(of.misfit, _LEAST_ERROR)
-        for of in (fit, best)
-    ]
-    by_chance = 2 * math.sqrt(len(x)) * float((shares[0] - shares[1]).std(correction=0))
+    difference = _relative_errors(fit, x, depth) - _relative_errors(best, x, depth)
+    by_chance = 2 * math.sqrt(len(x)) * float(difference.std(correction=0))
     return _bic(fit) - _bic(best) <= _ALIKE * by_chance
 
 
-def _bounds(d: Tensor) -> Tensor:
-    """(nearest, farthest) metres that aligned depth can have."""
-    factor = BEYOND * (1 + 1 / len(d))
-    return torch.stack([d.min() / factor, d.max() * factor])
+def _relative_errors(fit: Alignment, x: Tensor, depth: Tensor) -> Tensor:
+    """(N,) the errors of log depth at the points, over their mean; arguments as of `_is_alike`."""
+    errors = (fit.depth(x).log() - depth.log()).abs().clamp_max(MAX_ERROR)
+    return errors / max(fit.misfit, _LEAST_ERROR)
+
+
+def _bounds(depth: Tensor) -> Tensor:
+    """(nearest, farthest) metres that aligned depth can have, from the depth (N,) of the points."""
+    factor = BEYOND * (1 + 1 / len(depth))
+    return torch.stack([depth.min() / factor, depth.max() * factor])
 
 
 def _clamp_value(value: Tensor, low: float, high: float = math.inf) -> Tensor:
-    """The value clamped, but with the gradient of the value as it is."""
+    """The value clamped between low and high, but with the gradient of the unclamped value."""
     clamped = value.clamp(low, high)
-    return clamped.detach() + (value - value.detach()) if value.requires_grad else clamped
+    if not value.requires_grad:
+        return clamped
+    return clamped.detach() + (value - value.detach())  # the addend is 0 and has the gradient
 
 
 def to_space(depth: Tensor, space: str) -> Tensor:
-    """Returns depth as one of `choices.SPACES`."""
+    """Returns depth itself, 1/depth or log depth, as `space` says, one of `choices.SPACES`."""
     match space:
         case "depth":
             return depth
@@ -449,7 +537,7 @@ def to_space(depth: Tensor, space: str) -> Tensor:
 
 
 def from_space(value: Tensor, space: str) -> Tensor:
-    """Returns the depth of a value in one of `choices.SPACES`."""
+    """Returns depth from what `to_space` makes of it; `space` is one of `choices.SPACES`."""
     match space:
         case "depth":
             return value

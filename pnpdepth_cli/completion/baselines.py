@@ -30,63 +30,72 @@ Baseline = Callable[[SparsePoints, Tensor], Tensor]
 and shift, 0 = unknown."""
 
 
-_LEAST_STD = 1e-9  # of the aligned depth at the points, over its mean: it may be level
+_LEAST_STD = 1e-9
+"""Added to the standard deviation of the aligned depth at the points, in units of its mean.
+
+The depth may be the same at all points, and it is divided by the standard deviation."""
 
 
 def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
-    """Returns the locally aligned depth (H, W) float32 metres, within a global alignment's bounds.
+    """Returns the prediction aligned anew around each pixel, (H, W) float32 metres, 0 = unknown.
+
+    It is within the bounds of a global alignment.
 
     Args:
-        prediction: (H, W) depth, metric or not; not positive or not finite is unknown, and 0 in the
+        points: The points.
+        prediction: Depth (H, W), metric or not; not positive or not finite is unknown, and 0 in the
             result.
 
     Raises:
         NoPointsError: No point has a prediction.
+        ModelError: No global alignment fits.
     """
     device = prediction.device
     prediction = prediction.detach().cpu()
     known, points = where_predicted(prediction, points.tensors())
     points = distinct(points)
-    # The global alignment, as metres and as what keeps metres within its bounds.
-    x = torch.where(known, prediction, 1.0).double()
+    # The global alignment. Metres go through `in_bounds`, which clamps them to its bounds.
+    x = torch.where(known, prediction, 1.0).double()  # 1 stands for what is unknown
     kinds = ("none", "scale", "affine")
-    aligned = align(points.sample(x), points, [Candidate("depth", kind) for kind in kinds])
-    start = aligned.scale * x + aligned.shift
-    bounded = replace(aligned, scale=1.0, shift=0.0)
-    # It in standard deviations over the points, which lines are over.
-    at_points = points.sample(start)
+    alignment = align(points.sample(x), points, [Candidate("depth", kind) for kind in kinds])
+    aligned = alignment.scale * x + alignment.shift
+    in_bounds = replace(alignment, scale=1.0, shift=0.0)
+    # Aligned depth in standard deviations over the points: the regressor of the local lines.
+    at_points = points.sample(aligned)
     mean = at_points.mean()
     std = at_points.std(correction=0) + _LEAST_STD * at_points.abs().mean()
-    z = (start - mean) / std
-    z_at_points = (at_points - mean) / std
+    regressor = (aligned - mean) / std
+    regressor_at_points = (at_points - mean) / std
     # The residual of depth by lines around every pixel, outliers counting less.
     residual = points.depth.double() - at_points
-    weights = inlier_weights(points, points.depth.double().log() - bounded.depth(at_points).log())
-    shift, slope = local_lines(points, None, residual, z_at_points, weights)
-    depth = bounded.depth(start + shift + slope * z)
+    log_residual = points.depth.double().log() - in_bounds.depth(at_points).log()
+    weights = inlier_weights(points, log_residual)
+    shift, slope = local_lines(points, None, residual, regressor_at_points, weights)
+    depth = in_bounds.depth(aligned + shift + slope * regressor)
     return torch.where(known, depth, 0.0).float().to(device)
 
 
 def _aligned(points: SparsePoints, prediction: Tensor, *, kind: str, reading: str) -> Tensor:
-    """The prediction, read as depth or disparity and aligned with the points."""
+    """The prediction aligned with the points, (H, W) metres; arguments as of `align_prediction`."""
     return align_prediction(prediction, points, kind=kind, reading=reading)
 
 
 def by_nearest(points: SparsePoints, prediction: Tensor) -> Tensor:
-    """Returns the depth of the nearest point everywhere."""
+    """Returns the depth of the nearest point, (H, W) metres; the prediction has no effect."""
     return nearest(points)
 
 
 def by_linear(points: SparsePoints, prediction: Tensor) -> Tensor:
-    """Returns linear interpolation of depth between the points."""
+    """Returns linear interpolation of depth between the points; the prediction has no effect."""
     return linear(points)
 
 
 def by_linear_log(points: SparsePoints, prediction: Tensor) -> Tensor:
-    """Returns linear interpolation of log depth between the points."""
+    """Returns linear interpolation of log depth between the points, in metres; as `by_linear`."""
     return linear(points, space="log")
 
 
+# Alignments of the whole prediction (`align_prediction`), with one factor or scale and shift.
 by_median = partial(_aligned, kind="median", reading="depth")
 by_scale = partial(_aligned, kind="scale", reading="depth")
 by_affine = partial(_aligned, kind="affine", reading="depth")

@@ -41,37 +41,48 @@ _AROUND = np.ones((3, 3), np.bool_)  # a pixel and its eight neighbours: one hol
 def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
     """Returns (N,) int64, the fold 0 … folds − 1 of each point; folds are about equally large.
 
-    With fewer points than folds every point has a fold of its own. Neighbouring scan lines of a
-    LiDAR are in different folds.
+    A point of one fold is about as far from those of the others as an ordinary pixel is from all
+    points. Neighbouring scan lines of a LiDAR are in different folds. With fewer points than folds
+    every point has a fold of its own.
+
+    Args:
+        points: The N points.
+        folds: Number of folds.
+        seed: Random seed of the folds.
     """
     generator = torch.Generator().manual_seed(seed)
+    # Of a LiDAR, whole scan lines in turn.
     line = scan_lines(points.xy.cpu().numpy(), points.size)
     if line is not None:
         first = torch.randint(folds, (1,), generator=generator)
         return (torch.from_numpy(line) + first) % folds
-    # Cells grow until held-out points are as far from the others as pixels are from all.
-    target = _distance_of_pixels(points, generator)
-    side = 0.0
-    best = _folds_of_cells(points, side, folds, generator)
-    while _distance_held_out(points, best, generator) * _SLACK < target:
-        side = side * _GROWTH if side else max(1.0, target)
-        if side > _MAX_SIDE * min(points.size):
+    # Of other points, cells that grow until the first fold is as far from the others as pixels are
+    # from all points. A side of 0 has each point in a cell of its own.
+    wanted_px = _distance_of_pixels(points, generator)
+    side_px = 0.0
+    fold = _folds_of_cells(points, side_px, folds, generator)
+    while _distance_held_out(points, fold, generator) * _SLACK < wanted_px:
+        side_px = side_px * _GROWTH if side_px else max(1.0, wanted_px)
+        if side_px > _MAX_SIDE * min(points.size):
             break
-        best = _folds_of_cells(points, side, folds, generator)
-    return best
+        fold = _folds_of_cells(points, side_px, folds, generator)
+    return fold
 
 
 def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | None:
-    """Returns (N,) the number of the copied hole that a point of a depth map is under, 0 for none.
+    """Returns (N,) int, which copied hole of a depth map each point lies under; 0 for none.
 
-    One of `folds` of the points is under one, at most.
+    Copied holes have the numbers 1, 2, …. The map of what is unknown is moved over the known
+    pixels, as a whole and around the image's edges, so that the distances to what stays known are
+    those in the holes. Of the last copy only some holes are taken.
 
-    The map of what is unknown is moved over the known pixels, as a whole and around the image's
-    edges, so that the distances to what stays known are those in the holes. Of the last copy only
-    some holes are taken.
+    None for points that are no depth map with holes: those of a scanner, at random pixels, or of a
+    map without a hole.
 
-    Returns None for points that are no depth map with holes: those of a scanner, at random pixels,
-    or of a map without a hole.
+    Args:
+        points: The N points.
+        folds: Number of points for each one that may lie under a copied hole.
+        seed: Random seed of the moves.
     """
     from scipy import ndimage
 
@@ -80,44 +91,48 @@ def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | 
         return None
     known = np.zeros(grid.shape, np.bool_)
     known[grid.row, grid.column] = True
-    surrounded = ndimage.binary_erosion(known)
-    if known.all() or surrounded.sum() < _SURROUNDED * known.sum():
+    is_surrounded = ndimage.binary_erosion(known)
+    if known.all() or is_surrounded.sum() < _SURROUNDED * known.sum():
         return None
-    # Copies of the holes, until so many points are under them.
+    # Copies of the holes, until enough pixels are under them.
     rng = np.random.default_rng(seed)
-    hidden = np.zeros_like(known)
-    room = int(known.sum()) // folds
+    is_under = np.zeros_like(known)
+    room = int(known.sum()) // folds  # pixels that may still come under holes
     for _ in range(_COPIES):
         moved = np.roll(~known, rng.integers(grid.shape), axis=(0, 1))
-        copy = _some_holes(moved & known & ~hidden, room, rng)
-        hidden |= copy
+        copy = _some_holes(moved & known & ~is_under, room, rng)
+        is_under |= copy
         room -= int(copy.sum())
-    if not hidden.any():
+    if not is_under.any():
         return None
-    label, _ = ndimage.label(hidden, _AROUND)
+    label, _ = ndimage.label(is_under, _AROUND)
     return torch.from_numpy(label[grid.row, grid.column])
 
 
 class _PixelGrid(NamedTuple):
-    """The pixels of the depth map that points are of, whose size can differ from the image's."""
+    """The pixels of the depth map that N points are of, whose size can differ from the image's."""
 
     shape: tuple[int, int]
+    """Rows and columns of pixels of the depth map."""
     row: NDArray[np.intp]
-    """(N,) of each point."""
+    """(N,) row of each point's pixel."""
     column: NDArray[np.intp]
-    """(N,) of each point."""
+    """(N,) column of each point's pixel."""
 
     @classmethod
     def of(cls, points: SparsePoints) -> _PixelGrid | None:
-        """Returns the grid of points; None if they are no depth map, or most of it is unknown."""
+        """Returns the pixels of the points; None if they are no depth map, or it is mostly unknown.
+
+        A depth map's rows are about as far apart as its columns, unlike the lines of a scanner.
+        """
         x, y = points.xy.cpu().double().numpy().T
         height, width = points.size
         rows = _PixelAxis.of(y, height)
         columns = _PixelAxis.of(x, width)
         if rows is None or columns is None:
             return None
-        spacings = sorted([rows.spacing, columns.spacing])
-        if spacings[1] > _SQUARE * spacings[0]:
+        smaller, larger = sorted([rows.spacing, columns.spacing])
+        if larger > _SQUARE * smaller:
             return None
         if rows.pixels * columns.pixels > _CELLS * len(points):
             return None
@@ -125,19 +140,28 @@ class _PixelGrid(NamedTuple):
 
 
 class _PixelAxis(NamedTuple):
-    """The rows or the columns of pixels that points are of."""
+    """The rows, or the columns, of the pixels of a depth map that N points are of."""
 
-    spacing: float  # of two pixels, in pixels of the image
-    pixels: int  # how many there are along the axis
-    number: NDArray[np.intp]  # (N,) of each point's pixel
+    spacing: float
+    """Distance of two neighbouring pixels, in pixels of the image."""
+    pixels: int
+    """How many rows or columns there are."""
+    number: NDArray[np.intp]
+    """(N,) number of each point's row or column."""
 
     @classmethod
     def of(cls, coordinate: NDArray[np.float64], length: int) -> _PixelAxis | None:
-        """Returns the axis for the points' coordinate (N,) in an image of this length, or None."""
+        """Returns the rows or columns by the steps between coordinates; None if all are the same.
+
+        Args:
+            coordinate: y (N,) of the points for rows, x for columns, in pixels of the image.
+            length: Height or width of the image.
+        """
         steps = np.diff(np.unique(coordinate))
         if not len(steps):  # all points are on one line
             return None
-        # Areas of pixels scale with the image, as `SparsePoints.resized` moves them.
+        # Pixels are areas: the first one reaches from −0.5 to −0.5 + spacing in the image, as
+        # `SparsePoints.resized` moves coordinates.
         spacing = float(np.median(steps))
         pixels = max(1, round(length / spacing))
         number = ((coordinate + 0.5) / spacing).astype(np.intp).clip(0, pixels - 1)
@@ -145,7 +169,13 @@ class _PixelAxis(NamedTuple):
 
 
 def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """The holes (R, C), or so many whole ones in random order that they have room, in pixels."""
+    """All of the holes (R, C) if they have room, else whole ones in random order that still have.
+
+    Args:
+        holes: Where holes are.
+        room: Number of pixels that holes may have in all.
+        rng: Source of the order.
+    """
     from scipy import ndimage
 
     if holes.sum() <= room:
@@ -164,24 +194,31 @@ def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -
 def _folds_of_cells(
     points: SparsePoints, side: float, folds: int, generator: torch.Generator
 ) -> Tensor:
-    """Folds of whole cells with this side in pixels; 0 has every point in a cell of its own."""
+    """(N,) int64, the fold of each point, where points of one cell of a grid are in one fold.
+
+    Args:
+        points: The N points.
+        side: Side of the square cells in pixels; 0: every point is in a cell of its own.
+        folds: Number of folds.
+        generator: Source of the cells' order.
+    """
     count = len(points)
     if side:
         cells = torch.floor(points.xy.cpu() / side).long()
         _, cell = torch.unique(cells, dim=0, return_inverse=True)
     else:
         cell = torch.arange(count)
-    # The points' positions in a list that has cell after cell, the cells in random order.
+    # Each point's position in a list that has cell after cell, the cells in random order.
     order = torch.randperm(int(cell.max()) + 1, generator=generator)
     position = torch.empty(count, dtype=torch.long)
     position[order[cell].argsort(stable=True)] = torch.arange(count)
-    # The list is cut where a fold is full; a cell is in the fold of its first point.
-    first = torch.full((len(order),), count).scatter_reduce(0, cell, position, "amin")
-    return (first[cell] * folds // count).clamp_max(folds - 1)
+    # The list is cut into folds of equal length; a cell is in the fold of its first point.
+    first_position = torch.full((len(order),), count).scatter_reduce(0, cell, position, "amin")
+    return (first_position[cell] * folds // count).clamp_max(folds - 1)
 
 
 def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> float:
-    """The median distance from pixels to their nearest point.
+    """The median distance in pixels from random pixels to their nearest point.
 
     The pixels are in the box around the middle 96 % of the points: a LiDAR has no points in the
     sky.
@@ -193,7 +230,10 @@ def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> flo
 
 
 def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Generator) -> float:
-    """The median distance from points of the first fold to the nearest of another."""
+    """The median distance in pixels from points of the first fold to the nearest of another.
+
+    ∞ if all points are in the first fold (N,).
+    """
     held_out = fold == 0
     if bool(held_out.all()):
         return math.inf
@@ -202,7 +242,7 @@ def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Gene
 
 
 def _sample(xy: Tensor, generator: torch.Generator) -> Tensor:
-    """At most `_SAMPLED` of the coordinates."""
+    """The coordinates (N, 2), or `_SAMPLED` of them at random if there are more."""
     if len(xy) <= _SAMPLED:
         return xy
     return xy[torch.randperm(len(xy), generator=generator)[:_SAMPLED]]

@@ -80,8 +80,8 @@ _NODES_BETWEEN = 6  # nodes of the grid between two points,
 _NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
 _MAX_STEP_PX = 4  # most between two nodes: on real frames as good as every pixel
 
-DEPTH = 2
-"""Position of the predicted log depth among the features."""
+LOG_DEPTH = 2
+"""Index of the predicted log depth among the features."""
 _FLAT_DEPTH = 1e-3  # added to the standard deviation of log depth: a flat one has no edges
 _FLAT_COLOUR = 1.0  # added to that of CIELAB, likewise
 _LEAST_XYZ = 1e-6  # of which the cube root is taken: below it is not used, and below 0 is NaN
@@ -94,20 +94,30 @@ _XYZ_OF_RGB = (
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """The residual at N points of an image, and the kernel of its Gaussian process."""
+    """The residual at N points of an image, and the kernel of its Gaussian process.
 
-    features: Tensor  # (3 or 6, H, W), see `features_of`
-    points: SparsePoints  # the points at pixel coordinates of the image, on the CPU
-    at: Tensor  # (N, 3 or 6), features at the points
-    residual: Tensor  # (N,) float64, log measured − log predicted depth
-    # Covariance of a Gaussian process; `gaussian_process.fit` chooses it.
-    depth_length: float = 2.5  # length scale of the predicted log depth
-    colour_length: float = 8.0  # length scale of the colour
-    noise: float = 1e-3  # variance of the noise
+    The residual is log measured − log predicted depth. The kernel is the covariance of two places
+    by their features; `gaussian_process.fit` chooses its numbers.
+    """
+
+    features: Tensor
+    """(3 or 6, H, W) features of every pixel, see `features_of`."""
+    points: SparsePoints
+    """The points at pixel coordinates of the image, on the CPU."""
+    point_features: Tensor
+    """(N, 3 or 6) features at the points."""
+    residual: Tensor
+    """(N,) float64 residual at the points."""
+    depth_length: float = 2.5
+    """Length scale of the predicted log depth, in standard deviations over the image."""
+    colour_length: float = 8.0
+    """Length scale of the colour, in standard deviations over the image."""
+    noise: float = 1e-3
+    """Variance of the noise, in units of the variance of the Gaussian process."""
 
     @functools.cached_property
     def fitted(self) -> Residuals:
-        """The residuals with the kernel of smallest leave-one-out error."""
+        """The same residuals with the kernel of smallest leave-one-out error."""
         return fit(self)
 
     @functools.cached_property
@@ -118,16 +128,17 @@ class Residuals:
 
     def scaled(self, features: Tensor) -> Tensor:
         """Returns features (..., 3 or 6) divided by their length scales."""
-        lengths = [1.0, 1.0, self.depth_length]
-        lengths += [self.colour_length] * (features.shape[-1] - 3)
+        lengths = [1.0, 1.0, self.depth_length]  # of x, y and log depth
+        colours = features.shape[-1] - len(lengths)  # 3, or 0 without an image
+        lengths += [self.colour_length] * colours
         return features / features.new_tensor(lengths)
 
     def select(self, mask: Tensor) -> Residuals:
-        """Returns the field with only the points where mask (N,) is true."""
+        """Returns the residuals at only the points where mask, (N,) bool, is true."""
         return replace(
             self,
             points=self.points.select(mask),
-            at=self.at[mask],
+            point_features=self.point_features[mask],
             residual=self.residual[mask],
         )
 
@@ -135,11 +146,12 @@ class Residuals:
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
     """Returns the residuals at the points that lie in the image and have a prediction.
 
-    Of several points at the same coordinates the nearest counts.
+    Of several points at the same coordinates the one of least depth counts.
 
     Args:
-        prediction: (H, W) metres; not positive or not finite is unknown.
-        rgb: (3, H, W) in 0…1, or None.
+        prediction: Depth (H, W) in metres; not positive or not finite is unknown.
+        points: The points, in pixels of the image.
+        rgb: Image (3, H, W) in 0…1; None: colour is no feature.
 
     Raises:
         NoPointsError: No point has a prediction.
@@ -157,28 +169,31 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
     return Residuals(
         features=features,
         points=points,
-        at=_sample(features, points),
+        point_features=_sample(features, points),
         residual=points.depth.double().log() - predicted.log(),
     )
 
 
 def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
-    """Returns (3 or 6, H, W) float32: x and y, predicted log depth, CIELAB colour.
+    """Returns the features (3 or 6, H, W) float32 by which pixels are near or alike.
 
-    x and y are in units of the longer side; depth and colour in standard deviations over the image.
+    They are x, y, predicted log depth and, with an image, the three of CIELAB. x and y are in units
+    of the longer side; depth and colour in standard deviations over the image.
 
     Args:
-        log_depth: (H, W), NaN where unknown.
-        rgb: (3, H, W) in 0…1, or None.
+        log_depth: Predicted log depth (H, W), NaN where unknown.
+        rgb: Image (3, H, W) in 0…1, or None.
     """
     height, width = log_depth.shape
-    y, x = (torch.arange(float(side)) / max(height, width) for side in (height, width))
+    x = torch.arange(float(width)) / max(height, width)
+    y = torch.arange(float(height)) / max(height, width)
     # u: known log depth, of mean 0 and standard deviation 1; 0 where it is unknown.
     known = log_depth.isfinite()
-    values = log_depth if bool(known.all()) else log_depth[known]  # picking pixels is slow
-    values = values.double().flatten()
-    mean = values.mean()
-    std = (values.dot(values) / len(values) - mean.square()).clamp_min(0).sqrt()
+    known_values = log_depth if bool(known.all()) else log_depth[known]  # picking pixels is slow
+    known_values = known_values.double().flatten()
+    mean = known_values.mean()
+    mean_square = known_values.dot(known_values) / len(known_values)
+    std = (mean_square - mean.square()).clamp_min(0).sqrt()
     u = torch.where(known, (log_depth - mean) / (std + _FLAT_DEPTH), 0.0)
     maps = [x.expand(height, width), y[:, None].expand(height, width), u.float()]
     if rgb is not None:
@@ -193,9 +208,12 @@ def _sample(features: Tensor, points: SparsePoints) -> Tensor:
 
 @functools.lru_cache(maxsize=2)
 def _colour(rgb: Tensor) -> Tensor:
-    """CIELAB (3, H, W), its mean 0 and its standard deviation over the image about 1.
+    """CIELAB (3, H, W) of an image (3, H, W), of mean 0 and standard deviation about 1.
 
-    Remembered for the last image, whose residuals are propagated several times, and for a grey one.
+    The standard deviation is the root of the three's variances over the image, summed.
+
+    Remembered for the last two images, by identity: a frame's, whose residuals are propagated
+    several times, and a grey one.
     """
     lab = cielab(rgb)
     lab = lab - lab.mean(dim=(1, 2), keepdim=True)
@@ -204,176 +222,211 @@ def _colour(rgb: Tensor) -> Tensor:
 
 def cielab(rgb: Tensor) -> Tensor:
     """Returns (3, H, W) CIELAB (CIE 1976, white D65) of an sRGB image (3, H, W) in 0…1."""
-    # The numbers are those of sRGB (IEC 61966-2-1) and of CIELAB.
+    # Linear light; the numbers are those of sRGB (IEC 61966-2-1).
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055).clamp_min(0) ** 2.4)
+    # XYZ as fractions of those of white, which are the sums of the matrix's rows.
     matrix = rgb.new_tensor(_XYZ_OF_RGB)
-    # Each row's sum is the white point's, of which XYZ is a fraction here.
     xyz = torch.einsum("ij,jhw->ihw", matrix / matrix.sum(dim=1, keepdim=True), linear)
+    # CIELAB; the numbers are CIE 15's: a cube root, and a line where it would be steep.
     root = xyz.clamp_min(_LEAST_XYZ).pow(1 / 3)
     x, y, z = torch.where(xyz > 216 / 24389, root, xyz * (24389 / 27 / 116) + 16 / 116)
     return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def fit(field: Residuals) -> Residuals:
-    """Returns the field with the kernel of smallest leave-one-out error.
+def fit(residuals: Residuals) -> Residuals:
+    """Returns the same residuals with the kernel of smallest leave-one-out error.
 
     The length scales are chosen first, then the noise: on rendered frames as good as all together.
-    With fewer than 5 points the kernel stays.
+    With fewer than `MIN_POINTS` points the kernel stays.
     """
-    if len(field.points) < MIN_POINTS:
-        return field
-    near = neighbourhoods(field, _MAX_EXACT)
+    if len(residuals.points) < MIN_POINTS:
+        return residuals
+    near = neighbourhoods(residuals, _MAX_EXACT)
 
     def error(candidate: Residuals) -> float:
+        """The mean |error| of log depth at points, each predicted from the others."""
         errors, _ = leave_one_out(candidate, near)
         return float(errors.abs().mean())
 
-    colours = LENGTHS_COLOUR if field.at.shape[1] > 3 else LENGTHS_COLOUR[:1]
-    lengths = product(LENGTHS_DEPTH, colours)
-    best = min((replace(field, depth_length=d, colour_length=c) for d, c in lengths), key=error)
-    noises = [replace(best, noise=noise) for noise in NOISES if noise != best.noise]
-    return min([best, *noises], key=error)
+    # The length scales; without colour, its length has no effect.
+    has_colour = residuals.point_features.shape[1] > 3
+    colour_lengths = LENGTHS_COLOUR if has_colour else LENGTHS_COLOUR[:1]
+    by_lengths = [
+        replace(residuals, depth_length=depth_length, colour_length=colour_length)
+        for depth_length, colour_length in product(LENGTHS_DEPTH, colour_lengths)
+    ]
+    best = min(by_lengths, key=error)
+    # The noise.
+    by_noise = [replace(best, noise=noise) for noise in NOISES if noise != best.noise]
+    return min([best, *by_noise], key=error)
 
 
-def predict(field: Residuals, queries: SparsePoints | None = None) -> Tensor:
+def predict(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
     """Returns the mean residual (H, W) float32 at every pixel, or (M,) at M points' coordinates.
 
-    It is smooth where the prediction is not, so that every pixel's is predicted on a coarser grid.
+    The residual is smooth even where the prediction is not. So every pixel's is interpolated from
+    a coarser grid of pixels.
+
+    Args:
+        residuals: The residuals at the points, with the kernel of a Gaussian process.
+        queries: Points at whose coordinates the residual is wanted. None: every pixel.
     """
     if queries is not None:
-        features = _sample(field.features, queries)
-        if _is_exact(field) or len(field.points) <= NEIGHBOURS:
-            return _solve(field, _all_points(field), features[None])[0]
-        _, near = nearest_points(field.points, queries.xy.double(), NEIGHBOURS)
-        return _solve(field, near, features[:, None])[:, 0]
-    # At every pixel, on a grid.
-    size = field.points.size
-    rows, columns = _steps(field.points)
-    if rows == columns == 1:
-        return _predict_grid(field)
-    coarse = (max(1, round(size[0] / rows)), max(1, round(size[1] / columns)))
-    features = F.interpolate(field.features[None], coarse, mode="area")[0]
-    grid = replace(field, features=features, points=field.points.resized(*coarse))
-    values = _predict_grid(grid)[None, None]
-    return F.interpolate(values, size, mode="bilinear", align_corners=False)[0, 0]
+        features = _sample(residuals.features, queries)
+        if _uses_all_points(residuals) or len(residuals.points) <= NEIGHBOURS:
+            return _solve(residuals, _all_points(residuals), features[None])[0]
+        # Each query is a block of its own, predicted from its nearest points.
+        _, near = nearest_points(residuals.points, queries.xy.double(), NEIGHBOURS)
+        return _solve(residuals, near, features[:, None])[:, 0]
+    # Every pixel's, on a grid with the mean features of several pixels.
+    height, width = residuals.points.size
+    row_step, column_step = _steps(residuals.points)
+    if row_step == 1 and column_step == 1:
+        return _predict_grid(residuals)
+    grid_size = (max(1, round(height / row_step)), max(1, round(width / column_step)))
+    features = F.interpolate(residuals.features[None], grid_size, mode="area")[0]
+    grid = replace(residuals, features=features, points=residuals.points.resized(*grid_size))
+    on_grid = _predict_grid(grid)[None, None]
+    return F.interpolate(on_grid, (height, width), mode="bilinear", align_corners=False)[0, 0]
 
 
 def leave_one_out(
-    field: Residuals, near: Tensor, weight: Tensor | None = None
+    residuals: Residuals, near: Tensor, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Returns error and variance (B, ≤ k) at points predicted from their neighbourhood's others.
+    """Returns error and variance of points, each predicted from the others of its neighbourhood.
 
-    Computed without solving again: Rasmussen and Williams, eq. 5.12.
+    Both are (B, k), or (B, `_INNER`) of the points in the middle where there are several
+    neighbourhoods. The error is the residual minus the predicted one, the variance the predicted
+    one's, in units of the Gaussian process's. They are computed without solving again: Rasmussen
+    and Williams, eq. 5.12.
 
     Args:
-        near: (B, k) numbers of points of each neighbourhood.
-        weight: (N,) 0…1 of each point as a predictor; one of 0 predicts nothing.
+        residuals: The residuals at N points, with the kernel of a Gaussian process.
+        near: Numbers (B, k) of the points of each neighbourhood, the middle one first.
+        weight: Weight (N,) 0…1 of each point as a predictor; one of 0 predicts nothing. None: 1.
     """
-    # A point counts less by more noise of its own.
-    covariance = _systems(field, near).covariance
-    weight = torch.ones_like(field.residual) if weight is None else weight
-    extra_noise = field.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
+    # A point of less weight has more noise of its own: the noise over its squared weight.
+    covariance = _systems(residuals, near).covariance
+    weight = torch.ones_like(residuals.residual) if weight is None else weight
+    extra_noise = residuals.noise * (weight[near].clamp_min(_MIN_SCORED_WEIGHT) ** -2 - 1)
     covariance.diagonal(dim1=1, dim2=2).add_(extra_noise)
     # Errors of all points at once, from the inverse.
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
-    error = (inverse @ field.residual[near][..., None])[..., 0] * variance
+    error = (inverse @ residuals.residual[near][..., None])[..., 0] * variance
     # The points at the edge of a neighbourhood have others outside of it.
     inner = _INNER if near.shape[0] > 1 else None
     return error[:, :inner], (variance - extra_noise)[:, :inner]
 
 
-def neighbourhoods(field: Residuals, max_exact: int) -> Tensor:
-    """Returns (B, k) numbers of points near each other, the middle one first.
+def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:
+    """Returns the numbers (B, k) of the points of B neighbourhoods, the middle one first.
 
-    One neighbourhood of all points, up to `max_exact` of them.
+    Up to `max_exact` points it is one neighbourhood of all points, in their order.
     """
-    count = len(field.points)
+    count = len(residuals.points)
     if count <= max_exact:
-        return _all_points(field)
+        return _all_points(residuals)
     middles = torch.linspace(0, count - 1, _NEIGHBOURHOODS).long()
-    _, near = nearest_points(field.points, field.points.xy[middles].double(), NEIGHBOURS)
+    _, near = nearest_points(residuals.points, residuals.points.xy[middles].double(), NEIGHBOURS)
     return near
 
 
 def _steps(points: SparsePoints) -> tuple[int, int]:
-    """Rows and columns between the nodes of the grid on which the residual is predicted.
+    """How many rows and columns of pixels one node of the grid stands for; 1, 1: it is the pixels.
 
-    Between scan lines, which lie along rows, the rows of nodes may be farther apart.
+    The grid is the one on which the residual is predicted.
     """
-    if points.size[0] * points.size[1] < _WORTH_A_GRID:
+    height, width = points.size
+    if height * width < _WORTH_A_GRID:
         return 1, 1
-    spacing_px = math.sqrt(points.size[0] * points.size[1] / len(points))
+    spacing_px = math.sqrt(height * width / len(points))
     columns = min(_MAX_STEP_PX, max(1, int(spacing_px / _NODES_BETWEEN)))
-    _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
-    rows = min(_MAX_STEP_PX, max(columns, int(across_px / _NODES_BETWEEN_LINES)))
+    # Scan lines lie along rows, so that rows of nodes may be farther apart between them.
+    rows = columns
+    spacing = scan_pattern(points.xy, points.size)
+    if spacing is not None:
+        _, across_px = spacing
+        rows = min(_MAX_STEP_PX, max(columns, int(across_px / _NODES_BETWEEN_LINES)))
     return rows, columns
 
 
-def _predict_grid(field: Residuals) -> Tensor:
-    """The residual (H, W) of the Gaussian process at every pixel of the field's features."""
-    height, width = field.points.size
-    if _is_exact(field):
-        queries = field.features.flatten(1).T.contiguous()[None]
-        return _solve(field, _all_points(field), queries).reshape(height, width)
+def _predict_grid(residuals: Residuals) -> Tensor:
+    """The mean residual (H, W) at every pixel of `residuals.features`, each predicted by itself."""
+    height, width = residuals.points.size
+    if _uses_all_points(residuals):
+        queries = residuals.features.flatten(1).T.contiguous()[None]  # (1, HW, F)
+        return _solve(residuals, _all_points(residuals), queries).reshape(height, width)
     # Two layers of blocks, each of which counts where the other one has its seams.
-    side = _block_side(field.points)
-    values, weight = _predict_blocks(field, side, 0)
-    shifted_values, shifted_weight = _predict_blocks(field, side, side // 2)
+    side = _block_side(residuals.points)
+    values, weight = _predict_blocks(residuals, side, 0)
+    shifted_values, shifted_weight = _predict_blocks(residuals, side, side // 2)
     total = weight + shifted_weight
     return values * (weight / total) + shifted_values * (shifted_weight / total)
 
 
-def _solve(field: Residuals, near: Tensor, queries: Tensor) -> Tensor:
-    """(B, Q) float32: the mean at B × Q features, from points near (B, k)."""
+def _solve(residuals: Residuals, near: Tensor, queries: Tensor) -> Tensor:
+    """The mean residual (B, Q) float32 at Q places of each of B blocks.
+
+    Args:
+        residuals: The residuals at the points, with the kernel of a Gaussian process.
+        near: Numbers (B, k) of the points that predict each block.
+        queries: Features (B, Q, F) of the places.
+    """
     blocks, count = near.shape
     per_block = queries.shape[1]
-    result = queries.new_empty(blocks, per_block)
+    means = queries.new_empty(blocks, per_block)
     # Some blocks at once, or some queries of one block, so that the memory is bounded.
     blocks_at_once = max(1, _AT_ONCE // (per_block * count))
     queries_at_once = max(1, _AT_ONCE // (blocks_at_once * count))
     for first in range(0, blocks, blocks_at_once):
         some_blocks = slice(first, first + blocks_at_once)
-        # α of these blocks, and from it the mean of β₀ and β₁.
-        systems = _systems(field, near[some_blocks])
+        # α of these blocks, and from it the mean of β₀ and β₁, the constant and the slope over u.
+        systems = _systems(residuals, near[some_blocks])
         factor = torch.linalg.cholesky(systems.covariance)
-        alpha = torch.cholesky_solve(field.residual[near[some_blocks]][..., None], factor)
+        alpha = torch.cholesky_solve(residuals.residual[near[some_blocks]][..., None], factor)
         constant = (CONSTANT * alpha[..., 0].sum(1)).float()[:, None]
         slope = (SLOPE * (systems.u * alpha[..., 0]).sum(1)).float()[:, None]
         # mean = k·α + β₀ + β₁·u
         for start in range(0, per_block, queries_at_once):
             some_queries = slice(start, start + queries_at_once)
             features = queries[some_blocks, some_queries]
-            k = _covariance(field.scaled(features), systems.at.float())
+            k = _covariance(residuals.scaled(features), systems.features.float())
             mean = (k @ alpha.float())[..., 0] + constant
-            result[some_blocks, some_queries] = mean + slope * features[..., DEPTH]
-    return result
+            means[some_blocks, some_queries] = mean + slope * features[..., LOG_DEPTH]
+    return means
 
 
 class _Systems(NamedTuple):
-    """The equations of B blocks with k points each."""
+    """The linear equations (K + N) α = r of B blocks with k points each (see this module)."""
 
-    at: Tensor
+    features: Tensor
     """(B, k, F) features of the points over their length scales."""
     u: Tensor
-    """(B, k) predicted log depth."""
+    """(B, k) predicted log depth at the points, in its standard deviations."""
     covariance: Tensor
-    """(B, k, k) covariances of r, with β₀, β₁ and the noise."""
+    """(B, k, k) K + N: covariances of the residual r, of β₀ and β₁ too, and the noise."""
 
 
-def _systems(field: Residuals, near: Tensor) -> _Systems:
-    """The equations of blocks whose points are near (B, k)."""
-    features = field.at[near].double()
-    at = field.scaled(features)
-    u = features[..., DEPTH]
-    covariance = _covariance(at, at).double()
+def _systems(residuals: Residuals, near: Tensor) -> _Systems:
+    """The equations of B blocks; `near` (B, k) are the numbers of the points of each."""
+    features = residuals.point_features[near].double()
+    u = features[..., LOG_DEPTH]
+    scaled = residuals.scaled(features)
+    covariance = _covariance(scaled, scaled).double()
+    # Added in place: the variance of β₁ times u·uᵀ, that of β₀ everywhere, the noise at points.
     covariance.baddbmm_(u[:, :, None], u[:, None, :], alpha=SLOPE).add_(CONSTANT)
-    covariance.diagonal(dim1=1, dim2=2).add_(field.noise)
-    return _Systems(at, u, covariance)
+    covariance.diagonal(dim1=1, dim2=2).add_(residuals.noise)
+    return _Systems(scaled, u, covariance)
 
 
 def _covariance(a: Tensor, b: Tensor) -> Tensor:
-    """exp(−|a − b|) (B, Q, k) float32 of a (B, Q, F) and b (B, k, F), in B blocks."""
+    """exp(−|a − b|), (B, Q, k) float32, for every a and b of each block.
+
+    Args:
+        a: Features (B, Q, F) of Q places in each of B blocks, over their length scales.
+        b: Features (B, k, F) of k points in each block, likewise.
+    """
     # Small numbers, so that the squares cancel well in |a|² + |b|² − 2a·b.
     middle = b.mean(dim=1, keepdim=True)
     a = a - middle
@@ -384,57 +437,68 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
     return closeness
 
 
-def _all_points(field: Residuals) -> Tensor:
-    """(1, N): one block, which has all points."""
-    return torch.arange(len(field.points))[None]
+def _all_points(residuals: Residuals) -> Tensor:
+    """The numbers (1, N) of the points of one block that has all N."""
+    return torch.arange(len(residuals.points))[None]
 
 
-def _is_exact(field: Residuals) -> bool:
-    """Whether every pixel is predicted from all points."""
-    count = len(field.points)
-    height, width = field.points.size
-    small = count <= _MAX_EXACT_SMALL and count * height * width <= _MAX_EXACT_PRODUCT
-    return small or count <= _MAX_EXACT
+def _uses_all_points(residuals: Residuals) -> bool:
+    """Whether points and pixels are so few that every pixel is predicted from all points."""
+    count = len(residuals.points)
+    height, width = residuals.points.size
+    is_small = count * height * width <= _MAX_EXACT_PRODUCT
+    return count <= _MAX_EXACT or (is_small and count <= _MAX_EXACT_SMALL)
 
 
-def _predict_blocks(field: Residuals, side: int, shift: int) -> tuple[Tensor, Tensor]:
-    """(H, W): the mean, predicted block by block, and the pixels' weights.
+def _predict_blocks(residuals: Residuals, side: int, shift: int) -> tuple[Tensor, Tensor]:
+    """The mean residual (H, W), predicted block by block, and the weight (H, W) of each pixel.
 
-    Blocks of side × side pixels, the first of which begins `shift` pixels before the image. A
-    pixel's weight is its distance to the edge of its block.
+    A pixel's weight is its distance to the edge of its block, in pixels.
+
+    Args:
+        residuals: The residuals at the points, with the kernel of a Gaussian process.
+        side: Side of the square blocks in pixels.
+        shift: Pixels by which the first block begins before the image, to the left and above.
     """
-    height, width = field.points.size
+    height, width = residuals.points.size
     rows = math.ceil((height + shift) / side)
     columns = math.ceil((width + shift) / side)
     # The features (rows, columns, side, side, F), block by block; border pixels are repeated.
-    padding = (shift, columns * side - shift - width, shift, rows * side - shift - height)
-    padded = F.pad(field.features[None], padding, mode="replicate")[0]
+    behind = columns * side - shift - width
+    below = rows * side - shift - height
+    padded = F.pad(residuals.features[None], (shift, behind, shift, below), mode="replicate")[0]
     blocks = padded.reshape(-1, rows, side, columns, side).permute(1, 3, 2, 4, 0)
-    # The mean in each block, from the points nearest to its middle.
-    middles = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
-    _, near = nearest_points(field.points, (middles + 0.5) * side - 0.5 - shift, NEIGHBOURS)
-    values = _solve(field, near, blocks.reshape(rows * columns, side * side, -1))
+    # The mean in each block, from the points nearest to its middle (x, y).
+    numbers = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).double()
+    middles = (numbers + 0.5) * side - 0.5 - shift
+    _, near = nearest_points(residuals.points, middles, NEIGHBOURS)
+    values = _solve(residuals, near, blocks.reshape(rows * columns, side * side, -1))
     # The blocks side by side.
     values = values.reshape(rows, columns, side, side).permute(0, 2, 1, 3)
     values = values.reshape(rows * side, columns * side)
-    # How far pixels are inside their blocks.
+    # How far pixels are inside their blocks, by rows, by columns and by both.
     position = torch.arange(float(side)) + 0.5
     inside = torch.minimum(position, side - position)
-    y = inside.repeat(rows)[shift:]
-    x = inside.repeat(columns)[shift:]
-    weight = torch.minimum(y[:height, None], x[None, :width])
+    by_row = inside.repeat(rows)[shift : shift + height]
+    by_column = inside.repeat(columns)[shift : shift + width]
+    weight = torch.minimum(by_row[:, None], by_column[None, :])
     return values[shift : shift + height, shift : shift + width], weight
 
 
 def _block_side(points: SparsePoints) -> int:
-    """The largest side in pixels for which nearly no block has too many points."""
+    """The largest side of blocks in pixels for which nearly no block has too many points.
+
+    A block has too many if it contains more than 1 / `_IN_BLOCK` of the points that predict it.
+    """
     side = max(points.size)
     x, y = points.xy.unbind(1)
     while side > _MIN_BLOCK_PX:
-        cell = (y / side).floor().clamp_min(0) * points.size[1] + (x / side).floor().clamp_min(0)
-        count = torch.bincount(cell.long())
-        crowded = count[count > NEIGHBOURS / _IN_BLOCK].sum()
-        if float(crowded) <= _CROWDED * len(points):
+        # How many points are in each block; there are never more columns of blocks than of pixels.
+        row = (y / side).floor().clamp_min(0)
+        column = (x / side).floor().clamp_min(0)
+        count = torch.bincount((row * points.size[1] + column).long())
+        points_in_crowds = count[count > NEIGHBOURS / _IN_BLOCK].sum()
+        if float(points_in_crowds) <= _CROWDED * len(points):
             break
         side = max(_MIN_BLOCK_PX, round(side / _BLOCK_SHRINKS))
     return side

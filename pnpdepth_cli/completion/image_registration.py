@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -45,7 +46,7 @@ CHANCE = 3.0
 So the best of all registrations must have it for one frame, and twice it for more."""
 
 _LEAST_MOVED = 0.02
-"""Root mean square, of the image's longer side, by which a registration moves pixels at least.
+"""Root mean square, over the image's longer side, by which a registration moves pixels at least.
 
 Colour and depth of one frame are not exposed at the same time. Where the camera turns fast, that
 moves the images of a registered camera by 0.01 to 0.02, rarely 0.034, another way in each frame
@@ -58,48 +59,80 @@ _TURNED_MORE = 5.0
 """By how much it must exceed the evidence for the image as it is."""
 
 # What is searched, and the prior of it.
-_ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))  # 0.67 to 1.49
-_LARGEST_SHIFT = 0.05  # of the image's sides
-_ZOOM_SCALE = 0.07  # of Laplace's prior of the log zoom
-_SHIFT_SIGMA = 0.025  # standard deviation of the prior of the shift, of the image's sides
+_ZOOMS = np.exp(np.linspace(-0.4, 0.4, 81))
+"""Zooms that are tried, 0.67 to 1.49."""
+_LARGEST_SHIFT = 0.05
+"""Shift that is tried, at most, over the image's sides."""
+_ZOOM_SCALE = 0.07
+"""Scale of Laplace's prior of the log zoom."""
+_SHIFT_SIGMA = 0.025
+"""Standard deviation of the normal prior of the shift, over the image's sides."""
 
 # The points and the image that are used.
-_LONGEST_PX = 320  # the image is reduced to this size
-_MIN_POINTS = 10  # fewer tell nothing
-_MOST_POINTS = 2000  # of more, so many evenly spaced ones are used
-_LEAST_HULL = 0.5  # of the image's area; points of one part say little of the zoom
-_MOST_AT_EDGES = 4.0  # standard errors; points on edges of the image were found in the image
-_LONGEST_PAIR = 0.95  # quantile of the distances between neighbouring points
-_STEPS = 12  # samples between two points
-_JUMP = 0.15  # of log depth between two neighbouring points
+_LONGEST_PX = 320
+"""Longer side of the reduced image; a smaller image stays."""
+_MIN_POINTS = 10
+"""Fewer points tell nothing."""
+_MOST_POINTS = 2000
+"""Of more points, so many evenly spaced ones are used."""
+_LEAST_HULL = 0.5
+"""Area of the points' hull over the image's, at least: points of one part say little of the zoom"""
+_MOST_AT_EDGES = 4.0
+"""Standard errors of the mean edge strength at points; above, they were found in the image."""
+_LONGEST_PAIR = 0.95
+"""Quantile of the distances between neighbouring points, up to which pairs are used."""
+_STEPS = 12
+"""Samples between two points."""
+_JUMP = 0.15
+"""Change of log depth between two neighbouring points above which it is a jump."""
 _LEAST_SHORT = 1 / 3
 """Share of the jumps that lie between points nearer to each other than half of all neighbours are.
 
 It is 0.39 to 0.58 in the maps of five RGB-D sets. It is 0 to 0.28 where points within 8 px of the
 jumps are missing, as of phones whose depth of low confidence is dropped. The points that are left
 tell nothing of where in between the jump is."""
-_SMALLEST_CHANGE = 0.03  # of log depth; smaller ones are noise
-_LENGTH_OFFSET = 0.1  # pixels of the reduced image, so that a length has a logarithm
-_LEAST_SPREAD = 0.4  # standard deviation of the log of that change; a noisy wall has 0.4, rooms 0.6
-_LARGEST_EVIDENCE = 2.5  # standard deviations
-_LEAST_CONTRAST = 0.02  # of an image with edges
+_SMALLEST_CHANGE = 0.03
+"""Change of log depth between two points that is added to all; smaller ones are noise."""
+_LENGTH_OFFSET = 0.1
+"""Pixels of the reduced image that are added to a length, so that it has a logarithm."""
+_LEAST_SPREAD = 0.4
+"""Standard deviation of the log of that change, at least; a noisy wall has 0.4, rooms 0.6."""
+_LARGEST_EVIDENCE = 2.5
+"""Standard deviations of that log beyond which a pair counts no more."""
+_LEAST_CONTRAST = 0.02
+"""Range of the values 0…1 of an image with edges."""
 
 # Edges of the image: standard deviations of Gaussians in pixels of the reduced image.
-_EDGE_SIGMA = 1.0  # before the gradient is taken
-_EDGE_REACH = 8.0  # of the surroundings that an edge's strength is relative to
-_EDGE_BAND = 6.0  # of the mean that is taken off
+_EDGE_SIGMA = 1.0
+"""Of the blur before the gradient is taken."""
+_EDGE_REACH = 8.0
+"""Of the surroundings that an edge's strength is relative to."""
+_EDGE_BAND = 6.0
+"""Of the mean that is taken off."""
+_FAINT_EDGE = 0.01
+"""Strength that is added to the surroundings': where there is nothing, noise is no edge."""
+_TINY = 1e-9
+"""Added to what is divided by, so that this is not 0."""
 
-# What must be better all over the image.
-_PARTS = (24, 32)  # rows and columns of parts of the image
-_LEAST_STANDING = 2.4  # standard errors of the gain of a registration, with 500 points a frame
-_MORE_STANDING = 1.66  # of it for each e-fold of more points, which see more of chance as well
+# What must be better all over the image (docs/notes/registration.md, "What is better all over the
+# image").
+_PARTS = (24, 32)
+"""Rows and columns of parts of the image."""
+_LEAST_STANDING = 2.4
+"""Standard errors of the gain of a registration, at least, with `_POINTS_OF_STANDING` a frame."""
+_MORE_STANDING = 1.66
+"""By how much it is more for each e-fold of more points, which see more of chance as well."""
 _POINTS_OF_STANDING = 500
 
 # What the correlation of edges and changes of depth tells.
-_WEIGHT = 0.1  # log likelihood per unit of it
-_INDEPENDENT = 37.0  # norm of the evidence from which pairs are no longer independent
-_NO_EVIDENCE = 25  # points that tell nothing
-_EVIDENCE = 0.85  # standard deviations that each e-fold of more points tells
+_WEIGHT = 0.1
+"""Log likelihood per unit of the correlation."""
+_INDEPENDENT = 37.0
+"""Norm of the pairs' weights from which pairs are no longer independent."""
+_NO_EVIDENCE = 25
+"""Points that tell nothing."""
+_EVIDENCE = 0.85
+"""Standard deviations that each e-fold of more points tells."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,15 +142,22 @@ class ImageRegistration:
     The colour of pixel x is at c + zoom (x − c) + (right, down), where c is the image's centre.
     """
 
-    zoom: float  # ratio of the focal lengths, image over depth
-    right: float  # shift in pixels, as `down`
+    zoom: float
+    """Ratio of the focal lengths, image over depth."""
+    right: float
+    """Shift to the right in pixels of the image."""
     down: float
+    """Shift downwards in pixels of the image."""
 
     def __str__(self) -> str:
         return f"{self.zoom:.3f},{self.right:.1f},{self.down:.1f}"
 
     def apply_to(self, rgb: Image) -> Image:
-        """Returns the image (H, W, 3) at the pixels of the depth camera, its border repeated."""
+        """Returns the image as the depth camera would see it, its border repeated.
+
+        Args:
+            rgb: Image (H, W, 3); another number of channels, or none, will do.
+        """
         height, width = rgb.shape[:2]
         # The matrix leads from a pixel of the result to where its colour is.
         x, y = (1 - self.zoom) * np.array([width - 1, height - 1]) / 2 + (self.right, self.down)
@@ -131,116 +171,153 @@ class ImageRegistration:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What one frame tells of the registration, at the reduced size."""
+    """What one frame tells of the registration of its image.
 
-    edges: Image  # (h, w) strength of the image's edges
-    between: Floats  # (S, 2) x and y of samples between neighbouring points
+    Positions are x and y in the reduced image, whose left and upper edges are 0. Between two
+    neighbouring points are samples; where depth changes between the two, the image should have
+    edges at the samples.
+    """
+
+    edges: Image
+    """(h, w) strength of the reduced image's edges, of mean 0 and standard deviation 1."""
+    between: Floats
+    """(S, 2) positions of samples between neighbouring points."""
     weight: Floats
-    """(S,) log likelihood per unit of edge strength, by how much depth changes there."""
-    size: tuple[int, int]  # (H, W) of the image
-    points: int  # number of points
-    jumps: int  # number of pairs of neighbouring points across a jump of depth
+    """(S,) log likelihood of each sample per unit of edge strength; the more depth changes between
+    the two points, the larger, and below 0 where it changes little."""
+    size: tuple[int, int]
+    """(H, W) of the image before it was reduced."""
+    points: int
+    """Number of points."""
+    jumps: int
+    """Number of pairs of neighbouring points across a jump of depth."""
     short_jumps: int
     """Number of these that are short: all pairs as short have half of the length of all pairs."""
 
     def log_likelihood(self, zoom: float) -> Floats:
-        """Returns (rows, columns), the log likelihood of each shift in pixels of the reduced image.
+        """Returns (rows, columns), the log likelihood of registrations with this zoom by shift.
 
-        Edges outside the image have strength 0.
+        Element (i, j) is that of the shift by i − rows // 2 down and j − columns // 2 to the right,
+        in pixels of the reduced image. Edges outside the image have strength 0.
         """
-        reach = np.rint(_LARGEST_SHIFT * np.array(self.edges.shape)).astype(np.intp)
-        centre = np.array(self.edges.shape[::-1]) / 2
-        rows, columns = self.edges.shape + 2 * reach
+        rows, columns = self.edges.shape
+        most_down = round(_LARGEST_SHIFT * rows)
+        most_right = round(_LARGEST_SHIFT * columns)
         # The weights at their pixels of a map that has the image in its middle.
-        x, y = np.floor((self.between - centre) * zoom + centre).astype(np.intp).T
-        x = x + reach[1]
-        y = y + reach[0]
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        drawn = np.bincount((y * columns + x)[inside], self.weight[inside], rows * columns)
-        template = drawn.reshape(rows, columns).astype(np.float32)
-        # Their correlation with the edges at all shifts.
-        top, left = (int(n) for n in 2 * reach)
+        map_rows = rows + 2 * most_down
+        map_columns = columns + 2 * most_right
+        x, y = self._zoomed_pixels(zoom).T
+        x = x + most_right
+        y = y + most_down
+        inside = (x >= 0) & (x < map_columns) & (y >= 0) & (y < map_rows)
+        pixel = (y * map_columns + x)[inside]
+        weights = np.bincount(pixel, self.weight[inside], map_rows * map_columns)
+        template = weights.reshape(map_rows, map_columns).astype(np.float32)
+        # Their correlation with the edges at all shifts, from −most to +most.
+        top = 2 * most_down
+        left = 2 * most_right
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
         return cv2.matchTemplate(padded, template, cv2.TM_CCORR).astype(np.float64)
 
     def gain(self, zoom: float, right: int, down: int) -> Floats:
-        """Returns the gain in log likelihood by a registration in each of the parts of the image.
+        """Returns (P,), by how much a registration's log likelihood exceeds that of none.
+
+        It is the sum over the samples in each of P parts of the image, row after row (`_PARTS`).
 
         Args:
-            zoom: Its zoom.
-            right: Its shift in pixels of the reduced image, as `down`.
-            down: The other shift.
+            zoom: Zoom of the registration.
+            right: Shift to the right in pixels of the reduced image.
+            down: Shift downwards, likewise.
         """
-        of_samples = self._of_samples(zoom, right, down) - self._of_samples(1.0, 0, 0)
+        of_samples = self._sample_likelihoods(zoom, right, down)
+        of_samples = of_samples - self._sample_likelihoods(1.0, 0, 0)
+        # The part that each sample is in.
         rows, columns = self.edges.shape
-        y = (self.between[:, 1] * _PARTS[0] / rows).astype(np.intp).clip(0, _PARTS[0] - 1)
-        x = (self.between[:, 0] * _PARTS[1] / columns).astype(np.intp).clip(0, _PARTS[1] - 1)
-        gains = np.bincount(y * _PARTS[1] + x, of_samples, _PARTS[0] * _PARTS[1])
+        part_rows, part_columns = _PARTS
+        row = (self.between[:, 1] * part_rows / rows).astype(np.intp).clip(0, part_rows - 1)
+        column = (self.between[:, 0] * part_columns / columns).astype(np.intp)
+        column = column.clip(0, part_columns - 1)
+        gains = np.bincount(row * part_columns + column, of_samples, part_rows * part_columns)
         return np.asarray(gains, np.float64)
 
-    def _of_samples(self, zoom: float, right: int, down: int) -> Floats:
-        """(S,) the log likelihood of each sample."""
+    def _sample_likelihoods(self, zoom: float, right: int, down: int) -> Floats:
+        """(S,) the log likelihood of each sample by a registration; arguments as of `gain`."""
+        rows, columns = self.edges.shape
+        x, y = (self._zoomed_pixels(zoom) + np.array([right, down])).T
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        strength = self.edges[y.clip(0, rows - 1), x.clip(0, columns - 1)]
+        return np.where(inside, strength * self.weight, 0.0)
+
+    def _zoomed_pixels(self, zoom: float) -> NDArray[np.intp]:
+        """(S, 2) column and row of the samples' pixels, zoomed from the image's centre."""
         rows, columns = self.edges.shape
         centre = np.array([columns, rows]) / 2
-        moved = np.floor((self.between - centre) * zoom + centre).astype(np.intp)
-        x, y = (moved + np.array([right, down])).T
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        seen = self.edges[y.clip(0, rows - 1), x.clip(0, columns - 1)]
-        return np.where(inside, seen * self.weight, 0.0)
+        return np.floor((self.between - centre) * zoom + centre).astype(np.intp)
 
 
 def evidence(rgb: Image, points: SparsePoints) -> Evidence | None:
     """Returns what the frame tells of the registration of its image.
 
-    Args:
-        rgb: (H, W, 3) in 0…1.
+    None where it tells nothing: the points are too few, in a part of the image only, scan lines of
+    a LiDAR, or were matched in the image, as SfM points are; or image or depth are flat.
 
-    Returns:
-        The evidence. None where the points tell nothing: they are too few, in a part of the image
-        only, scan lines of a LiDAR, or were matched in the image, as SfM points are.
+    Args:
+        rgb: Image (H, W, 3) in 0…1.
+        points: Points of the frame, on the CPU.
     """
     xy = points.xy.double().numpy()
     depth = points.depth.double().numpy()
-    if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size):
+    if len(xy) < _MIN_POINTS or scan_pattern(xy, points.size) is not None:
         return None
     if len(xy) > _MOST_POINTS:
-        chosen = np.linspace(0, len(xy) - 1, _MOST_POINTS).astype(np.intp)
-        xy, depth = xy[chosen], depth[chosen]
+        used = np.linspace(0, len(xy) - 1, _MOST_POINTS).astype(np.intp)
+        xy = xy[used]
+        depth = depth[used]
     # They must spread over the image.
+    height, width = points.size
     hull = cv2.convexHull(xy.astype(np.float32))
-    if cv2.contourArea(hull) < _LEAST_HULL * points.size[0] * points.size[1]:
+    if cv2.contourArea(hull) < _LEAST_HULL * height * width:
         return None
     # The edges of the image, at a reduced size.
-    scale = min(1.0, _LONGEST_PX / max(points.size))
-    rows, columns = (round(side * scale) for side in points.size)
+    scale = _reduction(points.size)
+    rows = round(height * scale)
+    columns = round(width * scale)
     small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
     if np.ptp(small) < _LEAST_CONTRAST:
         return None
     edges = _edges(np.asarray(small, np.float32))
-    # Points that lie on edges were matched in the image.
-    at = (xy + 0.5) * scale
-    x, y = at.astype(np.intp).T
-    at_edges = edges[y.clip(0, rows - 1), x.clip(0, columns - 1)].mean() * np.sqrt(len(at))
-    if at_edges > _MOST_AT_EDGES:
+    # Points that lie on edges were matched in the image. Edges have mean 0 and deviation 1.
+    positions = (xy + 0.5) * scale
+    x, y = positions.astype(np.intp).T
+    at_points = edges[y.clip(0, rows - 1), x.clip(0, columns - 1)]
+    if at_points.mean() * np.sqrt(len(positions)) > _MOST_AT_EDGES:
         return None
     # Pairs of neighbouring points, and by how much log depth changes between the two.
-    pairs, length = _neighbours(at)
+    pairs, length = _neighbours(positions)
     change = np.abs(np.diff(np.log(depth)[pairs], axis=1)[:, 0])
     weight = _weights_of_pairs(change, length)
     if weight is None:
         return None
     # Samples between the two points of each pair, and jumps of depth.
-    step = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]
-    jumps = change > _JUMP
+    fraction = ((np.arange(_STEPS) + 0.5) / _STEPS)[None, :, None]  # of the way, (1, _STEPS, 1)
+    ends = positions[pairs]  # (M, 2, 2): pair, end, x and y
+    between = ends[:, :1] * (1 - fraction) + ends[:, 1:] * fraction
+    is_jump = change > _JUMP
+    is_short = length < _length_of_half(length)
     return Evidence(
         edges=edges,
-        between=(at[pairs][:, :1] * (1 - step) + at[pairs][:, 1:] * step).reshape(-1, 2),
+        between=between.reshape(-1, 2),
         weight=np.repeat(weight / _STEPS, _STEPS),
         size=points.size,
         points=len(xy),
-        jumps=int(jumps.sum()),
-        short_jumps=int((jumps & (length < _length_of_half(length))).sum()),
+        jumps=int(is_jump.sum()),
+        short_jumps=int((is_jump & is_short).sum()),
     )
+
+
+def _reduction(size: tuple[int, int]) -> float:
+    """The factor by which an image (H, W) is reduced, at most 1."""
+    return min(1.0, _LONGEST_PX / max(size))
 
 
 def _weights_of_pairs(change: Floats, length: Floats) -> Floats | None:
@@ -248,63 +325,92 @@ def _weights_of_pairs(change: Floats, length: Floats) -> Floats | None:
 
     It follows by how many standard deviations log depth changes more than at other pairs of that
     length. None where that is about the same everywhere, such as of a wall.
+
+    Args:
+        change: |Difference| (M,) of log depth between the two points.
+        length: Distance (M,) of the two in pixels of the reduced image.
     """
-    # The change that is usual at a length, by least squares in logarithms.
+    # The change that is usual at a length, by least squares in logarithms, and what exceeds it.
     terms = np.stack([np.ones_like(length), np.log(length + _LENGTH_OFFSET)], axis=1)
     log_change = np.log(change + _SMALLEST_CHANGE)
-    rest = log_change - terms @ np.linalg.lstsq(terms, log_change, rcond=None)[0]
-    if rest.std() < _LEAST_SPREAD:
+    excess = log_change - terms @ np.linalg.lstsq(terms, log_change, rcond=None)[0]
+    if excess.std() < _LEAST_SPREAD:
         return None
-    weight = (rest / rest.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
+    weight = (excess / excess.std()).clip(-_LARGEST_EVIDENCE, _LARGEST_EVIDENCE)
     weight -= weight.mean()
+    # Many pairs see the same edges, so that their evidence is bounded.
     weight *= _WEIGHT * min(1.0, _INDEPENDENT / float(np.linalg.norm(weight)))
     return np.asarray(weight)
 
 
 def _length_of_half(length: Floats) -> float:
-    """The length up to which pairs have half of the length of all pairs (M,)."""
+    """The length up to which pairs, of lengths (M,), have half of the summed length of all."""
     ordered = np.sort(length)
     return float(ordered[np.searchsorted(ordered.cumsum(), ordered.sum() / 2)])
 
 
 def better_orientation(frames: Sequence[Evidence]) -> str | None:
-    """Returns how the depth of frames of one size is turned or mirrored against the image, or None.
+    """Returns how depth is turned or mirrored against the image, in words; None if it is not.
 
-    None also where the image belongs to its points as it is, and where the evidence for another
-    orientation is no better than chance.
+    None also where the evidence for another orientation is no better than chance.
+
+    Args:
+        frames: Evidence of one frame or more, all of one size.
     """
-    height, width = frames[0].size
-    scale = min(1.0, _LONGEST_PX / max(height, width))
-    right = width * scale  # edges of the reduced image
-    bottom = height * scale
-
-    def factor(orient: Callable[[Floats], Floats]) -> float:
-        """Evidence that the depth belongs to the image when its positions are turned like this."""
-        turned = [replace(frame, between=orient(frame.between)) for frame in frames]
-        maps = [frame.log_likelihood(1.0) for frame in turned]
-        return _bayes_factor(frames, maps, tuple(count // 2 for count in maps[0].shape))
-
-    as_it_is = factor(lambda at: at)
+    as_it_is = _orientation_factor(frames, _unchanged)
     if as_it_is > REGISTERED:
         return None
-    # What else it can be; sides are exchanged only where they are equal.
-    across = np.array([right, 0.0])
-    down = np.array([0.0, bottom])
-    orientations: dict[str, Callable[[Floats], Floats]] = {
-        "mirrored left to right": lambda at: np.abs(across - at),
-        "upside down, its rows from the bottom up": lambda at: np.abs(down - at),
-        "turned by 180°": lambda at: across + down - at,
+    factors = {
+        words: _orientation_factor(frames, orient)
+        for words, orient in _orientations(frames[0].size).items()
+    }
+    best = max(factors, key=lambda words: factors[words])
+    return best if factors[best] > max(_TURNED, as_it_is + _TURNED_MORE) else None
+
+
+_Orient = Callable[[Floats], Floats]
+"""Takes positions (S, 2), x and y in the reduced image, to where they are if depth was turned."""
+
+
+def _unchanged(xy: Floats) -> Floats:
+    """The positions themselves."""
+    return xy
+
+
+def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
+    """Where positions in an image (H, W) are if its depth is turned or mirrored, by words for it.
+
+    x and y are exchanged only in a square image.
+    """
+    height, width = size
+    right = width * _reduction(size)  # edges of the reduced image
+    bottom = height * _reduction(size)
+    corner = np.array([right, bottom])
+    orientations: dict[str, _Orient] = {
+        "mirrored left to right": lambda xy: np.abs(np.array([right, 0.0]) - xy),
+        "upside down, its rows from the bottom up": lambda xy: np.abs(np.array([0.0, bottom]) - xy),
+        "turned by 180°": lambda xy: corner - xy,
     }
     if height == width:
         orientations |= {
-            "turned by 90°": lambda at: np.column_stack([bottom - at[:, 1], at[:, 0]]),
-            "turned by −90°": lambda at: np.column_stack([at[:, 1], right - at[:, 0]]),
-            "with x and y exchanged": lambda at: at[:, ::-1],
-            "with x and y exchanged, and turned by 180°": lambda at: (across + down - at)[:, ::-1],
+            "turned by 90°": lambda xy: np.column_stack([bottom - xy[:, 1], xy[:, 0]]),
+            "turned by −90°": lambda xy: np.column_stack([xy[:, 1], right - xy[:, 0]]),
+            "with x and y exchanged": lambda xy: xy[:, ::-1],
+            "with x and y exchanged, and turned by 180°": lambda xy: (corner - xy)[:, ::-1],
         }
-    factors = {text: factor(orient) for text, orient in orientations.items()}
-    best = max(factors, key=lambda text: factors[text])
-    return best if factors[best] > max(_TURNED, as_it_is + _TURNED_MORE) else None
+    return orientations
+
+
+def _orientation_factor(frames: Sequence[Evidence], orient: _Orient) -> float:
+    """The log of the Bayes factor over chance of images that belong to their depth turned so."""
+    maps = [replace(frame, between=orient(frame.between)).log_likelihood(1.0) for frame in frames]
+    return _bayes_factor(frames, maps, _no_shift(maps[0]))
+
+
+def _no_shift(log_likelihood: Floats) -> tuple[int, int]:
+    """The index of the shift by 0 in a map of `Evidence.log_likelihood`: its middle."""
+    rows, columns = log_likelihood.shape
+    return rows // 2, columns // 2
 
 
 def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistration | None:
@@ -316,7 +422,7 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
 
     Args:
         frames: Evidence of the frames; None of a frame that tells nothing. The first decides the
-            size.
+            size; frames of another one are left out.
     """
     telling = [frame for frame in frames if frame is not None]
     usable = [frame for frame in telling if frame.size == telling[0].size]
@@ -328,48 +434,81 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
         return None
     # An image that belongs to its points as it is stays.
     unmoved = [frame.log_likelihood(1.0) for frame in usable]
-    middle = tuple(count // 2 for count in unmoved[0].shape)
-    if _bayes_factor(usable, unmoved, middle) > REGISTERED:
+    no_shift = _no_shift(unmoved[0])
+    if _bayes_factor(usable, unmoved, no_shift) > REGISTERED:
         return None
     # Depth that is mirrored or turned is no matter of zoom and shift.
     if better_orientation(usable) is not None:
         return None
-    # The posterior over zoom, down and right: likelihood of all frames, and prior.
-    total = np.stack(
-        [np.sum([frame.log_likelihood(zoom) for frame in usable], axis=0) for zoom in _ZOOMS]
-    )
-    height, width = usable[0].size
-    scale = min(1.0, _LONGEST_PX / max(height, width))
-    down, right = ((np.arange(count) - count // 2) / scale for count in total.shape[1:])
-    prior = (
+    # All registrations together must be far better than none.
+    posterior = _posterior(usable)
+    of_none = sum(float(by_shift[no_shift]) for by_shift in unmoved)
+    if logsumexp(posterior.logits) - of_none < FOUND:
+        return None
+    # The best registration must be better than chance.
+    number, row, column = np.unravel_index(posterior.logits.argmax(), posterior.logits.shape)
+    best_zoom = float(_ZOOMS[number])
+    maps = [frame.log_likelihood(best_zoom) for frame in usable]
+    if _bayes_factor(usable, maps, (int(row), int(column))) < CHANCE * min(len(usable), 2):
+        return None
+    # It must be better in most parts of the image, not by a few edges.
+    best_right = int(column) - no_shift[1]
+    best_down = int(row) - no_shift[0]
+    if not _is_spread(usable, best_zoom, best_right, best_down):
+        return None
+    # The mean must be more than what moves the images of a registered camera that turns.
+    mean = posterior.mean()
+    size = usable[0].size
+    return mean if _moves_px(mean, size) >= _LEAST_MOVED * max(size) else None
+
+
+class _Posterior(NamedTuple):
+    """The probabilities of registrations, given some frames."""
+
+    logits: Floats
+    """(Z, rows, columns) log of likelihood × prior for each of `_ZOOMS` and each shift."""
+    down: Floats
+    """(rows,) shifts downwards in pixels of the image."""
+    right: Floats
+    """(columns,) shifts to the right in pixels of the image."""
+
+    def mean(self) -> ImageRegistration:
+        """Returns the mean zoom and the mean shift, rounded to what is shown."""
+        probability = np.exp(self.logits - logsumexp(self.logits))
+        return ImageRegistration(
+            zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
+            right=round(float(self.right @ probability.sum((0, 1))), 2),
+            down=round(float(self.down @ probability.sum((0, 2))), 2),
+        )
+
+
+def _posterior(frames: Sequence[Evidence]) -> _Posterior:
+    """The posterior over zoom and shift, given frames of one size."""
+    # The log likelihood of all frames together.
+    by_zoom = [np.sum([frame.log_likelihood(zoom) for frame in frames], axis=0) for zoom in _ZOOMS]
+    log_likelihood = np.stack(by_zoom)
+    # The shifts that the elements of a map are of.
+    height, width = frames[0].size
+    scale = _reduction(frames[0].size)
+    _, rows, columns = log_likelihood.shape
+    down = (np.arange(rows) - rows // 2) / scale
+    right = (np.arange(columns) - columns // 2) / scale
+    # Minus the log of the prior, up to a constant: Laplace's of the log zoom, normal of the shift.
+    penalty = (
         (np.abs(np.log(_ZOOMS)) / _ZOOM_SCALE)[:, None, None]
         + ((down / height / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
         + ((right / width / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
-    logits = total - prior - logsumexp(-prior)
-    # It must be far better than no registration.
-    if logsumexp(logits) - sum(float(by_shift[middle]) for by_shift in unmoved) < FOUND:
-        return None
-    # The best registration must be better than chance.
-    number, *place = np.unravel_index(logits.argmax(), logits.shape)
-    maps = [frame.log_likelihood(float(_ZOOMS[number])) for frame in usable]
-    if _bayes_factor(usable, maps, tuple(place)) < CHANCE * min(len(usable), 2):
-        return None
-    # It must be better in most parts of the image, not by a few edges.
-    best_down, best_right = (int(n) - half for n, half in zip(place, middle, strict=True))
-    if not _is_spread(usable, float(_ZOOMS[number]), best_right, best_down):
-        return None
-    # The posterior's mean.
-    probability = np.exp(logits - logsumexp(logits))
-    found = ImageRegistration(
-        zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
-        right=round(float(right @ probability.sum((0, 1))), 2),
-        down=round(float(down @ probability.sum((0, 2))), 2),
-    )
-    # It must be more than what moves the images of a registered camera that turns.
-    of_zoom = (found.zoom - 1) * np.hypot(height, width) / np.sqrt(12)
-    moved = np.sqrt(of_zoom**2 + found.right**2 + found.down**2)
-    return found if moved >= _LEAST_MOVED * max(height, width) else None
+    logits = log_likelihood - penalty - logsumexp(-penalty)
+    return _Posterior(logits, down, right)
+
+
+def _moves_px(registration: ImageRegistration, size: tuple[int, int]) -> float:
+    """By how many pixels a registration moves those of an image (H, W), as root mean square."""
+    height, width = size
+    # Pixels are hypot(H, W) / √12 from the image's centre in root mean square.
+    by_zoom = (registration.zoom - 1) * np.hypot(height, width) / np.sqrt(12)
+    return float(np.sqrt(by_zoom**2 + registration.right**2 + registration.down**2))
 
 
 def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -> bool:
@@ -378,53 +517,75 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
     Neighbouring points see the same edges, so their gains are not independent; those of parts of
     the image are. By chance their sum is 0 ± the root of the sum of their squares. A part is that
     of all frames: many frames of a still scene are no more evidence than one.
+
+    Args:
+        frames: Evidence of the frames.
+        zoom: Zoom of the registration.
+        right: Shift to the right in pixels of the reduced image.
+        down: Shift downwards, likewise.
     """
     gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
-    standing = gains.sum() / (np.linalg.norm(gains) + 1e-9)
+    standing = gains.sum() / (np.linalg.norm(gains) + _TINY)
     points = np.mean([frame.points for frame in frames])
     more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
     return bool(standing >= _LEAST_STANDING + more)
 
 
 def _bayes_factor(
-    frames: Sequence[Evidence], maps: Sequence[Floats], place: tuple[int | np.intp, ...]
+    frames: Sequence[Evidence], maps: Sequence[Floats], shift: tuple[int, int]
 ) -> float:
     """Log of the Bayes factor of images that belong to their points at one shift over chance.
 
     The log likelihood there exceeds its mean over all shifts by so many standard deviations. For an
     unrelated image these are 0 ± 1. For one that belongs there they grow with the logarithm of the
     number of points (even frames of 7-Scenes and ICL-NUIM).
+
+    Args:
+        frames: Evidence of the frames.
+        maps: Log likelihood (rows, columns) of each frame by shift.
+        shift: Row and column of the shift in the maps.
     """
     standing = np.array(
-        [(by_shift[place] - by_shift.mean()) / (by_shift.std() + 1e-9) for by_shift in maps]
+        [(by_shift[shift] - by_shift.mean()) / (by_shift.std() + _TINY) for by_shift in maps]
     )
     points = np.array([frame.points for frame in frames])
+    # The log of N(standing; expected, 1) over N(standing; 0, 1), summed over the frames.
     expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
     return float(np.sum(expected * (standing - expected / 2)))
 
 
 def _edges(rgb: Image) -> Image:
-    """(h, w) strength of edges relative to the surroundings, of mean 0 and standard deviation 1."""
-    # OpenCV's own conversion takes 0.1 s when it is called first.
+    """(h, w) strength of edges relative to the surroundings, of mean 0 and standard deviation 1.
+
+    Args:
+        rgb: Image (h, w, 3) in 0…1.
+    """
+    # CIELAB over 100; OpenCV's own conversion takes 0.1 s when it is called first.
     channels = torch.from_numpy(np.clip(rgb, 0, 1)).permute(2, 0, 1)
     lab = np.ascontiguousarray(cielab(channels).permute(1, 2, 0)) / 100
+    # The length of the gradient, of all three channels; Sobel's weights sum to 8.
     blurred = cv2.GaussianBlur(lab, (0, 0), _EDGE_SIGMA)
     gradients = [
         cv2.Sobel(blurred, cv2.CV_32F, dx, dy, scale=0.125, borderType=cv2.BORDER_REFLECT)
         for dx, dy in ((1, 0), (0, 1))
     ]
     strength = np.sqrt(np.square(gradients).sum((0, 3)))
-    relative = strength / (cv2.GaussianBlur(strength, (0, 0), _EDGE_REACH) + 0.01)
+    # Relative to the surroundings, whose mean is taken off.
+    relative = strength / (cv2.GaussianBlur(strength, (0, 0), _EDGE_REACH) + _FAINT_EDGE)
     edges = relative - cv2.GaussianBlur(relative, (0, 0), _EDGE_BAND)
-    return np.asarray(edges / (edges.std() + 1e-9), np.float32)
+    return np.asarray(edges / (edges.std() + _TINY), np.float32)
 
 
-def _neighbours(at: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """(M, 2) pairs of neighbouring points and (M,) their distances: triangles' sides, not long."""
-    triangles = Delaunay(at, qhull_options="QJ").simplices
+def _neighbours(positions: Floats) -> tuple[NDArray[np.intp], Floats]:
+    """The pairs of neighbouring points, numbers (M, 2), and their distances (M,).
+
+    They are the sides of Delaunay's triangles of positions (N, 2), without the longest ones.
+    """
+    # QJ: Qhull moves points at random, so that points on one line or circle have triangles, too.
+    triangles = Delaunay(positions, qhull_options="QJ").simplices
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
     sides = np.sort(sides)
     pairs = np.unique(sides, axis=0).astype(np.intp)
-    length = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-    near = length <= np.quantile(length, _LONGEST_PAIR)
-    return pairs[near], length[near]
+    length = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    is_near = length <= np.quantile(length, _LONGEST_PAIR)
+    return pairs[is_near], length[is_near]

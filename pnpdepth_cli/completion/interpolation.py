@@ -32,34 +32,46 @@ from pnpdepth_cli.completion.triangles import (
 from pnpdepth_cli.errors import NoPointsError
 from pnpdepth_cli.points import SparsePoints
 
-_AT_A_POINT = 0.25  # pixels; closer than this, a point is as close as can be
-_NODES = 2  # a point, at most, of a grid that squares are sought in
-_FEW = 50  # points a position, at least, where only the triangles at the positions are made
-_CHUNK = 1 << 18  # positions that are interpolated at once: bounds the memory
+_HULL_MARGIN_PX = 0.25
+"""Pixels; a pixel that is no farther outside the points' hull still counts as inside."""
+_NODES = 2
+"""Nodes for each point, at most, of a grid on whose nodes points are sought."""
+_FEW = 50
+"""Points for each position, at least, where only the triangles at the positions are made."""
+_CHUNK = 1 << 18
+"""Positions that are interpolated at once, which bounds the memory."""
 
 # Instead of a triangle's number:
 _OUTSIDE = -1
 _IN_SQUARE = -2
 
-# What is found of points, as long as these points are in use.
+# What was computed of points, kept as long as these points are in use.
 _TRIANGULATIONS = WeakKeyDictionary[SparsePoints, "Triangulation"]()
 _DISTINCT = WeakKeyDictionary[SparsePoints, SparsePoints]()
 _NEIGHBOURS = WeakKeyDictionary[SparsePoints, Tensor]()
 
 
 def nearest(points: SparsePoints) -> Tensor:
-    """Returns the depth of the nearest point in the image."""
+    """Returns (H, W) float32 metres: at every pixel the depth of the point nearest in the image.
+
+    Raises:
+        NoPointsError: There is no point.
+    """
     points = distinct(points)
     _, number = nearest_points(points, pixels_of(points.size), 1)
     return points.depth[number[:, 0].to(points.depth.device)].reshape(points.size)
 
 
 def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "depth") -> Tensor:
-    """Returns linear interpolation in the Delaunay triangles of the points; see `Triangulation`.
+    """Returns depth that is linear between the points, in metres; see `Triangulation`.
 
     Args:
-        xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel.
-        space: The quantity that is linear, one of `choices.SPACES`.
+        points: The points.
+        xy: Pixel coordinates (M, 2) where depth (M,) is wanted. None: every pixel, (H, W).
+        space: Quantity of depth that is linear, one of `choices.SPACES`.
+
+    Raises:
+        NoPointsError: There is no point.
     """
     triangulation = triangulation_of(points)
     return triangulation.dense(space) if xy is None else triangulation.at(xy, space)
@@ -68,7 +80,7 @@ def linear(points: SparsePoints, xy: Tensor | None = None, *, space: str = "dept
 def triangulation_of(points: SparsePoints) -> Triangulation:
     """Returns the triangulation of the points, the same one as long as these points are in use.
 
-    An expert, its validation, the baseline and the standard deviation interpolate in it.
+    Several steps of a refinement interpolate in it.
     """
     triangulation = _TRIANGULATIONS.get(points)
     if triangulation is None:
@@ -93,12 +105,13 @@ class Triangulation:
     def __init__(self, points: SparsePoints):
         self._points = distinct(points)
         self._xy = self._points.xy.cpu().double().numpy()
-        self._grid = _Grid.of(self._xy)
-        self._dense: dict[str, Tensor] = {}
-        self._asked: tuple[Tensor, _Located] | None = None  # the last coordinates
+        self._grid = _Grid.of(self._xy)  # None: the points are on no grid
+        self._dense: dict[str, Tensor] = {}  # depth at every pixel, by what is linear
+        self._last: tuple[Tensor, _Located] | None = None
+        """The last coordinates that `at` was given, and where they lie."""
 
     def dense(self, space: str = "depth") -> Tensor:
-        """Returns depth (H, W) float32 metres at every pixel, computed once."""
+        """Returns depth (H, W) float32 metres at every pixel, computed once for each space."""
         if space not in self._dense:
             pixels = pixels_of(self._points.size).numpy()
             depth = self._depth(pixels, self._locate_pixels(), space)
@@ -108,48 +121,60 @@ class Triangulation:
     def at(self, xy: Tensor, space: str = "depth") -> Tensor:
         """Returns depth (M,) float32 metres at pixel coordinates (M, 2).
 
-        Where the last coordinates lie is remembered: an expert, the baseline and the standard
-        deviation ask for the same validation points.
+        Where the last coordinates lie is remembered, as several steps ask for the same ones.
         """
         coordinates = xy.cpu().double().numpy()
-        if self._asked is None or self._asked[0] is not xy:
+        if self._last is None or self._last[0] is not xy:
             positions, number = Positions.of(coordinates)
+            # Of many points and few positions, only the triangles at the positions are made.
             is_few = len(self._rim) > _FEW * len(coordinates)
             triangles = self._triangles_at(coordinates) if is_few else self._triangles
-            self._asked = (xy, self._locate(coordinates, triangles, positions, number))
-        _, located = self._asked
+            self._last = (xy, self._locate(coordinates, triangles, positions, number))
+        _, located = self._last
         return self._depth(coordinates, located, space)
 
     @functools.cached_property
     def _rim(self) -> Numbers:
-        """Numbers of the points that not only squares meet at: those that are triangulated."""
+        """Numbers of the points that are triangulated: all but those that only squares meet at."""
         return np.arange(len(self._xy)) if self._grid is None else self._grid.rim()
 
     @functools.cached_property
     def _triangles(self) -> Numbers:
-        """(T, 3) numbers of the points at the corners; in squares they are of no account."""
+        """(T, 3) numbers of the points at the corners of all triangles.
+
+        Some may lie in squares; there the square is interpolated.
+        """
         return self._rim[delaunay(self._xy[self._rim])]
 
     def _triangles_at(self, xy: Floats) -> Numbers:
-        """Those of the same triangles that hold any of the positions (M, 2)."""
+        """(T, 3) as `_triangles`, but only those that hold any of the positions (M, 2)."""
         if self._grid is not None:
             xy = xy[~self._grid.squares(xy).inside]
         return self._rim[delaunay_at(self._xy[self._rim], xy)]
 
     def _locate_pixels(self) -> _Located:
-        """Where each pixel lies, row after row."""
-        rows, columns = (np.arange(float(count)) for count in self._points.size)
+        """Where each pixel of the frame lies, row after row."""
+        height, width = self._points.size
         pixels = pixels_of(self._points.size).numpy()
-        return self._locate(pixels, self._triangles, Positions(columns=columns, rows=rows))
+        positions = Positions(columns=np.arange(float(width)), rows=np.arange(float(height)))
+        return self._locate(pixels, self._triangles, positions)
 
     def _locate(
         self,
         xy: Floats,
         triangles: Numbers,
         positions: Positions,
-        number: Numbers | slice = slice(None),  # of the position of each of xy
+        number: Numbers | slice = slice(None),
     ) -> _Located:
-        """In which triangle or square, or near which point, each position (M, 2) lies."""
+        """In which triangle or square, or near which point, each of M coordinates lies.
+
+        Args:
+            xy: The coordinates (M, 2).
+            triangles: Triangles (T, 3) that are looked in, numbers of the points at the corners.
+            positions: The coordinates without repetition, as triangles are sought.
+            number: Number (M,) of the position that each of the coordinates is; without it, they
+                are all positions in their order.
+        """
         triangle = cover(self._xy[triangles], positions)[number]
         if self._grid is not None:
             triangle = np.where(self._grid.squares(xy).inside, _IN_SQUARE, triangle)
@@ -160,26 +185,33 @@ class Triangulation:
             nearest = near[:, 0].numpy()
         return _Located(triangles, triangle.astype(np.int32), nearest)
 
-    def _depth(self, xy: Floats, where: _Located, space: str) -> Tensor:
-        """(M,) metres at positions (M, 2) that are located."""
+    def _depth(self, xy: Floats, located: _Located, space: str) -> Tensor:
+        """Depth (M,) float32 metres at coordinates (M, 2).
+
+        Args:
+            xy: The coordinates.
+            located: Where they lie.
+            space: Quantity of depth that is linear, one of `choices.SPACES`.
+        """
         depth = self._points.depth.cpu().double()
         value = to_space(depth, space).numpy()
         # Means of the values at the corners of triangles and squares.
-        result = np.empty(len(xy))
-        for first in range(0, len(result), _CHUNK):
+        means = np.empty(len(xy))
+        for first in range(0, len(means), _CHUNK):
             chunk = slice(first, first + _CHUNK)
-            mean = result[chunk]  # a view, to be filled
-            number = where.number[chunk]
+            mean = means[chunk]  # a view, to be filled
+            number = located.number[chunk]
             in_triangle = number >= 0
-            corners = where.triangles[number[in_triangle]]
-            shares = barycentric(self._xy[corners], xy[chunk][in_triangle])
-            mean[in_triangle] = (shares * value[corners]).sum(axis=1)
+            corners = located.triangles[number[in_triangle]]
+            weights = barycentric(self._xy[corners], xy[chunk][in_triangle])
+            mean[in_triangle] = (weights * value[corners]).sum(axis=1)
             if self._grid is not None:
                 squares = self._grid.squares(xy[chunk])
-                mean[squares.inside] = (squares.shares * value[squares.corners]).sum(axis=1)
+                mean[squares.inside] = (squares.weights * value[squares.corners]).sum(axis=1)
         # As depth, which outside is that of the nearest point.
-        dense = from_space(torch.from_numpy(result), space)
-        dense[torch.from_numpy(where.number == _OUTSIDE)] = depth[torch.from_numpy(where.nearest)]
+        dense = from_space(torch.from_numpy(means), space)
+        is_outside = torch.from_numpy(located.number == _OUTSIDE)
+        dense[is_outside] = depth[torch.from_numpy(located.nearest)]
         return dense.float().to(self._points.depth.device)
 
 
@@ -189,9 +221,9 @@ class _Located(NamedTuple):
     triangles: Numbers
     """(T, 3) numbers of the points at the corners of triangles."""
     number: NDArray[np.int32]
-    """(M,) of the triangle that holds the position, or `_IN_SQUARE`, or `_OUTSIDE`."""
+    """(M,) number of the triangle that holds each position, or `_IN_SQUARE`, or `_OUTSIDE`."""
     nearest: Numbers
-    """Number of the point nearest to each position outside."""
+    """(K,) number of the point nearest to each of the K positions outside."""
 
 
 class _Squares(NamedTuple):
@@ -201,8 +233,8 @@ class _Squares(NamedTuple):
     """(M,) true for K positions."""
     corners: Numbers
     """(K, 4) numbers of the points at the corners."""
-    shares: Floats
-    """(K, 4) weights of bilinear interpolation."""
+    weights: Floats
+    """(K, 4) weights of these in bilinear interpolation."""
 
 
 class _Grid(NamedTuple):
@@ -219,7 +251,10 @@ class _Grid(NamedTuple):
 
     @classmethod
     def of(cls, xy: Floats) -> _Grid | None:
-        """Returns the grid of points (N, 2); None if they are on none or leave most of it empty."""
+        """Returns the grid of points (N, 2); None if they are on none or leave most of it empty.
+
+        None also if no square of the grid has points at its four corners.
+        """
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)
         if len(columns) * len(rows) > _NODES * len(xy):
@@ -234,50 +269,68 @@ class _Grid(NamedTuple):
 
     def rim(self) -> Numbers:
         """Returns the numbers of the points that are not surrounded by four full squares."""
-        around = np.pad(self.full, 1)
-        inner = around[:-1, :-1] & around[:-1, 1:] & around[1:, :-1] & around[1:, 1:]
-        return self.number[(self.number >= 0) & ~inner]
+        padded = np.pad(self.full, 1)  # (R + 1, C + 1): a node's upper left square is at its index
+        is_inner = padded[:-1, :-1] & padded[:-1, 1:] & padded[1:, :-1] & padded[1:, 1:]
+        return self.number[(self.number >= 0) & ~is_inner]
 
     def squares(self, xy: Floats) -> _Squares:
         """Returns which positions (M, 2) are in full squares, with corners and weights."""
         column, right = _between(self.columns, xy[:, 0])
         row, down = _between(self.rows, xy[:, 1])
-        inside = self.full[row, column] & ~np.isnan(right + down)
-        row, column, right, down = row[inside], column[inside], right[inside], down[inside]
+        inside = self.full[row, column] & ~np.isnan(right) & ~np.isnan(down)
+        row = row[inside]
+        column = column[inside]
+        right = right[inside]
+        down = down[inside]
         # Upper left, upper right, lower left, lower right.
-        corners = [self.number[row + i, column + j] for i in (0, 1) for j in (0, 1)]
-        shares = [y * x for y in (1 - down, down) for x in (1 - right, right)]
-        return _Squares(inside, np.stack(corners, axis=1), np.stack(shares, axis=1))
+        corners = [
+            self.number[row, column],
+            self.number[row, column + 1],
+            self.number[row + 1, column],
+            self.number[row + 1, column + 1],
+        ]
+        weights = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
+        return _Squares(inside, np.stack(corners, axis=1), np.stack(weights, axis=1))
 
 
-def _between(nodes: Floats, at: Floats) -> tuple[Numbers, Floats]:
-    """Number (M,) of the node at or before a coordinate, and how far it is to the next, 0…1.
+def _between(nodes: Floats, coordinate: Floats) -> tuple[Numbers, Floats]:
+    """Between which two nodes of an axis each of M coordinates lies.
 
-    NaN before the first and behind the last node.
+    Args:
+        nodes: The nodes (R,), ascending, two or more.
+        coordinate: The coordinates (M,).
+
+    Returns:
+        Number (M,) of the node at or before the coordinate, and the fraction (M,) 0…1 of the way
+        from it to the next; NaN before the first and behind the last node.
     """
-    number = np.searchsorted(nodes, at, "right").clip(1, len(nodes) - 1) - 1
-    fraction = (at - nodes[number]) / (nodes[number + 1] - nodes[number])
+    number = np.searchsorted(nodes, coordinate, "right").clip(1, len(nodes) - 1) - 1
+    fraction = (coordinate - nodes[number]) / (nodes[number + 1] - nodes[number])
     return number, np.where((fraction >= 0) & (fraction <= 1), fraction, np.nan)
 
 
 def in_hull(points: SparsePoints) -> Tensor:
-    """Returns bool (H, W), whether each pixel lies in the convex hull of the points."""
+    """Returns bool (H, W), whether each pixel lies in the convex hull of the points.
+
+    No pixel does if there are fewer than three points, or all are on one line.
+    """
     pixels = pixels_of(points.size)
     inside = torch.ones(len(pixels), dtype=torch.bool)
     try:
         planes = ConvexHull(points.xy.cpu().double().numpy()).equations
-    except QhullError:  # fewer than three points, or all on one line
+    except QhullError:  # SciPy's, of points without an area
         return torch.zeros(points.size, dtype=torch.bool, device=points.depth.device)
+    # Each side of the hull is a line; x, y is its unit normal, so this is the distance outside.
     for x, y, offset in planes.tolist():
-        inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _AT_A_POINT
+        inside &= x * pixels[:, 0] + y * pixels[:, 1] + offset <= _HULL_MARGIN_PX
     return inside.reshape(points.size).to(points.depth.device)
 
 
 def distinct(points: SparsePoints) -> SparsePoints:
-    """Returns the points ordered by coordinates; of several at the same coordinates the nearest.
+    """Returns the points ordered by coordinates; of several at the same ones that of least depth.
 
-    They are the same object as long as these points are in use, so that all that is found of them,
-    such as neighbours, is found once.
+    They are the same object as long as these points are in use, so that all that is computed of
+    them, such as neighbours, is computed once.
 
     Raises:
         NoPointsError: There is no point.
@@ -291,7 +344,11 @@ def distinct(points: SparsePoints) -> SparsePoints:
 def neighbours_of(points: SparsePoints, count: int) -> Tensor:
     """Returns the numbers (N, count) of the points nearest to each point, itself left out.
 
-    The largest count is remembered as long as the points are in use.
+    The nearest comes first. The largest count is remembered as long as the points are in use.
+
+    Args:
+        points: The N points, no two at the same coordinates.
+        count: Number of neighbours of each, fewer than N.
     """
     neighbours = _NEIGHBOURS.get(points)
     if neighbours is None or neighbours.shape[1] < count:
@@ -301,13 +358,18 @@ def neighbours_of(points: SparsePoints, count: int) -> Tensor:
 
 
 def _order(points: SparsePoints) -> SparsePoints:
-    """The points ordered by coordinates, the nearest of several at the same ones."""
+    """The points ordered by coordinates, that of least depth of several at the same ones.
+
+    Raises:
+        NoPointsError: There is no point.
+    """
     if not len(points):
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
     xy = points.xy.cpu().numpy()
     depth = points.depth.cpu().numpy()
     order = np.lexsort(xy.T[::-1])  # faster than torch.unique
-    xy, depth = xy[order], depth[order]
+    xy = xy[order]
+    depth = depth[order]
     # The first of each run of equal coordinates, and the least depth of the run.
     is_first = np.append(True, (xy[1:] != xy[:-1]).any(axis=1))
     (first,) = is_first.nonzero()
@@ -320,14 +382,21 @@ def _order(points: SparsePoints) -> SparsePoints:
 
 def pixels_of(size: tuple[int, int]) -> Tensor:
     """Returns x and y of every pixel of a frame (H, W), row after row, (HW, 2) float64."""
-    rows, columns = (torch.arange(n, dtype=torch.float64) for n in size)
+    height, width = size
+    rows = torch.arange(height, dtype=torch.float64)
+    columns = torch.arange(width, dtype=torch.float64)
     return torch.cartesian_prod(rows, columns).flip(1)
 
 
 def nearest_points(points: SparsePoints, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Returns distance in pixels and number, (M, count) each, of the points nearest to xy (M, 2).
+    """Returns the distances in pixels and the numbers of the points nearest to each position.
 
-    The nearest point comes first.
+    Both are (M, count), the nearest point first.
+
+    Args:
+        points: The points.
+        xy: Pixel coordinates (M, 2) of the positions, on the CPU.
+        count: Number of points for each position, at most all.
     """
     distance, number = points.tree.query(xy.numpy(), np.arange(1, count + 1), workers=-1)
     return torch.from_numpy(distance), torch.from_numpy(number)

@@ -20,6 +20,9 @@ ALONE = 10.0
 FAR = 0.2
 """Difference of log depth beyond which a network that weighs its points contradicts a point."""
 
+_LEAST_DEPTH = 1e-6
+"""Metres; a prediction is at least this before its logarithm is taken."""
+
 _COMPARED = 8
 """Neighbours that a point is compared with."""
 _AGREEING = 2
@@ -64,40 +67,46 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
     the points or more is of no use: then none is far.
 
     Args:
-        prediction: (H, W) metres, 0 = unknown, of a network that weighs its points.
+        prediction: Depth (H, W) in metres, 0 = unknown, of a network that weighs its points.
+        points: The N points.
     """
     at_points = points.sample(prediction)
-    error = points.depth.log() - at_points.clamp_min(1e-6).log()
+    error = points.depth.log() - at_points.clamp_min(_LEAST_DEPTH).log()
     far = (at_points > 0) & (error.abs() > FAR)
-    return far & (far.sum() < len(points) / 2)
+    return far if far.sum() < len(points) / 2 else torch.zeros_like(far)
 
 
 def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
-    """Returns (N,) bool: points that agree with their neighbours, and none with a prediction.
+    """Returns (N,) bool: points that agree with points around them, but not with a prediction.
 
     As those seen in a mirror or through a pane. No geometry of the points tells these from a
-    corridor behind a door; a prediction that is right everywhere else does. The larger group of
-    those that are farther, and of those that are nearer.
+    corridor behind a door; a prediction that is right everywhere else does.
+
+    They are all farther than predicted, or all nearer, whichever are more.
 
     Args:
-        points: The points.
-        error: (N,) log measured − log predicted depth.
-        least: Error from which on a point stands out.
+        points: The N points.
+        error: Errors (N,), log measured − log predicted depth.
+        least: |Error| above which a point does not agree with the prediction.
     """
     none = torch.zeros(len(points), dtype=torch.bool)
     if len(points) <= _AROUND or not bool((error.abs() > least).any()):
         return none
     near = neighbours_of(points, _AROUND)
-    alike = (error[near] - error[:, None]).abs() < _ALIKE
+    alike = (error[near] - error[:, None]).abs() < _ALIKE  # (N, _AROUND)
     groups = list[Tensor]()
-    for side in (error, -error):
-        off = side > least
-        groups.append(off & ((off[near] & alike).sum(dim=1) >= _AGREE_AROUND))
+    for signed_error in (error, -error):  # farther points, then nearer ones
+        off = signed_error > least
+        agreeing = (off[near] & alike).sum(dim=1)
+        groups.append(off & (agreeing >= _AGREE_AROUND))
     return max(groups, key=lambda group: int(group.sum()))
 
 
 def without_outliers(residuals: Residuals) -> Residuals:
-    """Returns the residuals at the points that are inliers; all unless some clearly are not."""
+    """Returns the residuals at the points that are no outliers; all unless some clearly are.
+
+    Outliers are sought again without those that were found, until there are none.
+    """
     for _ in range(_PASSES):
         inliers = inlier_mask(residuals)
         if bool(inliers.all()):
@@ -107,65 +116,83 @@ def without_outliers(residuals: Residuals) -> Residuals:
 
 
 def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
-    """Returns (N,) 0…1: how consistent each point is with its neighbours.
+    """Returns the weight (N,) 0…1 of each point by how consistent it is with its neighbours.
 
     A point that no two of its neighbours agree with is an outlier, or on an object so small that
-    nothing can be learnt from it for others.
+    nothing can be learnt from it for others: its weight is 0.
 
     Args:
-        residual: (N,) log measured − log predicted depth.
+        points: The N points.
+        residual: Residual (N,) of the points, log measured − log predicted depth.
     """
     if len(points) <= _AGREEING:
         return torch.ones_like(residual)
     near = neighbours_of(points, min(_COMPARED, len(points) - 1))
-    apart = (residual[near] - residual[:, None]).abs().sort(dim=1).values[:, _AGREEING - 1]
-    typical = max(MAD_TO_STD * float(apart.median()), _MIN_DISAGREEMENT)
-    return (1 - (apart / (ALONE * typical)).square()).clamp_min(0).square()
+    # By how much a point differs from the neighbour that agrees with it second best.
+    differences = (residual[near] - residual[:, None]).abs().sort(dim=1).values
+    disagreement = differences[:, _AGREEING - 1]
+    typical = max(MAD_TO_STD * float(disagreement.median()), _MIN_DISAGREEMENT)
+    return _biweight(disagreement / (ALONE * typical))
 
 
-def inlier_mask(field: Residuals) -> Tensor:
-    """Returns (N,) bool: the points that are inliers; all of them unless some clearly are not.
+def _biweight(ratio: Tensor) -> Tensor:
+    """Tukey's weights (1 − ratio²)² of errors over the cutoff; 0 from a ratio of 1 on."""
+    return (1 - ratio.square()).clamp_min(0).square()
 
-    Points are weighted by how well their neighbours predict them, at first by `inlier_weights`.
-    Unless there are very many, the Gaussian process from the other points, with their weights,
-    predicts each point then.
+
+def inlier_mask(residuals: Residuals) -> Tensor:
+    """Returns (N,) bool: the points that are no outliers; all of them unless some clearly are.
+
+    Points are weighted by how well others predict them. First these are their neighbours
+    (`inlier_weights`). Then, unless there are very many points, it is the Gaussian process from all
+    others with their weights.
     """
-    weight = inlier_weights(field.points, field.residual)
-    near = neighbourhoods(field, _MAX_EXACT)
+    weight = inlier_weights(residuals.points, residuals.residual)
+    near = neighbourhoods(residuals, _MAX_EXACT)
+    has_all_points = len(near) == 1
     # Few points all predict each other, with weights that follow from the errors, again and again.
-    if len(near) == 1 and near.shape[1] >= _MIN_POINTS:
+    if has_all_points and near.shape[1] >= _MIN_POINTS:
         for cutoff in _CUTOFFS:
-            error, variance = leave_one_out(field, near, weight)
-            ratio = error[0].abs() / variance[0].sqrt()
-            typical = max(MAD_TO_STD * float(ratio.median()), _MIN_ERROR)
-            weight = (1 - (ratio / (cutoff * typical)).square()).clamp_min(0).square()
-    # Points of little weight are suspected, unless they are alone together.
+            errors, variances = leave_one_out(residuals, near, weight)
+            deviations = errors[0].abs() / variances[0].sqrt()
+            typical = max(MAD_TO_STD * float(deviations.median()), _MIN_ERROR)
+            weight = _biweight(deviations / (cutoff * typical))
+    # Points of little weight are suspected, unless their neighbours are, too.
     inliers = weight > _MIN_WEIGHT
-    inliers = inliers | _suspected_together(field.points, ~inliers)
+    inliers = inliers | _suspected_together(residuals.points, ~inliers)
     weight = torch.where(inliers, weight.clamp_min(_MIN_WEIGHT), weight)
     if bool(inliers.all()) or not bool(inliers.any()):
         return torch.ones_like(inliers)
     # They are outliers if the others predict each other far better without them.
-    with_all, without = (
-        float((error.abs() * weight[near[:, : error.shape[1]]]).sum())
-        for error, _ in (leave_one_out(field, near), leave_one_out(field, near, weight))
-    )
-    far_better = _FAR_BETTER if len(near) == 1 else _FAR_BETTER_MANY
-    if without >= far_better * with_all:
+    errors_with, _ = leave_one_out(residuals, near)
+    errors_without, _ = leave_one_out(residuals, near, weight)
+    scored_weight = weight[near[:, : errors_with.shape[1]]]  # of the points that have an error
+    sum_with = float((errors_with.abs() * scored_weight).sum())
+    sum_without = float((errors_without.abs() * scored_weight).sum())
+    far_better = _FAR_BETTER if has_all_points else _FAR_BETTER_MANY
+    if sum_without >= far_better * sum_with:
         return torch.ones_like(inliers)
     return inliers
 
 
 def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:
-    """(N,) bool: suspected points most of whose neighbours are suspected, and those beside them."""
+    """(N,) bool: suspected points most of whose neighbours are suspected, and those beside them.
+
+    So points that are off together, as on an object that the network has not seen, are found.
+
+    Args:
+        points: The N points.
+        suspected: Whether each point, (N,) bool, may be an outlier.
+    """
     together = torch.zeros_like(suspected)
     if len(points) <= _AROUND or not bool(suspected.any()):
         return together
     # Only suspected points can be among them, so only their neighbours are sought.
     (numbers,) = suspected.nonzero(as_tuple=True)
     _, near = nearest_points(points, points.xy[numbers].double(), _AROUND + 1)
-    near = near[:, 1:]
+    near = near[:, 1:]  # the nearest is the point itself
     together[numbers] = suspected[near].sum(dim=1) >= _MOST_SUSPECTED
+    # Suspected points beside these join them, until there are no more.
     while True:
         more = together[numbers] | (together[near].sum(dim=1) >= _HALF_SUSPECTED)
         if torch.equal(more, together[numbers]):

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnpdepth_cli.completion import gaussian_process
-from pnpdepth_cli.completion.gaussian_process import DEPTH, Residuals
+from pnpdepth_cli.completion.gaussian_process import LOG_DEPTH, Residuals
 from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 
@@ -33,69 +33,92 @@ POWER = 3.0
 """Power of the distance by which a point counts less."""
 RIDGE = 0.03
 """Against the variance of x among the points of a pixel, in units of its variance among all."""
-_LINES = 400_000  # that are fitted; with more pixels, lines are interpolated
-_AT_A_POINT = 0.5  # pixels; closer than this, a point is as close as can be
-_OUTLIER_WEIGHT = 1e-6  # what an outlier counts where no other point is near
+_LINES = 400_000
+"""Lines that are fitted at most; with more pixels, lines are interpolated."""
+_AT_A_POINT_PX = 0.5
+"""Pixels; closer than this, a point is as close as can be."""
+_OUTLIER_WEIGHT = 1e-6
+"""What an outlier counts where no other point is near."""
 
 
 def local_lines(
-    points: SparsePoints, xy: Tensor | None, residual: Tensor, z: Tensor, inlier_weight: Tensor
+    points: SparsePoints,
+    xy: Tensor | None,
+    residual: Tensor,
+    regressor: Tensor,
+    inlier_weight: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Returns shift and slope, (H, W) each, of the line around every pixel.
+    """Returns shift and slope of the line residual = shift + slope · regressor around each pixel.
+
+    Both are (H, W) float64, or (M,) at coordinates.
 
     Args:
-        xy: (M, 2) pixel coordinates around which lines (M,) are wanted. None: every pixel.
-        residual: (N,) y at the points.
-        z: (N,) x at the points, in units of its standard deviation.
-        inlier_weight: (N,) 0…1.
+        points: The N points.
+        xy: Pixel coordinates (M, 2) around which lines are wanted. None: every pixel.
+        residual: Residual (N,) float64 at the points, of any unit.
+        regressor: Quantity (N,) float64 at the points over which lines run, such as the predicted
+            log depth, of standard deviation 1.
+        inlier_weight: Weight (N,) 0…1 of each point.
     """
     if xy is not None:
-        return _lines_at(xy.cpu().double(), points, residual, z, inlier_weight)
+        return _lines_at(xy.cpu().double(), points, residual, regressor, inlier_weight)
     # Lines around the nodes of a grid, which are interpolated where it has fewer than pixels.
     height, width = points.size
     step = math.ceil(math.sqrt(height * width / _LINES))
-    rows, columns = (
-        torch.linspace(0, side - 1, math.ceil((side - 1) / step) + 1, dtype=torch.float64)
-        for side in (height, width)
-    )
-    nodes = torch.cartesian_prod(rows, columns).flip(1)
-    lines = torch.stack(_lines_at(nodes, points, residual, z, inlier_weight))
+    rows = _nodes(height, step)
+    columns = _nodes(width, step)
+    nodes = torch.cartesian_prod(rows, columns).flip(1)  # x, y
+    lines = torch.stack(_lines_at(nodes, points, residual, regressor, inlier_weight))
     lines = lines.reshape(1, 2, len(rows), len(columns))
     if step > 1:
         lines = F.interpolate(lines, points.size, mode="bilinear", align_corners=True)
     return lines[0, 0], lines[0, 1]
 
 
+def _nodes(length: int, step: int) -> Tensor:
+    """Coordinates from 0 to length − 1, evenly spaced by at most `step` pixels, float64."""
+    count = math.ceil((length - 1) / step) + 1
+    return torch.linspace(0, length - 1, count, dtype=torch.float64)
+
+
 def _lines_at(
-    nodes: Tensor, points: SparsePoints, residual: Tensor, z: Tensor, inlier_weight: Tensor
+    nodes: Tensor, points: SparsePoints, residual: Tensor, regressor: Tensor, inlier_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Shift and slope, (M,) each, of the lines around nodes (M, 2); see `local_lines`."""
+    """Shift and slope, (M,) each, of the lines around nodes (M, 2), x and y; see `local_lines`."""
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
-    weight = distance.clamp_min(_AT_A_POINT).pow(-POWER) * (inlier_weight[near] + _OUTLIER_WEIGHT)
+    closeness = distance.clamp_min(_AT_A_POINT_PX).pow(-POWER)
+    weight = closeness * (inlier_weight[near] + _OUTLIER_WEIGHT)
     weight = weight / weight.sum(dim=1, keepdim=True)
-    # Weighted least squares with a ridge, of all nodes at once.
-    z, residual = z[near], residual[near]
-    mean_z = (weight * z).sum(dim=1, keepdim=True)
-    mean_residual = (weight * residual).sum(dim=1, keepdim=True)
-    covariance = (weight * (z - mean_z) * (residual - mean_residual)).sum(dim=1, keepdim=True)
-    variance = (weight * (z - mean_z).square()).sum(dim=1, keepdim=True)
+    # Weighted least squares with a ridge, of all nodes at once: (M, neighbours) each.
+    x = regressor[near]
+    y = residual[near]
+    mean_x = (weight * x).sum(dim=1, keepdim=True)
+    mean_y = (weight * y).sum(dim=1, keepdim=True)
+    covariance = (weight * (x - mean_x) * (y - mean_y)).sum(dim=1, keepdim=True)
+    variance = (weight * (x - mean_x).square()).sum(dim=1, keepdim=True)
     slope = covariance / (variance + RIDGE)
-    return (mean_residual - slope * mean_z)[:, 0], slope[:, 0]
+    return (mean_y - slope * mean_x)[:, 0], slope[:, 0]
 
 
 def by_lines(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
-    """Returns the residual, (H, W) or (M,) float32, by lines over the predicted log depth."""
-    log_depth = residuals.features[DEPTH]
+    """Returns the residual by local lines over the predicted log depth, through the points.
+
+    It is (H, W) float32 at every pixel, or (M,) at the coordinates of M queries.
+    """
+    log_depth = residuals.features[LOG_DEPTH]
     xy = None
     if queries is not None:
         log_depth = queries.sample(log_depth)
         xy = queries.xy
-    at_points = residuals.at[:, DEPTH].double()
+    at_points = residuals.point_features[:, LOG_DEPTH].double()
     weights = torch.ones_like(residuals.residual)
     shift, slope = local_lines(residuals.points, xy, residuals.residual, at_points, weights)
     return (shift + slope * log_depth).float()
 
 
 def by_gaussian_process(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor:
-    """Returns the mean residual, (H, W) or (M,), of a Gaussian process that fits the points."""
+    """Returns the mean residual of the Gaussian process whose kernel fits the points best.
+
+    It is (H, W) float32 at every pixel, or (M,) at the coordinates of M queries.
+    """
     return gaussian_process.predict(residuals.fitted, queries)

@@ -22,15 +22,15 @@ from pnpdepth_cli.points import SparsePoints
 
 
 class ResidualField:
-    """The residual of one prediction, given at some points.
+    """How much deeper the scene is than one prediction says: log measured − log predicted depth.
 
-    What several steps need, such as which points are outliers, is computed when it is first asked
-    for, and once.
+    It is known at some points. What several steps need, such as which points are outliers, is
+    computed when it is first asked for, and once.
 
     Args:
-        prediction: (H, W) metres, 0 = unknown.
+        prediction: Depth (H, W) in metres; 0 or not finite = unknown.
         points: The points, in pixels of the image.
-        rgb: (3, H, W) in 0…1, or None.
+        rgb: Image (3, H, W) in 0…1; None: colour has no effect.
     """
 
     def __init__(self, prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> None:
@@ -40,7 +40,7 @@ class ResidualField:
         self.points = points
 
     def is_of(self, prediction: Tensor, points: SparsePoints) -> bool:
-        """Returns whether it is the field of these two objects."""
+        """Returns whether the field is that of these very objects, not only of equal ones."""
         return prediction is self.prediction and points is self.points
 
     @functools.cached_property
@@ -50,7 +50,7 @@ class ResidualField:
 
     @functools.cached_property
     def at_inliers(self) -> Residuals:
-        """The residuals at the points that are no outliers."""
+        """The residuals at the points that are no outliers; errors as of `at_points`."""
         return outliers.without_outliers(self.at_points)
 
     @functools.cached_property
@@ -64,32 +64,43 @@ class ResidualField:
         return torch.isin(all_keys, outlying).to(self.points.xy.device)
 
     def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
-        """Returns the residual (H, W), or (M,) at the coordinates of M points.
+        """Returns the residual (H, W) at every pixel, or (M,) at the coordinates of M points.
+
+        It is predicted from the points that are no outliers, and lies between their least and
+        largest residual.
 
         Args:
             queries: Points at whose coordinates the residual is wanted. None: every pixel.
-            kind: A name in `choices.PROPAGATIONS`.
+            kind: Name of the way to predict it, in `choices.PROPAGATIONS`.
+
+        Raises:
+            NoPointsError: No point has a prediction.
         """
         inliers = self.at_inliers
         residual: Tensor = PROPAGATIONS[kind](inliers, queries)
         return residual.clamp(float(inliers.residual.min()), float(inliers.residual.max()))
 
     def depth(self, xy: Tensor | None = None, *, kind: str = "gp") -> Tensor:
-        """Returns the prediction with its residual propagated, metres, 0 = unknown.
+        """Returns the depth that agrees with the points: exp(residual) · prediction.
+
+        It is float32 metres, 0 = unknown.
 
         Args:
-            xy: (M, 2) pixel coordinates where depth (M,) is wanted. None: every pixel, (H, W).
-            kind: A name in `choices.PROPAGATIONS`; with "none" the prediction itself is returned.
+            xy: Pixel coordinates (M, 2) where depth (M,) is wanted. None: every pixel, (H, W).
+            kind: Name of the way to predict the residual, in `choices.PROPAGATIONS`; with "none"
+                the prediction itself is returned.
 
         Raises:
             NoPointsError: No point has a prediction, except with "none".
         """
         queries = None
-        predicted = torch.where(self._known, self.prediction, 0.0)
-        if xy is not None:
+        if xy is None:
+            predicted = torch.where(self._known, self.prediction, 0.0)
+        else:
+            # Depth between pixels is unknown where one of these is: NaN spreads, and becomes 0.
             queries = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=self.points.size)
-            unknown = torch.where(self._known, self.prediction, torch.nan)
-            predicted = queries.sample(unknown).nan_to_num(0.0)
+            nan_where_unknown = torch.where(self._known, self.prediction, torch.nan)
+            predicted = queries.sample(nan_where_unknown).nan_to_num(0.0)
             queries = queries.tensors()
         if kind == "none":
             return predicted.float()
@@ -98,5 +109,8 @@ class ResidualField:
 
 
 def _coordinate_keys(points: SparsePoints) -> Tensor:
-    """(N,) int64: x and y bit by bit, equal for equal coordinates."""
+    """(N,) int64, one number for each point, equal for equal coordinates.
+
+    It has the 32 bits of x and the 32 bits of y.
+    """
     return points.xy.float().contiguous().view(torch.int64).flatten()

@@ -45,7 +45,10 @@ def mean_error(errors: Tensor) -> float:
 
 
 def fit_location(values: Tensor) -> float:
-    """Returns the value from which the loss of the differences to values (N,) is smallest."""
+    """Returns the robust mean of values (N,): where Cauchy's loss of their differences is least.
+
+    Found from their median, by means with the loss's weights until they change no more.
+    """
     location = values.median()
     for _ in range(_STEPS):
         errors = values - location
@@ -58,7 +61,7 @@ def fit_location(values: Tensor) -> float:
 
 
 def fit_line(x: Tensor, y: Tensor, space: str, limits: tuple[float, float]) -> tuple[float, float]:
-    """Returns the scale and the shift of y = scale·x + shift.
+    """Returns the scale and the shift of y = scale·x + shift, of which outliers decide little.
 
     The loss has several minima. It is minimised from least squares over all points, and from the
     one of many lines through two points that has the smallest median error (LMedS, Rousseeuw 1984).
@@ -70,17 +73,20 @@ def fit_line(x: Tensor, y: Tensor, space: str, limits: tuple[float, float]) -> t
         space: Quantity of depth that y is, one of `choices.SPACES`.
         limits: (low, high) of y, to which the line is clamped.
     """
-    task = _Line(x, y, space, limits)
+    task = _LineFit(x, y, space, limits)
     starts = [task.least_squares()]
     through_two = task.least_median()
     if through_two is not None:
         starts.append(through_two)
-    ends = [task.minimise(*start) for start in starts]
-    return min(ends, key=lambda line: mean_error(task.errors(*line)))
+    lines = [task.minimise(scale, shift) for scale, shift in starts]
+    return min(lines, key=lambda line: mean_error(task.errors(*line)))
 
 
-class _Line:
-    """A line to be fitted; the arguments are those of `fit_line`."""
+class _LineFit:
+    """The task of fitting y = scale·x + shift to N points; the arguments are those of `fit_line`.
+
+    All tensors are (N,). A logarithm of y is log depth, up to its sign.
+    """
 
     def __init__(self, x: Tensor, y: Tensor, space: str, limits: tuple[float, float]) -> None:
         self._x = x
@@ -90,43 +96,47 @@ class _Line:
         self._log_y = self._log(y)
 
     def errors(self, scale: float, shift: float) -> Tensor:
-        """Returns the errors of log depth (N,), of 1/d those of log(1/d)."""
+        """Returns the errors (N,) of log depth by a line; where y is 1/depth, of log(1/depth)."""
         return self._log(scale * self._x + shift) - self._log_y
 
     def least_squares(self) -> tuple[float, float]:
-        """Returns least squares of relative errors over all points."""
+        """Returns scale and shift by least squares of relative errors over all points.
+
+        Where y is log depth, its plain errors are relative ones of depth.
+        """
         if self._space == "log":
             return _weighted_least_squares(self._x, self._y, torch.ones_like(self._y))
         return _weighted_least_squares(self._x, self._y, self._y**-2)
 
     def least_median(self) -> tuple[float, float] | None:
-        """Returns the line through two points with the smallest median error; the seed is fixed.
+        """Returns scale and shift of the line through two points with the least median error.
 
-        None where x is the same at the points of each pair that is tried.
+        Of many points, some pairs are drawn, with a fixed seed. None where x is the same at the
+        points of each pair.
         """
         x, y, log_y = self._x, self._y, self._log_y
         generator = torch.Generator().manual_seed(0)
         if len(x) > _SCORED:
-            kept = torch.randperm(len(x), generator=generator)[:_SCORED]
-            x, y, log_y = x[kept], y[kept], log_y[kept]
+            scored = torch.randperm(len(x), generator=generator)[:_SCORED]
+            x, y, log_y = x[scored], y[scored], log_y[scored]
         # Pairs of points, and the lines through them.
         first, second = torch.triu_indices(len(x), len(x), 1)
         if len(first) > _PAIRS:
             drawn = torch.randperm(len(first), generator=generator)[:_PAIRS]
             first, second = first[drawn], second[drawn]
-        apart = x[first] != x[second]
-        first, second = first[apart], second[apart]
+        is_apart = x[first] != x[second]
+        first, second = first[is_apart], second[is_apart]
         if not len(first):
             return None
         scale = (y[first] - y[second]) / (x[first] - x[second])
         shift = y[first] - scale * x[first]
-        # The line that half of the points are nearest to.
+        # Errors (pairs, points), and the line that half of the points are nearest to.
         errors = self._log(scale[:, None] * x + shift[:, None]) - log_y
         best = errors.abs().median(dim=1).values.argmin()
         return float(scale[best]), float(shift[best])
 
     def minimise(self, scale: float, shift: float) -> tuple[float, float]:
-        """Returns the minimum of the loss that Gauss-Newton steps reach from a line."""
+        """Returns scale and shift where Gauss-Newton steps from this line find a minimum."""
         errors = self.errors(scale, shift)
         for _ in range(_STEPS):
             width = _width(errors)
@@ -137,34 +147,39 @@ class _Line:
                 change = -errors
                 weights = _weights(errors, width)
             else:
-                value = (errors + self._log_y).exp()
-                change = -errors * value
-                weights = _weights(errors, width) / value.square()
-            more_scale, more_shift = _weighted_least_squares(self._x, change, weights)
-            # The step is halved until it lowers the loss.
+                line_y = (errors + self._log_y).exp()  # y of the line at each point, clamped
+                change = -errors * line_y
+                weights = _weights(errors, width) / line_y.square()
+            scale_step, shift_step = _weighted_least_squares(self._x, change, weights)
+            # The step is halved until it lowers the loss; if none does, this is the minimum.
             for halving in range(_HALVINGS):
-                size = 0.5**halving
-                nearer = self.errors(scale + size * more_scale, shift + size * more_shift)
-                lower = _loss(nearer, width)
-                if lower < loss:
+                fraction = 0.5**halving
+                next_scale = scale + fraction * scale_step
+                next_shift = shift + fraction * shift_step
+                next_errors = self.errors(next_scale, next_shift)
+                next_loss = _loss(next_errors, width)
+                if next_loss < loss:
                     break
             else:
                 break
-            scale += size * more_scale
-            shift += size * more_shift
-            errors = nearer
-            if loss - lower < _CONVERGED * loss:
+            scale = next_scale
+            shift = next_shift
+            errors = next_errors
+            if loss - next_loss < _CONVERGED * loss:
                 break
         return scale, shift
 
-    def _log(self, line: Tensor) -> Tensor:
-        """The logarithm of values of y, clamped to the limits."""
-        line = line.clamp(*self._limits)
-        return line if self._space == "log" else line.log()
+    def _log(self, y: Tensor) -> Tensor:
+        """The logarithm of values of y, clamped to the limits; of log depth y itself."""
+        clamped = y.clamp(*self._limits)
+        return clamped if self._space == "log" else clamped.log()
 
 
 def _weighted_least_squares(x: Tensor, y: Tensor, weights: Tensor) -> tuple[float, float]:
-    """Weighted least squares of y = scale·x + shift; the scale is 0 where x is the same."""
+    """Scale and shift of y = scale·x + shift by least squares with weights; all tensors are (N,).
+
+    The scale is 0 where x is the same everywhere.
+    """
     total = weights.sum()
     mean_x = (weights @ x) / total
     mean_y = (weights @ y) / total
@@ -176,12 +191,12 @@ def _weighted_least_squares(x: Tensor, y: Tensor, weights: Tensor) -> tuple[floa
 
 
 def _width(errors: Tensor) -> float:
-    """c of the loss."""
+    """c of the loss log(1 + (e/c)²) for errors (N,): a multiple of their robust deviation."""
     return _CAUCHY * max(MAD_TO_STD * float(errors.abs().median()), _LEAST_ERROR)
 
 
 def _weights(errors: Tensor, width: float) -> Tensor:
-    """The weights of least squares that has the loss's gradient."""
+    """(N,) the weights with which least squares has the gradient of the loss; width is its c."""
     return 1 / (1 + (errors / width).square())
 
 

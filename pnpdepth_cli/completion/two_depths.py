@@ -19,20 +19,22 @@ _STANDARD_ERRORS = 4.0
 OTHER_UNIT = math.log(1.5)
 """Log ratio that noise does not explain."""
 TIGHT = 0.25
-"""Spread of the log ratio of depths that differ by a unit."""
+"""Spread of the log ratio of depths that differ by a unit, at most."""
+_EXACT = TIGHT / 5
+"""Spread below which a factor explains everything, so that the order need not be seen."""
 
 
 class Agreement(NamedTuple):
     """How two depths of the same pixels agree."""
 
     pairs: int
-    """Number of pairs that both know."""
+    """Number of pixels that both know."""
     rank: float
     """Spearman's rank correlation, −1…1; 0 of values without order."""
     ratio: float
     """Median of first / second; NaN without pairs."""
     spread: float
-    """Half of the range that holds the middle 68 % of the log ratio."""
+    """Half of the range that holds the middle 68 % of log(first / second); NaN without pairs."""
 
     @property
     def is_reversed(self) -> bool:
@@ -46,11 +48,12 @@ class Agreement(NamedTuple):
 
     @property
     def is_unit(self) -> bool:
-        """Whether a factor, far from 1, explains the difference of the two."""
-        off = self.pairs >= FEWEST_PAIRS and abs(math.log(self.ratio)) > OTHER_UNIT
-        # of a wall, the order is noise
-        ordered = self.rank >= _CLEAR or self.spread < TIGHT / 5
-        return off and self.spread <= TIGHT and ordered
+        """Whether a factor, far from 1, explains the difference of the two, as of another unit."""
+        if self.pairs < FEWEST_PAIRS or abs(math.log(self.ratio)) <= OTHER_UNIT:
+            return False
+        # Both have one order. Of a wall the order is noise, but its ratio is the same everywhere.
+        is_alike = self.rank >= _CLEAR or self.spread < _EXACT
+        return is_alike and self.spread <= TIGHT
 
 
 def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) -> Agreement:
@@ -61,14 +64,14 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
         second: The others, of the same shape and pixels.
     """
     both = (first > 0) & (second > 0)
-    values = np.stack([first[both], second[both]]).astype(np.float64)
-    count = values.shape[1]
+    pairs = np.stack([first[both], second[both]]).astype(np.float64)  # (2, N)
+    count = pairs.shape[1]
     if not count:
         return Agreement(0, 0.0, math.nan, math.nan)
-    values = values[:, :: max(1, count // _MOST)]
-    log_ratio = np.log(values[0]) - np.log(values[1])
+    compared = pairs[:, :: max(1, count // _MOST)]
+    log_ratio = np.log(compared[0]) - np.log(compared[1])
     low, middle, high = np.quantile(log_ratio, (0.16, 0.5, 0.84)).tolist()
-    rank = rank_correlation(*values)
+    rank = rank_correlation(compared[0], compared[1])
     return Agreement(count, rank, math.exp(middle), (high - low) / 2)
 
 
@@ -76,17 +79,19 @@ def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) 
     """Returns Spearman's rank correlation of finite numbers (N,), 0 of numbers without order."""
     ranks = np.stack([_ranks(first), _ranks(second)])
     ranks -= ranks.mean(axis=1, keepdims=True)
-    length = float(np.linalg.norm(ranks[0]) * np.linalg.norm(ranks[1]))
-    return float(ranks[0] @ ranks[1]) / length if length > 0 else 0.0
+    norms = float(np.linalg.norm(ranks[0]) * np.linalg.norm(ranks[1]))
+    return float(ranks[0] @ ranks[1]) / norms if norms > 0 else 0.0
 
 
 def is_reversed(rank: float, pairs: int) -> bool:
     """Returns whether a rank correlation of so many pairs is clearly below 0, not by chance."""
-    return rank < -_CLEAR and -rank * math.sqrt(max(pairs - 1, 0)) > _STANDARD_ERRORS
+    # Without any order the standard error is 1 / √(pairs − 1).
+    standard_errors = -rank * math.sqrt(max(pairs - 1, 0))
+    return rank < -_CLEAR and standard_errors > _STANDARD_ERRORS
 
 
 def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The ranks (N,) of values (N,) from 1, the mean rank for equal ones.
+    """The rank (N,) of each value (N,) from 1, which is the mean rank for equal values.
 
     As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
     """

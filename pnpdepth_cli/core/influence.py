@@ -24,22 +24,26 @@ from pnpdepth_cli.core.spread import Spread, spread_of
 from pnpdepth_cli.errors import ModelError, wrap_user_errors
 
 _POSITIONS = ((0.5, 0.5), (0.35, 0.4), (0.65, 0.6))
-"""Where points are placed, as fractions of height and width; a field may differ by a stride."""
+"""Where points are placed, as fractions of height and width.
+
+There are several, as what points influence differs by up to a stride."""
 
 Patch = tuple[int, int]
 """Height and width of a patch."""
 
 
 class Field(NamedTuple):
-    """What one point influences: a patch of z in elements, and of the output in pixels.
+    """The influential field of a layer whose output is z: what one sparse point influences.
 
-    The sizes are upper bounds: units that are zero for an image let nothing through. in_z: None if
-    z has no two spatial axes. stride: pixels of the output for each element of z.
+    The sizes are upper bounds: units that are zero for an image let nothing through.
     """
 
     in_z: Patch | None
+    """Patch of z that the point's gradient reaches, in elements; None if z has no rows, columns."""
     in_output: Patch
+    """Patch of the predicted depth that changes when that patch of z does, in pixels."""
     stride: float
+    """Pixels of the predicted depth for each element of z; 0 if z has no rows and columns."""
 
 
 def influential_fields(
@@ -48,17 +52,23 @@ def influential_fields(
     layers: Iterable[str],
     prediction_of: Callable[[object], Tensor],
 ) -> dict[str, Field]:
-    """Returns the largest fields of a few points near the centre of the image, by layer.
+    """Returns how far a sparse point near the image's centre reaches, by layer.
 
-    A layer is left out that is not in the network, never runs, runs several times without a choice,
-    or gives no single tensor.
+    A layer's sizes are the largest ones of a few points. A layer is left out that is not in the
+    network, never runs, runs several times without a choice, or gives no single tensor.
 
     Args:
         module: The network, in eval mode.
-        arguments: Its arguments for a frame.
-        layers: Layers as `Split` takes them.
-        prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
+        arguments: Its arguments for one frame, such as an image (1, 3, H, W); tensors on the device
+            "meta", which have no values, are enough.
+        layers: Names of layers as `Split` takes them.
+        prediction_of: Function that takes what the network returns to its prediction, a tensor
+            whose last two axes are rows and columns.
+
+    Raises:
+        ModelError: The network's forward fails.
     """
+    # The layers that are in the network.
     cuts: dict[str, CutPoint] = {}
     for layer in layers:
         with suppress(ModelError):
@@ -67,52 +77,73 @@ def influential_fields(
     follower = _Follower()
     with ExitStack() as hooks, torch.no_grad(), wrap_user_errors("the network's forward"):
         for cut in cuts.values():
-            if not isinstance(cut.module, torch.jit.ScriptModule):
+            if not isinstance(cut.module, torch.jit.ScriptModule):  # which takes no such hook
                 hooks.enter_context(cut.module.register_forward_hook(partial(follower.begin, cut)))
         with follower:
             prediction = prediction_of(module(*arguments))
-    return {
-        layer: _field(follower.followed(layer, prediction), shape, prediction)
-        for layer, shape in follower.shapes.items()
-        if cuts[layer].call is not None or follower.calls[layer] == 1
-    }
+    # What the prediction depends on in each layer that ran once, or in the call that was chosen.
+    fields: dict[str, Field] = {}
+    for layer, z_shape in follower.z_shapes.items():
+        if cuts[layer].call is not None or follower.calls[layer] == 1:
+            fields[layer] = _field(follower.spreads_from(layer, prediction), z_shape, prediction)
+    return fields
 
 
-def _field(spreads: list[Spread], shape: torch.Size, prediction: Tensor) -> Field:
-    """The field of a layer whose output has this shape."""
-    patches = [_patches(spreads, prediction, position) for position in _POSITIONS]
+def _field(spreads: list[Spread], z_shape: torch.Size, prediction: Tensor) -> Field:
+    """The field of a layer: the largest patches of points at `_POSITIONS`.
+
+    Args:
+        spreads: Where the prediction depends on z, as `_Follower.spreads_from` gives it.
+        z_shape: Shape of z, the layer's output.
+        prediction: The prediction, whose last two axes are rows and columns.
+    """
+    patches = [_patches(spreads, prediction.shape, position) for position in _POSITIONS]
     in_z = _largest([patch.in_z for patch in patches])
     in_output = _largest([patch.in_output for patch in patches])
-    if len(shape) != 4:  # z has no rows and columns
+    if len(z_shape) != 4:  # z has no rows and columns
         return Field(None, in_output, stride=0.0)
-    return Field(in_z, in_output, stride=prediction.shape[-2] / max(1, shape[-2]))
+    return Field(in_z, in_output, stride=prediction.shape[-2] / max(1, z_shape[-2]))
 
 
 class _Patches(NamedTuple):
-    """What one point influences: a patch of z in elements, and of the output in pixels."""
+    """What one point influences."""
 
-    in_z: Patch
-    in_output: Patch
+    in_z: Patch  # in elements of z
+    in_output: Patch  # in pixels of the prediction
 
 
-def _patches(spreads: list[Spread], prediction: Tensor, position: tuple[float, float]) -> _Patches:
-    """The patches of a point at this position of the prediction, from its gradient and back."""
-    in_z = [0, 0]
-    in_output = [0, 0]
-    for side, fraction in enumerate(position):
-        # The spreads are those of the rows of z and of its columns, or of z as a whole.
-        axis = prediction.ndim - 2 + side
-        for spread in spreads[side : side + 1] or spreads:
-            first, last = spread.first[:, axis], spread.last[:, axis]
-            point = int(prediction.shape[axis] * fraction)
-            # The rows of z on which the point depends, then what depends on those rows.
-            reached = ((first <= point) & (point <= last)).nonzero()
-            if len(reached):
-                in_z[side] = int(reached[-1] - reached[0]) + 1
-                in_output[side] = int(last[reached].max() - first[reached].min()) + 1
-    if not all(in_z):
-        return _Patches((0, 0), (0, 0))
-    return _Patches((in_z[0], in_z[1]), (in_output[0], in_output[1]))
+def _patches(
+    spreads: list[Spread], prediction_shape: torch.Size, position: tuple[float, float]
+) -> _Patches:
+    """The patch of z that one pixel depends on, and the patch of pixels that depends on that one.
+
+    Both are 0 × 0 if the pixel does not depend on z.
+
+    Args:
+        spreads: Where the prediction depends on the rows and on the columns of z; one of all of z
+            if z has no rows and columns; none if the prediction does not depend on z.
+        prediction_shape: Shape of the prediction, whose last two axes are rows and columns.
+        position: Place of the pixel, as fractions of height and width.
+    """
+    nothing = _Patches((0, 0), (0, 0))
+    if not spreads:
+        return nothing
+    # Height and width of the patches, one after the other.
+    sizes_in_z: list[int] = []
+    sizes_in_output: list[int] = []
+    for number, fraction in enumerate(position):
+        spread = spreads[number] if len(spreads) == 2 else spreads[0]
+        axis = len(prediction_shape) - 2 + number
+        first = spread.first[:, axis]
+        last = spread.last[:, axis]
+        # The rows (or columns) of z on which the pixel depends, then what depends on those.
+        pixel = int(prediction_shape[axis] * fraction)
+        reached = ((first <= pixel) & (pixel <= last)).nonzero()
+        if not len(reached):
+            return nothing
+        sizes_in_z.append(int(reached[-1] - reached[0]) + 1)
+        sizes_in_output.append(int(last[reached].max() - first[reached].min()) + 1)
+    return _Patches((sizes_in_z[0], sizes_in_z[1]), (sizes_in_output[0], sizes_in_output[1]))
 
 
 def _largest(patches: Sequence[Patch]) -> Patch:
@@ -127,7 +158,17 @@ _ROWS = 0
 _COLUMNS = 1
 
 _Source = tuple[str, int]
-"""A layer, and `_ROWS` of its output, also for all of an output without rows, or `_COLUMNS`."""
+"""A layer, and whether the rows of its output are followed (`_ROWS`) or its columns (`_COLUMNS`).
+
+An output without rows and columns is followed as a whole, under `_ROWS`."""
+
+
+class _Input(NamedTuple):
+    """An input of an operation, as it was before the operation ran."""
+
+    place: int | None  # number of the argument; None of a tensor in a list or a keyword
+    tensor: Tensor
+    spreads: dict[_Source, Spread]  # where it depended on each source
 
 
 class _Follower(TorchDispatchMode):
@@ -138,25 +179,31 @@ class _Follower(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # as in `Watch`
+        """False, for the reason that `core.split.watch.Watch` states."""
+        return False
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.shapes: dict[str, torch.Size] = {}
-        """Shapes of the outputs of the layers that ran."""
+        self.z_shapes: dict[str, torch.Size] = {}
+        """Shape of z, the output, of each layer that is followed."""
         self.calls: Counter[str] = Counter()
         """How often each layer ran."""
-        self._followed: dict[int, dict[_Geometry, dict[_Source, Spread]]] = {}
+        self._spreads: dict[int, dict[_Geometry, dict[_Source, Spread]]] = {}
         """Spreads of tensors by storage, place in it, and source."""
 
     def begin(self, cut: CutPoint, _module: nn.Module, _inputs: object, output: object) -> None:
-        """Follows a layer's output from here on, if this is the call that is cut at; a hook."""
+        """Follows a layer's output from here on: a forward hook of the layer, after `cut`.
+
+        Only one call of the layer is followed, the one that the cut names, or the first. An output
+        without the tensor that the cut names is not followed.
+        """
         self.calls[cut.layer] += 1
-        if self.calls[cut.layer] != (cut.call or 1):
+        followed_call = 1 if cut.call is None else cut.call
+        if self.calls[cut.layer] != followed_call:
             return
-        with suppress(ModelError):
+        with suppress(ModelError):  # of `choose`, if there is no such tensor
             _, z = cut.choose(output)
-            self.shapes[cut.layer] = z.shape
+            self.z_shapes[cut.layer] = z.shape
             spreads = self._spreads_of(z)
             if z.ndim == 4:
                 spreads[cut.layer, _ROWS] = Spread.of_axis(z.shape, 2)
@@ -164,13 +211,14 @@ class _Follower(TorchDispatchMode):
             else:
                 spreads[cut.layer, _ROWS] = Spread.whole(z.shape or (1,), 1)
 
-    def followed(self, layer: str, tensor: Tensor) -> list[Spread]:
-        """Returns where a tensor depends on the rows and the columns of a layer's output.
+    def spreads_from(self, layer: str, tensor: Tensor) -> list[Spread]:
+        """Returns where a tensor depends on the rows, and where on the columns of a layer's output.
 
         One spread if the output has no rows and columns; none if the tensor does not depend on it.
         """
         spreads = self._spreads_of(tensor)
-        return [spreads[layer, side] for side in (_ROWS, _COLUMNS) if (layer, side) in spreads]
+        sources = [(layer, _ROWS), (layer, _COLUMNS)]
+        return [spreads[source] for source in sources if source in spreads]
 
     def __torch_dispatch__(
         self,
@@ -181,56 +229,69 @@ class _Follower(TorchDispatchMode):
     ) -> object:
         """Runs an operation of torch, and keeps where its outputs depend on the layers followed.
 
+        Torch calls this for every operation while the mode is active.
+
         Returns:
             What the operation gives.
         """
         kwargs = kwargs or {}
-        # Inputs by the number of the argument; those in lists and keywords have none.
-        inputs = [
-            (int(path[0]) if len(path) == 1 else None, tensor) for path, tensor in tensors_in(args)
-        ]
-        inputs += [(None, tensor) for _, tensor in tensors_in(kwargs)]
-        # Their spreads are copied first, as the operation may change an input in place.
-        before = [(index, tensor, dict(self._spreads_of(tensor))) for index, tensor in inputs]
+        # The inputs. Their spreads are copied, as the operation may change an input in place.
+        inputs: list[_Input] = []
+        for path, tensor in tensors_in(args):
+            place = int(path[0]) if len(path) == 1 else None  # a longer path leads into a list
+            inputs.append(_Input(place, tensor, dict(self._spreads_of(tensor))))
+        for _, tensor in tensors_in(kwargs):
+            inputs.append(_Input(None, tensor, dict(self._spreads_of(tensor))))
         result = func(*args, **kwargs)
-        storages = {_storage(tensor) for _, tensor in inputs}
-        for position, (_, output) in enumerate(tensors_in(result)):
+        input_storages = {_storage(input_.tensor) for input_ in inputs}
+        for number, (_, output) in enumerate(tensors_in(result)):
             # Where the output depends on each source, through any of the inputs.
             output_spreads: dict[_Source, Spread] = {}
-            for index, tensor, input_spreads in before:
+            for place, tensor, input_spreads in inputs:
                 for source, spread in input_spreads.items():
-                    moved = spread_of(func, args, index, tensor, spread, output, position)
+                    moved = spread_of(func, args, place, tensor, spread, output, number)
                     if moved is not None:
                         output_spreads[source] = moved.joined(output_spreads.get(source))
-            if _storage(output) not in storages:
-                self._followed[_storage(output)] = {}  # new memory; what was there before is gone
+            if _storage(output) not in input_storages:
+                self._spreads[_storage(output)] = {}  # new memory; what was there before is gone
             elif func._schema.is_mutable:
-                self._spoil(output, output_spreads)
-            self._followed.setdefault(_storage(output), {})[_geometry(output)] = output_spreads
+                self._widen_views(output, output_spreads)
+            self._spreads.setdefault(_storage(output), {})[_geometry(output)] = output_spreads
         return result
 
     def _spreads_of(self, tensor: Tensor) -> dict[_Source, Spread]:
         """The spreads of a tensor by source, to read and to change; empty where it has none."""
-        places = self._followed.setdefault(_storage(tensor), {})
+        places = self._spreads.setdefault(_storage(tensor), {})
         return places.setdefault(_geometry(tensor), {})
 
-    def _spoil(self, written: Tensor, spreads: dict[_Source, Spread]) -> None:
-        """Notes a change in place: other views of the same memory may depend on all of it."""
-        for (_, shape, _), view_spreads in self._followed.get(_storage(written), {}).items():
+    def _widen_views(self, written: Tensor, spreads: dict[_Source, Spread]) -> None:
+        """After a change in place, every view of that memory depends on its sources everywhere.
+
+        Which elements of another view were changed is not worked out.
+
+        Args:
+            written: The tensor that was changed.
+            spreads: Where it depends on each source since.
+        """
+        for (_, shape, _), view_spreads in self._spreads.get(_storage(written), {}).items():
             for source, spread in spreads.items():
                 view_spreads[source] = Spread.whole(shape or (1,), len(spread.first))
 
 
 def _storage(tensor: Tensor) -> int:
-    """A number that tensors in the same memory share."""
+    """A number that tensors in the same memory share; 0 for a sparse tensor, which has no storage.
+
+    It is the address of the storage, which torch raises NotImplementedError for where there is
+    none.
+    """
     try:
         return int(tensor.untyped_storage()._cdata)
-    except NotImplementedError:  # a sparse tensor has none
+    except NotImplementedError:
         return 0
 
 
 def _geometry(tensor: Tensor) -> _Geometry:
-    """Where in its storage a tensor lies; a sparse tensor is told by its shape alone."""
+    """Where in its storage a tensor lies; of a sparse tensor its shape alone."""
     if tensor.layout != torch.strided:
         return 0, tensor.shape, ()
     return int(tensor.storage_offset()), tensor.shape, tensor.stride()

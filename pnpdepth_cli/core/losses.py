@@ -29,13 +29,17 @@ gave equal ones, but larger ones where a fifth of the points were outliers."""
 
 
 def checked_loss(name: str) -> Loss:
-    """Returns a loss of `LOSSES`; it raises ModelError where it fails or its value is no scalar."""
-    function: Loss = LOSSES[name]
+    """Returns a loss that raises ModelError where the one in `LOSSES` fails or gives no scalar.
+
+    Args:
+        name: Name of a loss in `LOSSES`, or path of a user's Python file with one.
+    """
+    loss: Loss = LOSSES[name]
 
     def checked(predicted: Tensor, true: Tensor) -> Tensor:
-        """The loss, of one element."""
+        """The loss of depths (N,) and (N,) in metres, of one element."""
         with wrap_user_errors(f"loss {name!r}"):
-            value = function(predicted, true)
+            value = loss(predicted, true)
             if value.numel() != 1:
                 shape = tuple(value.shape)
                 raise ModelError(f"loss {name!r} gives {shape}, not a scalar; add .mean()")
@@ -65,6 +69,7 @@ def berhu(predicted: Tensor, true: Tensor) -> Tensor:
     The reverse Huber loss of Laina et al. 2016, equation 2.
     """
     error = (predicted - true).abs()
+    # Above 0 also where all errors are 0, because it is divided by.
     c = (0.2 * error.detach().max()).clamp_min(torch.finfo(error.dtype).tiny)
     return torch.where(error <= c, error, (error.square() + c.square()) / (2 * c)).mean()
 

@@ -14,7 +14,7 @@ equations 2 and 3:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,7 +28,9 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 
 _LOSS_SCALE = 1024.0
-"""Factor on the loss where float16 is involved, whose smallest number exceeds many gradients."""
+"""Factor on the loss where float16 is involved, whose smallest number exceeds many gradients.
+
+The gradient is divided by it afterwards. It is a power of two, so neither rounds."""
 
 DepthOf = Callable[[object], Tensor]
 """Turns the network's output for one frame into depth (1, 1, h, w) in metres, differentiably."""
@@ -53,21 +55,22 @@ def refine(
     depth_of: DepthOf,
     z0: Tensor | None = None,
 ) -> Refinement:
-    """Returns the network's depth for one frame, refined to agree with the points.
+    """Returns the network's depth for one frame, before and after `settings.iterations` updates.
 
     Args:
         split: The network cut at a layer, open.
         arguments: The arguments of the network for the frame.
-        points: Sparse depth on the grid of the predicted depth's field of view.
+        points: Sparse depth of the frame; its frame has the predicted depth's field of view, and
+            may have another number of pixels.
         settings: Update rule, loss, step size and number of updates.
         depth_of: Turns the network's output into depth (1, 1, h, w) in metres, differentiably.
         z0: f_front of the arguments, where the front has run. None: it has not.
 
     Raises:
         DivergedError: The loss or its gradient is not finite; `last_good` is the Refinement until
-            then.
+            then, None if that was the first loss.
         ModelError: The first prediction is not finite at any point, or the depth does not depend
-            on z.
+            on z; or network, loss or update rule fail.
     """
     # z_0 = f_front(x)
     with torch.no_grad():
@@ -75,47 +78,34 @@ def refine(
     step = step_size(settings.lr, z)
     loss_of = checked_loss(settings.loss)
     rule: Update = UPDATES[settings.update]()
-    scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
-    before: Tensor | None = None
-    losses: tuple[float, ...] = ()
     so_far: Refinement | None = None
     updates = 0
     while True:
+        # The depth f_rear(z_k) and its loss L at the points; the last pass needs no gradient.
         is_last = updates == settings.iterations
-        # The depth f_rear(z_k) and its loss L at the points.
         z = z.detach() if is_last else z.detach().requires_grad_(True)
         with torch.set_grad_enabled(not is_last):
             depth = depth_of(split.rear(z))
             at_points = points.sample(depth)
-            if so_far is None:  # a point has no part in L where f(x) is unknown, such as in the sky
-                known = at_points.isfinite()
-                if settings.iterations and not bool(known.any()):
+            if so_far is None:
+                # A point has no part in L where f(x) is unknown, such as in the sky.
+                is_known = at_points.isfinite()
+                if settings.iterations and not bool(is_known.any()):
                     raise ModelError(
                         f"the network's prediction is not finite at any of {len(points):,} sparse"
                         " points, before any update of z; are its weights, its input range"
                         " (`normalise`) and precision right?"
                     )
-                points = points.select(known)
-                at_points = at_points[known]
+                points = points.select(is_known)
+                at_points = at_points[is_known]
             loss = loss_of(at_points, points.depth)
         if settings.iterations and not bool(loss.isfinite()):
             raise _diverged("loss", updates, step, so_far)
-        after = depth.detach()
-        before = after if before is None else before
-        losses = (*losses, float(loss.detach()))
-        so_far = Refinement(before=before, after=after, losses=losses, step=step)
+        so_far = _with_pass(so_far, depth.detach(), float(loss.detach()), step)
         if is_last:
             return so_far
-        # Its gradient at z_k.
-        with torch.enable_grad():
-            gradient = gradient_at(z, loss * scale)
-        if gradient is None:
-            raise ModelError(
-                f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
-                " the prediction does not depend on it or the network's forward runs under"
-                " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-            )
-        gradient = gradient / scale
+        # The gradient of L at z_k.
+        gradient = _gradient(loss, z, split)
         if not bool(gradient.isfinite().all()):
             raise _diverged("gradient", updates, step, so_far)
         # z_{k+1} = z_k − α·U(gradient)
@@ -128,8 +118,40 @@ def refine(
         updates += 1
 
 
+def _with_pass(so_far: Refinement | None, depth: Tensor, loss: float, step: float) -> Refinement:
+    """The refinement with one more pass of the rear; None so far: this is the pass of z_0."""
+    if so_far is None:
+        return Refinement(before=depth, after=depth, losses=(loss,), step=step)
+    return replace(so_far, after=depth, losses=(*so_far.losses, loss))
+
+
+def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
+    """∂loss/∂z, of the shape of z.
+
+    Raises:
+        ModelError: The loss does not depend on z, as far as torch can follow.
+    """
+    scale = _LOSS_SCALE if split.in_half else 1.0
+    with torch.enable_grad():
+        gradient = gradient_at(z, loss * scale)
+    if gradient is None:
+        raise ModelError(
+            f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
+            " the prediction does not depend on it or the network's forward runs under"
+            " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+        )
+    return gradient / scale
+
+
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:
-    """The error of a loss or a gradient that is not finite; `so_far` is its `last_good`."""
+    """The error of a loss or a gradient that is not finite.
+
+    Args:
+        quantity: "loss" or "gradient".
+        updates: How many updates of z were made.
+        step: α as a number.
+        so_far: The refinement until then, which is the error's `last_good`.
+    """
     plural = "" if updates == 1 else "s"
     return DivergedError(
         f"the {quantity} is not finite after {updates} update{plural} of z (step {step:.3g});"

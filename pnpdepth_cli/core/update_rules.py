@@ -38,8 +38,8 @@ def normalised() -> Update:
     def update(gradient: Tensor) -> Tensor:
         # Divided by the largest element first: squares of tiny gradients would underflow.
         largest = gradient.abs().max().clamp_min(torch.finfo(gradient.dtype).tiny)
-        gradient = gradient / largest
-        return gradient / gradient.square().mean().sqrt().clamp_min(torch.finfo().tiny)
+        relative = gradient / largest
+        return relative / relative.square().mean().sqrt().clamp_min(torch.finfo().tiny)
 
     return update
 
@@ -70,16 +70,21 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
         eps: Summand of the denominator. It is smaller than the common 1e-8, because the gradient of
             a mean over many points is tiny at most elements of z and 1e-8 would suppress them.
     """
-    first: Tensor | None = None
-    second: Tensor | None = None
+    mean: Tensor | None = None
+    mean_square: Tensor | None = None
     step = 0
 
     def update(gradient: Tensor) -> Tensor:
-        nonlocal first, second, step
+        nonlocal mean, mean_square, step
         step += 1
-        first = (1 - beta1) * gradient + (0 if first is None else beta1 * first)
-        second = (1 - beta2) * gradient.square() + (0 if second is None else beta2 * second)
-        return (first / (1 - beta1**step)) / ((second / (1 - beta2**step)).sqrt() + eps)
+        mean = (1 - beta1) * gradient + (0 if mean is None else beta1 * mean)
+        mean_square = (1 - beta2) * gradient.square() + (
+            0 if mean_square is None else beta2 * mean_square
+        )
+        # Both begin at 0, which the division takes out (bias correction).
+        unbiased_mean = mean / (1 - beta1**step)
+        unbiased_square = mean_square / (1 - beta2**step)
+        return unbiased_mean / (unbiased_square.sqrt() + eps)
 
     return update
 
@@ -103,8 +108,10 @@ def step_size(lr: float | str, z0: Tensor) -> float:
         z0: z_0, of any shape.
     """
     text = str(lr).strip()
-    value = float(text.removesuffix("%"))
-    return value / 100 * float(z0.float().std(correction=0)) if text.endswith("%") else value
+    number = float(text.removesuffix("%"))
+    if not text.endswith("%"):
+        return number
+    return number / 100 * float(z0.float().std(correction=0))
 
 
 def blur(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
@@ -114,23 +121,32 @@ def blur(gradient: Tensor, points: SparsePoints, spacings: float) -> Tensor:
     reach far, many points hardly beyond their own cells.
 
     Args:
-        gradient: (1, C, h, w) at z. Another shape is returned unchanged.
+        gradient: Gradient (1, C, h, w) at z. Another shape, which has no rows and columns to blur
+            along, is returned unchanged.
         points: The N sparse points of an image of H × W pixels.
         spacings: Standard deviation in units of √(HW/N) pixels; 0 returns the gradient unchanged.
     """
     if not spacings or gradient.ndim != 4:
         return gradient
     height, width = points.size
-    sigma = spacings * (height * width / len(points)) ** 0.5
-    down, across = (
-        _gaussian(cells, sigma * cells / pixels, gradient)
-        for cells, pixels in zip(gradient.shape[-2:], (height, width), strict=True)
-    )
+    sigma_px = spacings * (height * width / len(points)) ** 0.5
+    rows, columns = gradient.shape[-2:]
+    # z has fewer rows and columns than the image, so that sigma is shorter in its cells.
+    down = _gaussian(rows, sigma_px * rows / height, gradient)
+    across = _gaussian(columns, sigma_px * columns / width, gradient)
     return down @ gradient @ across.T
 
 
 def _gaussian(cells: int, sigma: float, like: Tensor) -> Tensor:
-    """(cells, cells): row i has the weights around cell i; every row sums to 1, also at borders."""
-    at = torch.arange(cells, device=like.device, dtype=like.dtype)
-    weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
+    """The matrix (cells, cells) that convolves a row of cells with a Gaussian.
+
+    Its row i has the weights around cell i. Every row sums to 1, also at borders.
+
+    Args:
+        cells: Number of cells in the row.
+        sigma: Standard deviation in cells.
+        like: Tensor whose type and device the matrix has.
+    """
+    index = torch.arange(cells, device=like.device, dtype=like.dtype)
+    weights = torch.exp(-0.5 * ((index[:, None] - index) / sigma).square())
     return weights / weights.sum(dim=1, keepdim=True)

@@ -28,4 +28,4 @@ def field(
     features = features_of(log, rgb)
     residual = torch.sin(xy[:, 0] / width * 3).double() * 0.3 + 0.2
     at = torch.stack([points.sample(feature) for feature in features], dim=1)
-    return Residuals(features=features, points=points, at=at, residual=residual)
+    return Residuals(features=features, points=points, point_features=at, residual=residual)

@@ -32,7 +32,7 @@ def reference(
     field: Residuals, near: np.ndarray, queries: np.ndarray, noise: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance at features (M, 6) by the textbook, from the points with these numbers."""
-    a = field.at.double().numpy()[near]
+    a = field.point_features.double().numpy()[near]
     k = covariance(field, queries, a)
     inverse = np.linalg.inv(covariance(field, a, a) + noise * np.eye(len(a)))
     variance = 1 + 100 + queries[:, 2] ** 2 - np.sum(k @ inverse * k, axis=1)
@@ -82,7 +82,7 @@ def test_errors_and_variances_of_left_out_points_are_those_of_leaving_them_out(c
     weight[5] = 0
     near = neighbourhoods(residuals, 128)
     error, variance = leave_one_out(residuals, near, weight)
-    at = residuals.at.double().numpy()
+    at = residuals.point_features.double().numpy()
     xy = residuals.points.xy.numpy()
     noise = residuals.noise / weight.clamp_min(1e-6).numpy() ** 2
     for row, numbers in enumerate(near.numpy()):
@@ -103,7 +103,7 @@ def test_the_fit_has_the_smallest_error_of_all_lengths_and_then_of_all_noises(co
     for seed in range(12):
         residuals = field(60, colour=colour, seed=seed)
         depth_length = (1.0, 2.5, 8.0, 25.0)[seed % 4]
-        at = residuals.at.double().numpy()
+        at = residuals.point_features.double().numpy()
         drawn = replace(residuals, depth_length=depth_length, colour_length=2.5, noise=1e-4)
         root = np.linalg.cholesky(covariance(drawn, at, at) + drawn.noise * np.eye(60))
         residual = root @ np.random.default_rng(seed).normal(size=60)

@@ -97,6 +97,9 @@ class Split:
         """Returns z_0, the output of the cut layer for these arguments of the network.
 
         In float32 if the layer gives a shorter type, in which small steps would be rounded away.
+
+        Raises:
+            ModelError: The network does not come to the cut, or fails before.
         """
         if self._replay is not None and self._replay.holds_for(arguments):
             self._replay.next_frame(arguments)
@@ -108,7 +111,12 @@ class Split:
         return z0.to(torch.float32 if z0.dtype in _LOW_PRECISION else z0.dtype, copy=True)
 
     def rear(self, z: Tensor) -> Any:
-        """Returns what the network returns when the cut layer gives z."""
+        """Returns what the network returns for the front's arguments when the cut layer gives z.
+
+        Raises:
+            ModelError: The network fails, the layer runs several times without a choice, or its
+                output cannot be replaced.
+        """
         replay = self._replay
         if replay is None or replay.z0 is None:
             raise RuntimeError("rear() needs front() first")
@@ -132,7 +140,8 @@ class Split:
             if cut.hooked != self._cut.hooked:
                 self._cut = cut
                 continue
-            # Once more, if submodules cannot be cached as a whole: to cache what is in those.
+            # Once more, if this pass met submodules that cannot be cached as a whole: the next one
+            # caches what is in them.
             if len(self._uncacheable) == uncacheable_before:
                 recorder.finish(complete=False)
                 return z0
@@ -146,24 +155,26 @@ class Split:
         try:
             self._run(replay, recorder)
         except PnpDepthError:
-            # The replay itself ends the pass at the cut.
+            # The replay itself ends the pass at the cut, by `Replay.end_of_front`.
             if not replay.has_front:
                 raise
-        if replay.z0 is None or replay.z is not None:
-            ran = {module for module, _ in replay.outputs}
-            ran = ran if recorder is None else recorder.ran
-            raise self._cut.never_ran(ran, replay.calls[self._cut.module])
+        if replay.z0 is None or replay.z is not None:  # has no front, as mypy understands it
+            ran = {module for module, _ in replay.outputs} if recorder is None else recorder.ran
+            raise self._cut.not_reached_error(ran, replay.calls[self._cut.module])
         return replay.z0
 
     def _recorder(self, replay: Replay) -> Recorder:
-        """What learns from the next pass; it protects every saved tensor."""
+        """A recorder for the next pass, whose watch protects every saved tensor from changes."""
         saved = [output for output in replay.outputs.values() if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
         watch = Watch(tensors, escapes=not self._promised_static)
         return Recorder(self._cut, watch, replay, self._uncacheable)
 
     def _handle(self, module: nn.Module, inputs: object, run: Run) -> object:
-        return run() if self._replay is None else self._replay.handle(module, inputs, run)
+        """The output of a call of a submodule, which the replay decides if there is one."""
+        if self._replay is None:  # before the first frame
+            return run()
+        return self._replay.handle(module, inputs, run)
 
     def _run(self, replay: Replay, recorder: Recorder | None = None) -> object:
         """One pass of the network, learning if there is a recorder."""
@@ -185,7 +196,11 @@ class Split:
 
 
 def gradient_at(z: Tensor, value: Tensor) -> Tensor | None:
-    """Returns ∂value/∂z for a fresh leaf z; None where no gradient comes back to it.
+    """Returns ∂value/∂z, of the shape of z; None where no gradient comes back to z.
+
+    Args:
+        z: Leaf tensor that requires gradient and has none yet.
+        value: Scalar that was computed from z, such as a loss.
 
     Raises:
         ModelError: The network cannot be differentiated.

@@ -35,7 +35,15 @@ class CutPoint:
 
     @classmethod
     def find(cls, network: nn.Module, layer: str) -> CutPoint:
-        """Returns the cut point of that name. Raises ModelError if there is no such submodule."""
+        """Returns the cut point of that name.
+
+        Args:
+            network: The network.
+            layer: Name of a submodule, `NAME#2` for its second call, `NAME[KEY]` for one output.
+
+        Raises:
+            ModelError: The text is no such notation, or the network has no such submodule.
+        """
         # The notation.
         match = _NAME.fullmatch(layer)
         if match is None or match["call"] == "0":
@@ -53,8 +61,13 @@ class CutPoint:
             raise ModelError(f"layer {name!r} is not in this network; {hint}")
         module = modules[name]
         # What is around it, and around submodules with hooks.
-        hooked = [n for n, m in modules.items() if m._forward_hooks or m._forward_pre_hooks]
-        names = [n for n, m in modules.items() if m is module]  # several where it is shared
+        hooked = [
+            module_name
+            for module_name, hooked_module in modules.items()
+            if hooked_module._forward_hooks or hooked_module._forward_pre_hooks
+        ]
+        # Its names, of which it has several where it is shared.
+        names = [other_name for other_name, other in modules.items() if other is module]
         return cls(
             layer=layer,
             name=name,
@@ -68,7 +81,10 @@ class CutPoint:
         )
 
     def choose(self, output: object) -> tuple[tuple[str, ...], Tensor]:
-        """Returns the path and the tensor of z in the layer's output.
+        """Returns the path of z in the layer's output, and z itself, detached.
+
+        The path is the keys of nested containers, as `tensors_in` yields it; () if the output is a
+        tensor.
 
         Raises:
             ModelError: The output has no such tensor, or several and the name chooses none.
@@ -78,9 +94,12 @@ class CutPoint:
             for path, tensor in tensors_in(output)
             if tensor.is_floating_point() and tensor.layout == torch.strided
         ]
+        # Without a key every candidate is chosen, which is right if there is one.
         chosen = [(path, tensor) for path, tensor in candidates if self.key in ((), path)]
         if len(chosen) == 1:
-            return chosen[0][0], chosen[0][1].detach()
+            path, tensor = chosen[0]
+            return path, tensor.detach()
+        # The names of all candidates, such as `decoder[0][features]`.
         keys = ["".join(f"[{key}]" for key in path) for path, _ in candidates]
         names = ", ".join(self.name + key for key in keys)
         if self.key:
@@ -91,8 +110,13 @@ class CutPoint:
             problem = "returns no tensor"
         raise ModelError(f"layer {self.layer!r} {problem}")
 
-    def never_ran(self, ran: Collection[nn.Module], calls: int) -> ModelError:
-        """Returns the error of a pass that did not reach the cut."""
+    def not_reached_error(self, ran: Collection[nn.Module], calls: int) -> ModelError:
+        """Returns the error of a pass that did not reach the cut, which tells where else to cut.
+
+        Args:
+            ran: Submodules that ran in the pass.
+            calls: How often the layer's submodule was called in it.
+        """
         if self.module in ran:
             times = f"{calls} time{'s' if calls > 1 else ''}"
             return ModelError(f"layer {self.layer!r}: it is called only {times}")
@@ -106,10 +130,16 @@ class CutPoint:
 
 
 def _around(inner_names: list[str], modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
-    """The submodules that contain another one with one of these names."""
-    return frozenset(
-        module
-        for name, module in modules.items()
-        for inner in inner_names
-        if name != inner and (not name or inner.startswith(f"{name}."))
-    )
+    """The submodules that contain one with one of these names, not itself included.
+
+    Args:
+        inner_names: Names such as `decoder.up1`.
+        modules: All submodules by name; the network itself has the name "".
+    """
+    around = set()
+    for inner_name in inner_names:
+        for name, module in modules.items():
+            is_network = name == ""
+            if inner_name != name and (is_network or inner_name.startswith(f"{name}.")):
+                around.add(module)
+    return frozenset(around)

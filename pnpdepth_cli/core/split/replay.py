@@ -19,10 +19,10 @@ from pnpdepth_cli.core.split.watch import Watch
 from pnpdepth_cli.errors import ModelError, PnpDepthError
 
 Run = Callable[[], object]
-"""Runs a call of a submodule; returns its output."""
+"""Runs a call of a submodule as the network made it; returns its output."""
 
 Call = tuple[nn.Module, int]
-"""A recorded call: its submodule, and the number of that submodule's recorded calls before it."""
+"""A recorded call: its submodule, and how many recorded calls of that submodule were before it."""
 
 Handler = Callable[[nn.Module, object, Run], object]
 """Called with a submodule, its inputs (args, kwargs) and a function that runs it."""
@@ -30,7 +30,15 @@ Handler = Callable[[nn.Module, object, Run], object]
 
 @contextmanager
 def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None]:
-    """Inside, calls of the submodules go to the handler; afterwards to their own `forward`."""
+    """Inside this context, calls of submodules return what the handler returns.
+
+    Afterwards they go to their own `forward` again.
+
+    Args:
+        modules: The submodules; one may come several times.
+        handler: Function called with a submodule, its inputs (args, kwargs) and a function that
+            runs it.
+    """
     # Few modules have a `forward` of their own; that of the others is their class's.
     own_forwards = {module: module.__dict__.get("forward") for module in modules}
     try:
@@ -47,7 +55,7 @@ def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None
 def _stand_in(
     module: nn.Module, original: Callable[..., object], handler: Handler
 ) -> Callable[..., object]:
-    """A `forward` that leaves the call to the handler."""
+    """A `forward` for a module that leaves the call to the handler; `original` is the module's."""
 
     @functools.wraps(original)
     def forward(*args: object, **kwargs: object) -> object:
@@ -57,9 +65,13 @@ def _stand_in(
 
 
 def shapes_of(arguments: object) -> object:
-    """Returns what arguments must share for a network without branches to treat them alike."""
-    tensors = [(t.shape, t.dtype, t.device) for _, t in tensors_in(arguments)]
-    return tensors, repr(map_tensors(arguments, lambda _, t: t.new_empty(0)))
+    """Returns a value that is equal for arguments which differ by the values of tensors alone.
+
+    It has the tensors' shapes, types and devices, and all that is no tensor. A network without
+    branches on values treats such arguments alike.
+    """
+    tensors = [(tensor.shape, tensor.dtype, tensor.device) for _, tensor in tensors_in(arguments)]
+    return tensors, repr(map_tensors(arguments, lambda _, tensor: tensor.new_empty(0)))
 
 
 class Replay:
@@ -68,6 +80,7 @@ class Replay:
     In the learning passes, calls that are not recorded yet go to the `recorder`.
 
     Args:
+        cut: The layer where the network is cut.
         arguments: Arguments of the network for the first frame.
     """
 
@@ -82,12 +95,12 @@ class Replay:
         self.path: tuple[str, ...] = ()  # path of z in the output of that call
         self.static_graph = True  # whether arguments of the same shapes all make the same calls
         self.complete = False  # whether the calls behind the cut are recorded, too
-        self.z0: Tensor | None = None
-        self.z: Tensor | None = None
+        self.z0: Tensor | None = None  # None before the front has run for the frame at hand
+        self.z: Tensor | None = None  # what the cut layer gives; None before the first rear
         self.calls: Counter[nn.Module] = Counter()
         """How often each submodule was called in the last pass."""
-        self.recorder: Recorder | None = None
-        self.in_pass = False
+        self.recorder: Recorder | None = None  # of a learning pass; None in the others
+        self.in_pass = False  # whether the network's forward runs
         self._fills = False  # inside a call whose output will be saved as a whole
 
     def holds_for(self, arguments: tuple[object, ...]) -> bool:
@@ -98,8 +111,10 @@ class Replay:
         """Forgets the frame at hand; `arguments` are those of the next one."""
         self.arguments = SavedTensors(_copies(arguments), self.arguments.copied)
         for call, saved in self.outputs.items():
-            self.outputs[call] = saved and SavedTensors(copied=saved.copied)
-        self.z0 = self.z = None
+            if saved is not None:
+                self.outputs[call] = SavedTensors(copied=saved.copied)
+        self.z0 = None
+        self.z = None
 
     @property
     def has_front(self) -> bool:
@@ -107,23 +122,37 @@ class Replay:
         return self.z0 is not None and self.z is None
 
     def end_of_front(self) -> PnpDepthError:
-        """Returns what ends the front's pass; a network that catches it gets it again."""
+        """Returns the error that ends the front's pass when the cut has given z_0.
+
+        A network that catches it gets it again from its next call.
+        """
         return PnpDepthError(f"layer {self._cut.layer!r} was reached, where the network is cut")
 
     def handle(self, module: nn.Module, inputs: object, run: Run) -> object:
-        """Returns the output of a call: saved, with z in it, or of the submodule."""
+        """Returns the output of a call: the saved one, one with z in it, or the submodule's own.
+
+        Args:
+            module: The submodule that is called.
+            inputs: Its inputs (args, kwargs).
+            run: Function that runs it on these.
+
+        Raises:
+            PnpDepthError: The call is the cut in the front's pass, or follows it (`end_of_front`).
+        """
         if not self.in_pass:
             return self._handle_outside(module, run)
         if self._fills:
             return run()
-        if self.has_front:
+        if self.has_front:  # the network has caught the end of the front
             raise self.end_of_front()
+        # A learning pass watches the call; a call that is not recorded yet is recorded.
         if self.recorder is not None:
             run = functools.partial(self.recorder.run, module, run)
         call = module, self.calls[module]
         self.calls[module] += 1
         if call not in self.outputs:
             return run() if self.recorder is None else self.recorder.record(module, inputs, run)
+        # A recorded call. The cut ends the front's pass; in the rear's it gives z.
         is_cut = call == self.cut_call
         if is_cut and self.z0 is not None:
             return self._output_with_z(run)
@@ -134,20 +163,24 @@ class Replay:
         return output
 
     def _handle_outside(self, module: nn.Module, run: Run) -> object:
-        """The output of a call between passes, with z if checkpointing repeats the cut."""
-        in_backward = torch._C._current_graph_task_id() != -1
+        """The output of a call between passes, with z in it if it repeats the cut.
+
+        Checkpointing (`torch.utils.checkpoint`) repeats calls in the backward pass. Of a layer that
+        is called several times it cannot be told which call is repeated.
+        """
+        in_backward = torch._C._current_graph_task_id() != -1  # torch's number of no backward pass
         is_cut = module is self._cut.module and self.calls[module] == 1
         return self._output_with_z(run) if in_backward and is_cut else run()
 
     def _saved_output(self, call: Call, run: Run) -> object:
-        """The saved output of a recorded call. A call that may be saved runs once, others always.
+        """The output of a recorded call: a call that may be saved runs once a frame, others always.
 
         Calls inside the one that runs are not replayed meanwhile (`_fills`).
         """
         saved = self.outputs[call]
-        if saved is None:
+        if saved is None:  # it may not be saved
             return run()
-        if saved.value is not None:
+        if saved.value is not None:  # it has run for this frame
             return saved.fresh()
         self._fills = True
         try:
@@ -158,7 +191,11 @@ class Replay:
         return output
 
     def _output_with_z(self, run: Run) -> object:
-        """The output of the cut, with z in place of z_0."""
+        """The output of the cut layer, with z in place of z_0.
+
+        Raises:
+            RuntimeError: There is no z yet, which is a fault of the caller.
+        """
         if self.z is None or self.z0 is None or self.cut_call is None:
             raise RuntimeError("the cut layer runs again before front() and rear()")
         # A copy, because the network may go on in place and z may be a leaf.
@@ -167,24 +204,25 @@ class Replay:
         # Without a saved output the layer runs for what else it does, as changing its input.
         output = run() if saved is None else saved.fresh()
         if self.recorder is not None:
-            original = None if saved else dict(tensors_in(output))[self.path]
-            self.recorder.watch.injected(z, original)
-        return map_tensors(output, lambda path, t: z if path == self.path else t)
+            original = dict(tensors_in(output))[self.path] if saved is None else None
+            self.recorder.watch.note_injection(z, original)
+        return map_tensors(output, lambda path, tensor: z if path == self.path else tensor)
 
 
 def _copies(arguments: Sequence[object]) -> object:
-    """The network may change its arguments in place; the caller's must not change."""
-    return map_tensors(tuple(arguments), lambda _, t: t.detach().clone())
+    """Copies of the arguments, which the network may change in place; the caller's stay as is."""
+    return map_tensors(tuple(arguments), lambda _, tensor: tensor.detach().clone())
 
 
 class Recorder:
     """Notes the calls of one pass that the replay does not know yet.
 
     Args:
+        cut: The layer where the network is cut.
         watch: Sees the operations of the pass.
         replay: Handles the pass; gets the recorded calls when the pass is over.
-        uncacheable: Submodules that contain something which forbids to cache them as a whole;
-            more are added. Their submodules are then recorded one by one.
+        uncacheable: Submodules that contain something which forbids to cache them as a whole; those
+            that this pass meets are added. Their submodules are recorded one by one.
     """
 
     def __init__(
@@ -196,49 +234,60 @@ class Recorder:
         self._cut = cut
         self._replay = replay
         self._uncacheable = uncacheable
-        self._saved = dict(replay.outputs)
-        self._known = len(self._saved)  # before this pass; in the rear's, those up to the cut
-        self._inside_one = False  # in a submodule that is to be cached as a whole
+        self._saved = dict(replay.outputs)  # recorded calls, like `Replay.outputs`
+        self._calls_before = len(self._saved)  # this pass; in the rear's, those up to the cut
+        self._is_inside_cached = False  # in a submodule that is to be cached as a whole
 
     def run(self, module: nn.Module, run: Run) -> object:
-        """Runs a submodule, watched."""
+        """Returns the output of a submodule that `run` runs, watched for values that escape."""
         with self.watch.seeing_escapes_of(module):
             return run()
 
     def record(self, module: nn.Module, inputs: object, run: Run) -> object:
-        """Runs a call and notes it; it is cached if its output can stand for all that it does."""
-        if self._inside_one and module is not self._cut.module:
+        """Returns the output of a call that was not recorded yet; now it is.
+
+        Its output is saved if it can stand for all that the call does.
+
+        Args:
+            module: The submodule that is called.
+            inputs: Its inputs (args, kwargs).
+            run: Function that runs it on these.
+
+        Raises:
+            PnpDepthError: The call is the cut, where the front ends (`Replay.end_of_front`).
+            ModelError: It is the cut, and its output has no tensor that can be z, or several.
+        """
+        if self._is_inside_cached and module is not self._cut.module:
             return run()
         self.ran.add(module)
         # The call is noted before it runs, so that calls are in the order in which they begin.
-        number = next(n for n in range(len(self._saved) + 1) if (module, n) not in self._saved)
+        number = 0
+        while (module, number) in self._saved:
+            number += 1
         call = (module, number)
         self._saved[call] = None
         first_inside = len(self._saved)
         # It runs, and what is inside is recorded too, unless it may be cached as a whole.
         since = self.watch.now()
-        before = list(tensors_in(inputs))
-        outside_one = self._inside_one
-        may_be_one = self._may_be_one(module)
-        self._inside_one = may_be_one
+        tensors_before = list(tensors_in(inputs))
+        was_inside_cached = self._is_inside_cached
+        may_be_cached = self._may_be_cached(module)
+        self._is_inside_cached = may_be_cached
         try:
             output = run()
         finally:
-            self._inside_one = outside_one
+            self._is_inside_cached = was_inside_cached
         if self._replay.has_front:  # the network has caught the end of the front
             return output
-        # Its output is saved if that is all that it did; this drops what was recorded inside.
-        if (
-            self.watch.can_stand_for(since, inputs, output)
-            and module not in self._cut.around_hooks
-            # and has not changed the lists or dicts among its inputs
-            and [(path, id(t)) for path, t in before]
-            == [(path, id(t)) for path, t in tensors_in(inputs)]
-        ):
+        # Its output is saved if that is all that it did, and nothing in it listens by a hook.
+        is_all = self.watch.can_stand_for(since, inputs, output)
+        keeps_inputs = _ids(tensors_before) == _ids(list(tensors_in(inputs)))
+        if is_all and keeps_inputs and module not in self._cut.around_hooks:
             self._drop_from(first_inside)
-            self._saved[call] = saved = SavedTensors.of(output)
+            saved = SavedTensors.of(output)
+            self._saved[call] = saved
             self.watch.protect(saved)
-        elif may_be_one and next(module.children(), None) is not None:
+        elif may_be_cached and next(module.children(), None) is not None:
             self._uncacheable.add(module)
         # The front ends at the cut.
         if self._is_cut(module):
@@ -266,32 +315,52 @@ class Recorder:
         # Another z may take another path behind the cut, unless the definition says otherwise. So
         # no call there is recorded, and saved outputs stay whole, as it may read or change them.
         if self.watch.data_dependent:
-            self._drop_from(self._known)
+            self._drop_from(self._calls_before)
             for saved in self._saved.values():
                 if saved is not None:
                     saved.copied = True
         self.finish(complete=True)
 
     def finish(self, *, complete: bool) -> None:
-        """Gives the replay the recorded calls, up to the cut or all."""
+        """Gives the replay the recorded calls; complete: also those behind the cut."""
         self._replay.outputs = self._saved
         self._replay.complete = complete
         # No value may reach Python in front of the cut or behind it.
         self._replay.static_graph &= not self.watch.escaped
 
     def _is_cut(self, module: nn.Module) -> bool:
-        reached = self._replay.cut_call is not None
-        chosen = self._cut.call in (None, self._replay.calls[module])
-        return not reached and module is self._cut.module and chosen
+        """Whether the call of this submodule that has just run is the one to cut at."""
+        if self._replay.cut_call is not None or module is not self._cut.module:
+            return False
+        return self._cut.call in (None, self._replay.calls[module])
 
-    def _may_be_one(self, module: nn.Module) -> bool:
-        """True if it ends before the cut, so that what is inside needs no record."""
-        apart = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
-        return self._replay.cut_call is None and not any(module in group for group in apart)
+    def _may_be_cached(self, module: nn.Module) -> bool:
+        """Whether a call that begins here may be cached as a whole, without a record of its inside.
+
+        It may if it ends before the cut, and nothing in it is known to forbid it.
+        """
+        if self._replay.cut_call is not None:
+            return False
+        forbidden = (self._cut.containers, self._cut.around_hooks, self._uncacheable)
+        return not any(module in group for group in forbidden)
 
     def _drop_from(self, first: int) -> None:
-        """Forgets the calls from this one on, in the order in which they began."""
+        """Forgets all but the first calls, in the order in which they began.
+
+        Args:
+            first: How many calls stay.
+        """
         while len(self._saved) > first:
             _, saved = self._saved.popitem()
             if saved is not None:
                 saved.value = None  # the watch would hold its tensors
+
+
+def _ids(tensors: list[tuple[tuple[str, ...], Tensor]]) -> list[tuple[tuple[str, ...], int]]:
+    """The paths and the identities of tensors, which change with the lists and dicts they are in.
+
+    Args:
+        tensors: Paths and tensors as `tensors_in` yields them; while they are held, no other tensor
+            gets the identity of one.
+    """
+    return [(path, id(tensor)) for path, tensor in tensors]

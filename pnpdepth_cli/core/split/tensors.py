@@ -14,7 +14,13 @@ from torch import Tensor, nn
 def tensors_in(
     structure: object, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Yields every tensor of a nested structure with its path, such as ("hidden_states", "0")."""
+    """Yields every tensor of a nested structure with its path, such as ("hidden_states", "0").
+
+    Args:
+        structure: A tensor, or lists, tuples, dicts and dataclasses with tensors; other objects
+            have none.
+        path: Path of the structure itself, in front of all paths.
+    """
     if isinstance(structure, Tensor):
         yield path, structure
         return
@@ -27,44 +33,59 @@ def map_tensors(
     change: Callable[[tuple[str, ...], Tensor], Tensor],
     path: tuple[str, ...] = (),
 ) -> object:
-    """Returns the structure with tensor t at path p replaced by change(p, t), in new containers."""
+    """Returns a copy of a nested structure with other tensors; the structure stays as it is.
+
+    Args:
+        structure: A tensor, or nested containers as of `tensors_in`; another object is returned
+            itself.
+        change: Function that takes the path of a tensor and the tensor to what replaces it.
+        path: Path of the structure itself, in front of all paths.
+    """
     if isinstance(structure, Tensor):
         return change(path, structure)
-    parts = _children(structure)
-    if parts is None:
+    children = _children(structure)
+    if children is None:
         return structure
-    children = [map_tensors(child, change, (*path, key)) for key, child in parts]
+    changed = [map_tensors(child, change, (*path, key)) for key, child in children]
+    # A container of the same type. A NamedTuple is made of arguments, another tuple of a list.
     if isinstance(structure, tuple):
         make: Callable[..., object] = type(structure)
-        return make(*children) if hasattr(structure, "_fields") else make(children)
-    result = copy.copy(structure)
-    if isinstance(result, list):
-        result[:] = children
-    elif isinstance(result, MutableMapping):
-        for key, child in zip(result, children, strict=True):
-            result[key] = child
+        return make(*changed) if hasattr(structure, "_fields") else make(changed)
+    container = copy.copy(structure)
+    if isinstance(container, list):
+        container[:] = changed
+    elif isinstance(container, MutableMapping):
+        for key, child in zip(container, changed, strict=True):
+            container[key] = child
     else:
-        for (name, _), child in zip(parts, children, strict=True):
-            object.__setattr__(result, name, child)  # the dataclass may be frozen
-    return result
+        for (name, _), child in zip(children, changed, strict=True):
+            object.__setattr__(container, name, child)  # the dataclass may be frozen
+    return container
 
 
 def is_transparent(structure: object) -> bool:
-    """Whether `tensors_in` is sure to find every tensor of the structure."""
+    """Whether `tensors_in` is sure to find every tensor of the structure.
+
+    It is not if there is an object that is neither a container nor a number or text.
+    """
     if structure is None or isinstance(structure, Tensor | int | float | str | bool):
         return True
-    parts = _children(structure)
-    return parts is not None and all(is_transparent(child) for _, child in parts)
+    children = _children(structure)
+    return children is not None and all(is_transparent(child) for _, child in children)
 
 
 def _children(structure: object) -> list[tuple[str, object]] | None:
-    """The parts of a container by their keys. None: it is none."""
+    """What a container holds, each with its key, index or field name; None if it is no container.
+
+    Containers are lists, tuples, mutable mappings and dataclasses.
+    """
     if isinstance(structure, list | tuple):
         return [(str(index), child) for index, child in enumerate(structure)]
     if isinstance(structure, MutableMapping):
         return [(str(key), child) for key, child in structure.items()]
     if dataclasses.is_dataclass(structure) and not isinstance(structure, type):
-        return [(f.name, getattr(structure, f.name)) for f in dataclasses.fields(structure)]
+        names = [field.name for field in dataclasses.fields(structure)]
+        return [(name, getattr(structure, name)) for name in names]
     return None
 
 
@@ -73,19 +94,27 @@ class SavedTensors:
     """Tensors in nested containers, as they were when saved."""
 
     value: object = None
+    """Nested containers with the tensors; None before there are any."""
     copied: bool = False
     """Whether the network changes them in place, so that `fresh` returns clones."""
 
     @classmethod
     def of(cls, output: object, *, copied: bool = False) -> SavedTensors:
         """Returns the tensors of an output in new containers, clones if they are `copied`."""
-        return cls(map_tensors(output, lambda _, t: t.clone() if copied else t), copied)
+
+        def saved(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            return tensor.clone() if copied else tensor
+
+        return cls(map_tensors(output, saved), copied)
 
     def fresh(self) -> object:
         """Returns the tensors in new containers; whatever is done to them leaves `value` as is."""
-        return map_tensors(
-            self.value, lambda _, t: t.clone() if self.copied or t.is_inference() else t
-        )
+
+        def given(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            # One of inference mode cannot be saved for a backward pass.
+            return tensor.clone() if self.copied or tensor.is_inference() else tensor
+
+        return map_tensors(self.value, given)
 
 
 class NetworkState:
@@ -98,21 +127,29 @@ class NetworkState:
     def __init__(self, network: nn.Module) -> None:
         modules = list(network.modules())
         parameters = list(network.parameters())
-        # Frozen torch scripts have neither a mode nor buffers that can be set.
-        plain = [m for m in modules if not isinstance(m, torch.jit.ScriptModule)]
         self._originals = [*parameters, *network.buffers()]
         self.tensors = [SavedTensors(tensor) for tensor in self._originals]
-        self._learning = [(p, p.requires_grad) for p in parameters]
-        self._buffers = [(m, dict(m._buffers)) for m in plain if m._buffers]
-        self._modes = [(m, m.training) for m in modules if hasattr(m, "training")]
+        self._gradient_flags = [(parameter, parameter.requires_grad) for parameter in parameters]
+        # Frozen torch scripts have neither a mode nor buffers that can be set.
+        self._buffers = [
+            (module, dict(module._buffers))
+            for module in modules
+            if not isinstance(module, torch.jit.ScriptModule) and module._buffers
+        ]
+        self._modes = [
+            (module, module.training) for module in modules if hasattr(module, "training")
+        ]
 
     def freeze(self) -> None:
         """Switches off the gradients of all parameters."""
-        for parameter, _ in self._learning:
+        for parameter, _ in self._gradient_flags:
             parameter.requires_grad_(False)
 
     def restore(self) -> None:
-        """Restores the values of parameters and buffers that the network has changed."""
+        """Restores the values of parameters and buffers that the network has changed.
+
+        A buffer may have been replaced by another tensor, or changed in place like a parameter.
+        """
         for module, buffers in self._buffers:
             module._buffers.update(buffers)
         with torch.no_grad():
@@ -121,9 +158,9 @@ class NetworkState:
                     original.copy_(saved.value)
 
     def close(self) -> None:
-        """Restores everything."""
+        """Restores values, gradient flags and modes."""
         self.restore()
-        for parameter, requires_grad in self._learning:
+        for parameter, requires_grad in self._gradient_flags:
             parameter.requires_grad_(requires_grad)
         for module, training in self._modes:
             module.training = training

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn, overrides
@@ -31,8 +32,12 @@ _FUSED = (
 """Torch's own forwards that use a fused kernel only where no torch function mode is active."""
 
 
-Moment = tuple[int, int, int]
-"""A time in a watched pass: the operations, results that depend on z, and writes before it."""
+class Moment(NamedTuple):
+    """A time in a watched pass, by how much has happened before it."""
+
+    operations: int  # number of tensor operations
+    touches: int  # number of those, and of calls, that may have read z
+    writes: int  # number of changes in place
 
 
 class Watch(TorchDispatchMode):
@@ -44,17 +49,21 @@ class Watch(TorchDispatchMode):
 
     escaped: bool
     """Whether a value of a tensor (not a shape) reached Python, which may branch on it."""
-    data_dependent: bool  # whether such a value depended on z
-    torn: bool  # whether z or the tensor it stands for was read after the other had been changed
+    data_dependent: bool
+    """Whether such a value depended on z."""
+    torn: bool
+    """Whether z or the tensor it stands for was read after the other had been changed in place."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        # Torch's own mark for modes that need no guard from torch.compile; the guard would import
-        # the whole compiler, a second in every run of the program.
+        """False: torch's own mark for modes that need no guard from torch.compile.
+
+        The guard would import the whole compiler, a second in every run of the program.
+        """
         return False
 
     def __init__(self, saved: Iterable[SavedTensors], *, escapes: bool) -> None:
-        """Begins with all counts at 0; sets and keys below are numbers of storages.
+        """Nothing has happened yet.
 
         Args:
             saved: Tensors to protect from in-place operations.
@@ -64,64 +73,84 @@ class Watch(TorchDispatchMode):
         self.data_dependent = False
         self.escaped = False
         self.torn = False
-        self._operations = 0
-        self._touches = 0
-        self._writes: list[int] = []  # per change in place, the storage's creator; 0: none
+        # Keys and elements are storages, as `_storage` numbers them.
+        self._operations = 0  # tensor operations so far, so that each has a number from 1
+        self._touches = 0  # operations and calls so far that may have read z
+        self._writes: list[int] = []
+        """For each change in place, the operation that created the storage; 0: none in this pass"""
         self._created: dict[int, int] = {}  # operation that created a storage
         self._marked: set[int] = set()  # storages that depend on z
-        self._protected: dict[int, list[SavedTensors]] = {}
+        self._protected: dict[int, list[SavedTensors]] = {}  # what is cloned before it is changed
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
         self._notes_escapes = escapes
-        self._sees_escapes = False
+        self._sees_escapes = False  # whether the function mode is active
         for tensors in saved:
             self.protect(tensors)
 
-    def injected(self, z: Tensor, original: Tensor | None) -> None:
-        """Notes that the network goes on with z, in place of `original` if that exists."""
+    def note_injection(self, z: Tensor, original: Tensor | None) -> None:
+        """Notes that the network goes on with z.
+
+        Args:
+            z: What the cut layer gives.
+            original: Tensor of the network that z stands for; None if the layer did not run.
+        """
         self._touches += 1
         self._marked.add(_storage(z))
         if original is not None:
             self._twins = (original, z)
 
     def protect(self, saved: SavedTensors) -> None:
-        """Protects these tensors from in-place operations."""
+        """Protects these tensors: they are cloned before an operation changes them in place."""
         for _, tensor in tensors_in(saved.value):
             self._protected.setdefault(_storage(tensor), []).append(saved)
 
     def now(self) -> Moment:
         """Returns this moment, for `can_stand_for`."""
-        return self._operations, self._touches, len(self._writes)
+        return Moment(self._operations, self._touches, len(self._writes))
 
     def can_stand_for(self, since: Moment, inputs: object, output: object) -> bool:
-        """Whether returning `output` does all that the call did which began at `since`.
+        """Returns whether giving `output` again does all that a call of a submodule did.
 
-        So it did not depend on z, changed nothing older than itself in place, and its output
+        So the call did not depend on z, changed nothing older than itself in place, and its output
         consists of tensors that it created, no two of them in the same memory.
+
+        If it may have depended on z, its output is noted to depend on z.
+
+        Args:
+            since: The moment when the call began; it has just ended.
+            inputs: Its inputs (args, kwargs).
+            output: Its output.
         """
-        operations, touches, writes = since
-        marked_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
-        if self._marked and (marked_input or not is_transparent(inputs)):
-            self._touches += 1  # a native extension may read its arguments unnoticed
-        created_inside = [_storage(tensor) for _, tensor in tensors_in(output)]
-        created_inside = [s for s in created_inside if self._created.get(s, 0) > operations]
-        if self._touches > touches:
+        # An input that may hold z counts as read: a native extension reads its arguments unnoticed.
+        has_marked_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
+        if self._marked and (has_marked_input or not is_transparent(inputs)):
+            self._touches += 1
+        # The tensors of its output that it created.
+        storages = [_storage(tensor) for _, tensor in tensors_in(output)]
+        created_inside = {
+            storage for storage in storages if self._created.get(storage, 0) > since.operations
+        }
+        if self._touches > since.touches:
             self._marked.update(created_inside)
             return False
-        return (
-            is_transparent(output)
-            and len(set(created_inside)) == sum(1 for _ in tensors_in(output))
-            and all(created > operations for created in self._writes[writes:])
-        )
+        is_all_new = len(created_inside) == len(storages)  # one storage for each tensor
+        writes_inside = self._writes[since.writes :]
+        changes_old = any(creator <= since.operations for creator in writes_inside)
+        return is_transparent(output) and is_all_new and not changes_old
 
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
-        """Watches the methods that give values to Python, too, but not in torch's fused layers."""
+        """Inside this context, `Tensor.numpy` and the like are seen while the module runs.
+
+        They are not in torch's fused layers (`_FUSED`), nor where escapes are not noted at all.
+        """
         seen_outside = self._sees_escapes
         is_fused = getattr(type(module), "forward", None) in _FUSED
         self._sees_escapes = self._notes_escapes and not is_fused
-        # The function mode is entered, or left for a while, where that differs from outside.
+        # The function mode is entered, or left for a while, where that differs from outside. Only
+        # the innermost mode can be left, which is another one where the network uses its own.
         innermost = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
         change: AbstractContextManager[object] = nullcontext()
         if self._sees_escapes and not seen_outside:
@@ -146,21 +175,27 @@ class Watch(TorchDispatchMode):
         args: Sequence[object] = (),
         kwargs: Mapping[str, object] | None = None,
     ) -> object:
+        """Runs an operation of torch, and notes what it created, changed and read.
+
+        Torch calls this for every operation while the mode is active.
+
+        Returns:
+            What the operation gives.
+        """
         kwargs = kwargs or {}
-        writes, escapes = _facts(func)
-        escapes = escapes and self._notes_escapes
+        effects = _effects_of(func)
         self._operations += 1
         inputs = [tensor for _, tensor in tensors_in((*args, *kwargs.values()))]
-        self.torn |= bool(self._stale) and any(_storage(tensor) in self._stale for tensor in inputs)
+        if self._stale and any(_storage(tensor) in self._stale for tensor in inputs):
+            self.torn = True
         # Saved tensors are cloned before the operation changes them.
-        written = [
-            tensor
-            for index, name in writes
-            for _, tensor in tensors_in(args[index] if index < len(args) else kwargs.get(name))
-        ]
+        written: list[Tensor] = []
+        for index, name in effects.written:
+            argument = args[index] if index < len(args) else kwargs.get(name)
+            written += [tensor for _, tensor in tensors_in(argument)]
         for tensor in written:
             self._before_write(tensor)
-        marked = bool(self._marked) and any(map(self._is_marked, inputs))
+        reads_z = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
         # New memory among its results belongs to this operation.
         results = {_storage(tensor) for _, tensor in tensors_in(result)}
@@ -169,25 +204,29 @@ class Watch(TorchDispatchMode):
         # An address seen before may have been freed and reused.
         self._marked -= created
         # What an operation makes of z, or writes, depends on z.
-        if marked:
+        if reads_z:
             self._touches += 1
             self._marked |= results | {_storage(tensor) for tensor in written}
-            self.data_dependent |= escapes
-        self.escaped |= escapes
+        # Values that the operation gives to Python.
+        if effects.values_escape and self._notes_escapes:
+            self.escaped = True
+            if reads_z:
+                self.data_dependent = True
         return result
 
     def _before_write(self, tensor: Tensor) -> None:
-        """Notes a change in place, and clones the saved tensors that it would change."""
+        """Notes that a tensor is about to change in place, and clones what is saved of it."""
         storage = _storage(tensor)
         self._writes.append(self._created.get(storage, 0))
         twins = {_storage(twin) for twin in self._twins}
         if storage in twins:
             self._stale |= twins - {storage}
         for saved in self._protected.pop(storage, []):
-            saved.value = map_tensors(saved.value, lambda _, t: t.clone())
+            saved.value = map_tensors(saved.value, lambda _, saved_tensor: saved_tensor.clone())
             saved.copied = True
 
     def _is_marked(self, tensor: Tensor) -> bool:
+        """Whether a tensor depends on z."""
         # Only z requires gradient, so a tensor that does was computed from it.
         return tensor.requires_grad or _storage(tensor) in self._marked
 
@@ -206,32 +245,47 @@ class _EscapeMode(TorchFunctionMode):
         args: Sequence[object] = (),
         kwargs: Mapping[str, object] | None = None,
     ) -> object:
+        """Runs a function of torch, after the watch has noted the values that it gives to Python.
+
+        Torch calls this for every function of its own while the mode is active.
+        """
         if func in _ESCAPES and isinstance(args[0], Tensor):
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
 
 
-_NO_STORAGE = 0  # the mark of sparse tensors, which have no storage
+_NO_STORAGE = 0
+"""The number that stands for the memory of sparse tensors, which have no storage."""
 
 
 def _storage(tensor: Tensor) -> int:
-    """A number that tensors in the same memory share."""
+    """A number that tensors in the same memory share; `_NO_STORAGE` for sparse tensors.
+
+    It is the address of the storage, which torch raises NotImplementedError for where there is
+    none.
+    """
     try:
         return int(tensor.untyped_storage()._cdata)
     except NotImplementedError:
         return _NO_STORAGE
 
 
-@functools.cache
-def _facts(func: OpOverload) -> tuple[list[tuple[int, str]], bool]:
-    """Index and name of the arguments that an operation changes in place; whether values escape.
+class _Effects(NamedTuple):
+    """What an operation of torch does besides computing its result."""
 
-    They do where it gives them, or shapes that depend on them, to Python.
-    """
-    writes = [
-        (index, argument.name)
-        for index, argument in enumerate(func._schema.arguments)
+    written: list[tuple[int, str]]
+    """Number and name of each argument that it changes in place."""
+    values_escape: bool
+    """Whether it gives values of tensors, or shapes that depend on them, to Python."""
+
+
+@functools.cache
+def _effects_of(func: OpOverload) -> _Effects:
+    """The effects that torch states of an operation, in its schema and its tags."""
+    written = [
+        (number, argument.name)
+        for number, argument in enumerate(func._schema.arguments)
         if argument.alias_info and argument.alias_info.is_write
     ]
     tags = (torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape)
-    return writes, any(tag in func.tags for tag in tags)
+    return _Effects(written, any(tag in func.tags for tag in tags))

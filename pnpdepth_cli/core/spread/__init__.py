@@ -33,36 +33,38 @@ _OVERWRITTEN = frozenset({"zero", "fill", "resize"})
 
 
 def spread_of(
-    func: OpOverload, args: Sequence[Any], index: int | None, source: Tensor, spread: Spread,
-    result: Tensor, position: int,
+    func: OpOverload, args: Sequence[Any], place: int | None, source: Tensor, spread: Spread,
+    result: Tensor, number: int,
 ) -> Spread | None:  # fmt: skip
-    """Returns where a result of an operation depends on an input; None if nowhere.
+    """Returns which elements of an operation's result depend on each row of a feature map.
+
+    None if none does: nothing of the input comes through the operation.
 
     Args:
         func: The operation.
         args: Its positional arguments.
-        index: Number of the input among them; None where it is in a list or a keyword.
+        place: Number of the input among them; None where it is in a list or a keyword.
         source: The input.
-        spread: That of the input.
+        spread: Boxes of the input's elements that depend on each row of the feature map.
         result: The result, or one of several.
-        position: Number of the result.
+        number: Number of the result, 0 for the only one.
     """
-    name = func._opname.rstrip("_")
+    name = func._opname.rstrip("_")  # that of the operation in place is `name_`
     # Through some operations nothing comes.
     if name in _NO_GRADIENT or not result.is_floating_point():
         return None
     if name in _OVERWRITTEN or name.startswith("new_") or name.endswith("_like"):
         return None  # these read no values
-    if name == "copy" and index == 0:  # what is overwritten
+    if name == "copy" and place == 0:  # what is overwritten
         return None
     # The others move the boxes by their rule; one without a rule, by what torch says of it.
     shape = tuple(result.shape) or (1,)  # a number is an axis of one
-    call = Call(name, func, args, index, source, spread, shape)
+    call = Call(name, func, args, place, source, spread, shape)
     if source.ndim == 0 or result.ndim == 0:
         return everywhere(call)
     if name in views.PARTITIONS:
-        return views.part_of(call, position)
-    if position:  # such as the indices of a pooling
+        return views.part_of(call, number)
+    if number:  # such as the indices of a pooling
         return everywhere(call)
     if name in RULES:
         return RULES[name](call)

@@ -17,17 +17,24 @@ AxisRange = tuple[Tensor, Tensor]
 
 
 class Spread(NamedTuple):
-    """Boxes of a tensor with d axes, one for each of n rows of a feature map.
+    """Boxes of a tensor with d axes: the elements that depend on each of n rows of a feature map.
 
-    first, last: (n, d) indices along each axis, the last one included.
+    The rows may also be its columns, or there is one box for all of it.
     """
 
     first: Tensor
+    """(n, d) the least indices of each box along each axis; `NOWHERE` for an empty box."""
     last: Tensor
+    """(n, d) the largest indices, which belong to the box; −1 for an empty box."""
 
     @classmethod
     def of_axis(cls, shape: Sequence[int], axis: int) -> Spread:
-        """Returns, for each index along an axis of a feature map, the box of its elements."""
+        """Returns the box of each row of a feature map in that map itself.
+
+        Args:
+            shape: Shape of the feature map.
+            axis: Axis along which the rows are counted, 2 for rows and 3 for columns.
+        """
         count = shape[axis]
         spread = cls.whole(shape, count)
         spread.first[:, axis] = torch.arange(count)
@@ -56,41 +63,47 @@ class Spread(NamedTuple):
         return list(zip(self.first.unbind(1), self.last.unbind(1), strict=True))
 
     def empty(self) -> Tensor:
-        """Which of the boxes (n,) have no element."""
+        """Returns (n,) bool, whether each box has no element."""
         return self.last[:, 0] < 0
 
     def joined(self, other: Spread | None) -> Spread:
-        """Returns the smallest boxes around these and others of the same tensor."""
+        """Returns the smallest boxes around these and others of the same tensor; None: no others.
+
+        Empty boxes need no case of their own: `NOWHERE` and −1 are never the least and largest.
+        """
         if other is None:
             return self
         return Spread(self.first.minimum(other.first), self.last.maximum(other.last))
 
 
 class Call(NamedTuple):
-    """An operation on tensors, with one of its inputs whose spread is known.
-
-    args: its positional arguments. place: number of the input among them; None in a list or a
-    keyword. source: the input. spread: that of the input. shape: shape of the result.
-    """
+    """An operation on tensors, with one of its inputs whose spread is known."""
 
     name: str
+    """Name of the operation in torch's library aten, without `_` at its end."""
     function: OpOverload
+    """The operation itself."""
     args: Sequence[Any]
+    """Its positional arguments, in aten's order; those at the end may be left to their defaults."""
     place: int | None
+    """Number of the input among them; None in a list or a keyword."""
     source: Tensor
+    """The input."""
     spread: Spread
+    """Boxes of the input's elements that depend on each row of a feature map."""
     shape: tuple[int, ...]
+    """Shape of the result; (1,) for a number."""
 
 
 Rule = Callable[[Call], Spread]
-"""Takes an operation to the spread of its result."""
+"""Takes an operation to the boxes of its result, one for each box of its input."""
 
 RULES: dict[str, Rule] = {}
 """How boxes move, by the name of the operation."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Enters the decorated function for operations of these names."""
+    """Returns a decorator that enters a function in `RULES` for operations of these names."""
 
     def enter(function: Rule) -> Rule:
         RULES.update(dict.fromkeys(names, function))
@@ -100,7 +113,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 def full_range(call: Call, axis: int) -> AxisRange:
-    """Returns all indices along an axis of the result, for boxes that are not empty."""
+    """Returns the range of all indices along an axis of the result; empty boxes stay empty."""
     empty = call.spread.empty()
     first = torch.zeros(len(empty), dtype=torch.long)
     last = torch.full((len(empty),), max(call.shape[axis], 1) - 1)
@@ -108,7 +121,10 @@ def full_range(call: Call, axis: int) -> AxisRange:
 
 
 def everywhere(call: Call) -> Spread:
-    """Returns boxes for operations whose every result depends on every element of the input."""
+    """Returns boxes that are all of the result, but for those that were empty.
+
+    So they are where every element of the result may depend on every element of the input.
+    """
     return Spread.from_axes([full_range(call, axis) for axis in range(len(call.shape))])
 
 
@@ -116,9 +132,16 @@ def everywhere(call: Call) -> Spread:
 @rule("where", "masked_fill", "addcmul", "lerp", "prelu", "_prelu_kernel", "native_dropout")
 @rule("native_batch_norm", "_native_batch_norm_legit", "_native_batch_norm_legit_no_training")
 def pointwise(call: Call) -> Spread:
-    """Returns boxes of results that depend on one element of the input, which may be broadcast."""
-    if "batch_norm" in call.name and (call.place != 0 or call.args[5] is True):  # it trains
-        return everywhere(call)
+    """Returns the input's boxes, full along axes that are broadcast.
+
+    So they are where each element of the result depends on the input's element at its place.
+    """
+    if "batch_norm" in call.name:
+        # Argument 5 is `training`: with it, elements are normalised by all others.
+        is_training = call.args[5] is True
+        if call.place != 0 or is_training:
+            return everywhere(call)
+    # Axes of the result that the input has not are in front of those that it has.
     new_axes = len(call.shape) - call.source.ndim
     if new_axes < 0:
         return everywhere(call)

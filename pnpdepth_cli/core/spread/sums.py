@@ -15,14 +15,18 @@ from pnpdepth_cli.core.spread.boxes import (
 
 @rule("mm", "bmm", "addmm", "baddbmm", "linear")
 def product(call: Call) -> Spread:
-    """Rows of the left factor and columns of the right one stay; what is summed becomes full."""
+    """Returns boxes of a product of matrices: full along the axis that is summed over.
+
+    Rows of the left factor are rows of the product, and columns of the right one its columns.
+    """
     left = 1 if call.name in ("addmm", "baddbmm") else 0  # number of the left factor
     if call.place is None:
         return everywhere(call)
-    if call.place < left:  # the summand
+    if call.place < left:  # the matrix that is added to the product
         return pointwise(call)
-    if call.name == "linear" and call.place:  # its weights
+    if call.name == "linear" and call.place:  # its weights or its bias
         return everywhere(call)
+    # The columns of the left factor are summed over, and the rows of the right one.
     axes = call.spread.axes()
     summed = len(axes) - 1 if call.place == left else len(axes) - 2
     axes[summed] = full_range(call, summed)
@@ -31,13 +35,13 @@ def product(call: Call) -> Spread:
 
 @rule("mean", "sum", "amax", "amin", "logsumexp", "prod", "var", "std")
 def reduction(call: Call) -> Spread:
-    """Axes that are reduced become full, or go."""
-    stated = call.args[1] if len(call.args) > 1 else None
-    if isinstance(stated, int):
-        stated = [stated]
-    if not isinstance(stated, list | tuple) or not stated:  # over all axes
+    """Returns boxes whose reduced axes are gone, or full where the operation keeps them."""
+    stated_axes = call.args[1] if len(call.args) > 1 else None
+    if isinstance(stated_axes, int):
+        stated_axes = [stated_axes]
+    if not isinstance(stated_axes, list | tuple) or not stated_axes:  # all axes are reduced
         return everywhere(call)
-    reduced = {axis % call.source.ndim for axis in stated}
+    reduced = {axis % call.source.ndim for axis in stated_axes}
     keeps_axes = len(call.shape) == call.source.ndim
     axes: list[AxisRange] = []
     for axis, axis_range in enumerate(call.spread.axes()):
@@ -45,14 +49,14 @@ def reduction(call: Call) -> Spread:
             axes.append(axis_range)
         elif keeps_axes:
             axes.append(full_range(call, axis))
-    if len(axes) != len(call.shape):
+    if len(axes) != len(call.shape):  # such as a single element, an axis of one
         return everywhere(call)
     return Spread.from_axes(axes)
 
 
 @rule("_softmax", "_log_softmax", "_safe_softmax", "cumsum")
 def along_axis(call: Call) -> Spread:
-    """An element depends on all of its axis."""
+    """Returns boxes that are full along the axis of a softmax or a cumulative sum, argument 1."""
     axes = call.spread.axes()
     axis = call.args[1] % call.source.ndim
     axes[axis] = full_range(call, axis)
@@ -61,10 +65,11 @@ def along_axis(call: Call) -> Spread:
 
 @rule("native_layer_norm")
 def layer_norm(call: Call) -> Spread:
-    """An element depends on all of the last axes, which are normalised together."""
-    if call.place != 0:
+    """Returns boxes that are full along the last axes, which are normalised together."""
+    if call.place != 0:  # weight or bias
         return everywhere(call)
     axes = call.spread.axes()
-    for axis in range(len(axes) - len(call.args[1]), len(axes)):
+    normalised = len(call.args[1])  # how many axes
+    for axis in range(len(axes) - normalised, len(axes)):
         axes[axis] = full_range(call, axis)
     return Spread.from_axes(axes)

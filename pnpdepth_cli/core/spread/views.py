@@ -18,26 +18,34 @@ from pnpdepth_cli.core.spread.boxes import (
     rule,
 )
 
-PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split", "unsafe_chunk")
+PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split")
 """Operations whose results are parts of their input."""
 
 
-def part_of(call: Call, position: int) -> Spread:
-    """Returns the boxes of one of the parts that a tensor is split into."""
-    if call.name == "unbind":
+def part_of(call: Call, number: int) -> Spread:
+    """Returns the boxes of one of the tensors that an operation of `PARTITIONS` makes of one.
+
+    Args:
+        call: The operation; its `shape` is that of this part.
+        number: Number of this part, from 0.
+    """
+    if call.name == "unbind":  # parts are `tensor[number]` along an axis
         axis = call.args[1] if len(call.args) > 1 else 0
-        return select(call._replace(args=(call.source, axis, position)))
+        return select(call._replace(args=(call.source, axis, number)))
     axis = (call.args[2] if len(call.args) > 2 else 0) % call.source.ndim
     sizes = call.args[1]  # one size of all parts, or the size of each
-    start = position * sizes if isinstance(sizes, int) else sum(sizes[:position])
+    start = number * sizes if isinstance(sizes, int) else sum(sizes[:number])
     return Spread.from_axes(_crop(call, axis, start, 1, call.shape[axis]))
 
 
 @rule("cat")
 def concatenate(call: Call) -> Spread:
-    """Returns boxes shifted to where the input lies; joined, if it is given several times."""
+    """Returns boxes shifted to where the input lies in the result of `torch.cat`.
+
+    They reach over all its places if it is given several times.
+    """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
-    offset = 0
+    offset = 0  # elements along the axis in front of the tensor at hand
     spread: Spread | None = None
     for tensor in call.args[0]:
         if tensor is call.source:
@@ -71,11 +79,21 @@ def stack(call: Call) -> Spread:
 
 
 def _crop(call: Call, axis: int, start: int, step: int, count: int) -> list[AxisRange]:
-    """The ranges of boxes where every step-th index from the start is kept along one axis."""
+    """The ranges of boxes, where along one axis only some indices of the input are kept.
+
+    Args:
+        call: The operation.
+        axis: The axis.
+        start: First index that is kept.
+        step: Distance between indices that are kept.
+        count: How many are kept. A box none of whose indices is kept gets its first behind its last
+            one, by which `Spread.from_axes` knows it is empty.
+    """
     axes = call.spread.axes()
     empty = call.spread.empty()
     first, last = axes[axis]
-    # The first index that is kept at or behind `first`, and the last one up to `last`.
+    # The first index that is kept at or behind `first`, and the last one up to `last`, both
+    # counted among those that are kept: a division by the step, rounded up and down.
     first = (first - start + step - 1).div(step, rounding_mode="floor").clamp(min=0)
     last = (last - start).div(step, rounding_mode="floor").clamp(max=count - 1)
     axes[axis] = (first.masked_fill(empty, NOWHERE), last.masked_fill(empty, -1))
@@ -84,12 +102,13 @@ def _crop(call: Call, axis: int, start: int, step: int, count: int) -> list[Axis
 
 @rule("slice")
 def slice_(call: Call) -> Spread:
-    """Returns boxes of `tensor[start:end:step]` along an axis, arguments as torch has them."""
-    defaults = [0, None, None, 1]
-    stated = [*call.args[1:], *defaults[len(call.args) - 1 :]]
-    axis = stated[0] % call.source.ndim
-    start = stated[1]
-    step = stated[3]
+    """Returns boxes of `tensor[start:end:step]` along an axis."""
+    # aten's arguments behind the input, of which the last ones may be left to their defaults. The
+    # end is not needed: the result has its size.
+    defaults = (0, None, None, 1)
+    stated = tuple(call.args[1:])
+    axis, start, _, step = stated + defaults[len(stated) :]
+    axis %= call.source.ndim
     size = call.source.shape[axis]
     if start is None:
         start = 0
@@ -101,10 +120,12 @@ def slice_(call: Call) -> Spread:
 
 @rule("select")
 def select(call: Call) -> Spread:
-    """Returns boxes of `tensor[index]` along an axis, which goes."""
+    """Returns boxes of `tensor[index]` along an axis, which the result has no more."""
     axis = call.args[1] % call.source.ndim
-    axes = _crop(call, axis, call.args[2] % call.source.shape[axis], 1, 1)
-    # A box that the index misses is empty, which another axis has to say.
+    index = call.args[2] % call.source.shape[axis]
+    axes = _crop(call, axis, index, step=1, count=1)
+    # A box that the index misses is empty. As the axis goes, the first one left has to say so;
+    # there is one, since `spread_of` sends no result without axes here.
     first, last = axes.pop(axis)
     missed = first > last
     first, last = axes[0]
@@ -164,11 +185,15 @@ def repeat(call: Call) -> Spread:
 
 @rule("view", "_unsafe_view", "reshape", "_reshape_alias", "squeeze", "unsqueeze", "flatten")
 def reshape(call: Call) -> Spread:
-    """Returns boxes whose axes are kept, merged or cut, group by group of as many elements."""
+    """Returns boxes of the same elements in other axes, as (2, 3, 4) becomes (6, 4) or (2, 12).
+
+    Both shapes fall into groups of neighbouring axes with equally many elements, such as (2, 3) and
+    (6). Each group is moved by itself.
+    """
     old_sizes = list(call.source.shape)
     new_sizes = list(call.shape)
     elements = math.prod(old_sizes)
-    if not elements or elements != math.prod(new_sizes):  # such as of another type
+    if not elements or elements != math.prod(new_sizes):  # such as a view as another type
         return everywhere(call)
     old_axes = call.spread.axes()
     new_axes: list[AxisRange] = []
@@ -189,7 +214,7 @@ class _Group(NamedTuple):
 
 
 def _first_group(old_sizes: list[int], new_sizes: list[int]) -> _Group:
-    """The shortest group that both shapes begin with."""
+    """The shortest group that both shapes begin with; both have as many elements in all."""
     old = old_sizes[:1]
     new = new_sizes[:1]
     while math.prod(old) != math.prod(new):
@@ -201,7 +226,13 @@ def _first_group(old_sizes: list[int], new_sizes: list[int]) -> _Group:
 
 
 def _regroup(axes: list[AxisRange], group: _Group, empty: Tensor) -> list[AxisRange]:
-    """The ranges of the new axes of a group, from those of its old axes."""
+    """The ranges of n boxes along the new axes of a group.
+
+    Args:
+        axes: Ranges along its old axes.
+        group: Sizes of its axes.
+        empty: (n,) bool, whether a box is empty.
+    """
     if group.old == group.new:
         return axes
     # The first and the last element of each box, counted through the whole group.
@@ -212,8 +243,8 @@ def _regroup(axes: list[AxisRange], group: _Group, empty: Tensor) -> list[AxisRa
         last = last * size + axis_last.masked_fill(empty, 0)
     # Their indices along the new axes, outermost first.
     new_axes: list[AxisRange] = []
-    is_one_index = torch.ones(len(empty), dtype=torch.bool)  # so far, from first to last
-    inner = math.prod(group.new)  # elements for each index of the axis
+    is_one_index = torch.ones(len(empty), dtype=torch.bool)  # of every axis so far, of each box
+    inner = math.prod(group.new)  # elements for each index of the axis at hand
     for size in group.new:
         inner //= max(size, 1)
         # Behind the first axis with several indices a box may have any index.

@@ -7,6 +7,7 @@ matrix.
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,22 +16,32 @@ from torch import Tensor
 from pnpdepth_cli.core.spread.boxes import NOWHERE, Call, Spread, everywhere, full_range, rule
 
 Response = tuple[Tensor, Tensor]
-"""First and last output index (n,) that each of n input indices reaches."""
+"""First and last index (n,) of an operation's result that each of n indices of its input reaches.
+
+They are along one axis. An index that reaches nothing has `NOWHERE` and −1."""
 
 
 def move_along(
     call: Call, responses: dict[int, Response], *, mixes_channels: bool = False
 ) -> Spread:
-    """Returns the boxes moved along some axes; with mixed channels, axis 1 becomes full."""
+    """Returns the boxes of an operation that works along each of some axes by itself.
+
+    Args:
+        call: The operation.
+        responses: What each index of the input reaches, by axis. Other axes stay as they are.
+        mixes_channels: Whether every channel, axis 1, depends on every other.
+    """
     axes = call.spread.axes()
     empty = call.spread.empty()
-    for axis, (least, most) in responses.items():
+    for axis, (first_reached, last_reached) in responses.items():
         first, last = axes[axis]
         # The first output of any input from `first` on, and the last of any up to `last`.
-        from_here = least.flip(0).cummin(0).values.flip(0)
-        up_to_here = most.cummax(0).values
-        first = from_here[first.clamp(max=len(least) - 1)].masked_fill(empty, NOWHERE)
-        last = up_to_here[last.clamp(min=0)].masked_fill(empty, -1)
+        first_from_here = first_reached.flip(0).cummin(0).values.flip(0)
+        last_up_to_here = last_reached.cummax(0).values
+        first = first_from_here[first.clamp(max=len(first_reached) - 1)]
+        last = last_up_to_here[last.clamp(min=0)]
+        first = first.masked_fill(empty, NOWHERE)
+        last = last.masked_fill(empty, -1)
         axes[axis] = (first, last)
     if mixes_channels:
         axes[1] = full_range(call, 1)
@@ -38,16 +49,20 @@ def move_along(
 
 
 def _response(output: Tensor) -> Response:
-    """The response from outputs (n, m) for the n rows of a unit matrix."""
-    reached = output != 0
+    """Which indices the n rows of a unit matrix reach, from what an operation gives of them.
+
+    Args:
+        output: (n, m), row i for the input that is 1 at index i and 0 elsewhere.
+    """
+    is_reached = output != 0
     indices = torch.arange(output.shape[1])
-    first = torch.where(reached, indices, NOWHERE).amin(dim=1)
-    last = torch.where(reached, indices, -1).amax(dim=1)
+    first = torch.where(is_reached, indices, NOWHERE).amin(dim=1)
+    last = torch.where(is_reached, indices, -1).amax(dim=1)
     return first, last
 
 
 def _unit_rows(call: Call, axis: int) -> Tensor:
-    """(n, 1, n): each of the n indices of the input along an axis as a row that is 1 there."""
+    """(n, 1, n): n rows in one channel; row i is 1 at the i-th of the input's n indices on axis."""
     return torch.eye(call.source.shape[axis])[:, None]
 
 
@@ -55,6 +70,10 @@ def _unit_rows(call: Call, axis: int) -> Tensor:
 def _response_of_convolution(
     size: int, kernel: int, stride: int, padding: int, dilation: int, transposed: bool, extra: int
 ) -> Response:
+    """Which outputs each of `size` inputs of a convolution along one axis reaches.
+
+    `extra` is the output padding: outputs that a transposed convolution adds at its end.
+    """
     rows = torch.eye(size)[:, None]
     weight = torch.ones(1, 1, kernel)
     groups = 1
@@ -66,12 +85,16 @@ def _response_of_convolution(
 
 @rule("convolution", "_convolution", "cudnn_convolution", "mkldnn_convolution")
 def convolution(call: Call) -> Spread:
-    """Returns boxes widened by the kernel; everything for the forms that are not decomposed."""
+    """Returns boxes widened by the kernel, in all channels.
+
+    All of the result, if the input at hand is weight or bias, or the operation one of those of a
+    device, whose arguments are others.
+    """
     if call.place != 0 or call.name not in ("convolution", "_convolution"):
         return everywhere(call)
     weight, _, strides, paddings, dilations, transposed, extras = call.args[1:8]
     responses: dict[int, Response] = {}
-    # A list of one number holds for all axes. `extras` are rows that a transposed one adds.
+    # A list of one number holds for all axes. `extras` are outputs that a transposed one adds.
     for number, kernel in enumerate(weight.shape[2:]):
         axis = 2 + number
         responses[axis] = _response_of_convolution(
@@ -88,22 +111,18 @@ def convolution(call: Call) -> Spread:
 
 @rule("max_pool2d_with_indices", "avg_pool2d", "max_pool2d")
 def pool(call: Call) -> Spread:
-    """Returns boxes widened by the windows of a pooling."""
-    # Arguments: input, kernel, stride, padding, then dilation (of the largest only), ceil_mode.
-    kernels, strides, paddings = ([*call.args[1:4], [], [], []])[:3]
-    strides = strides or kernels
-    paddings = paddings or [0]
-    dilations = [1]
-    ceil_place = 4
-    if call.name.startswith("max"):
-        ceil_place = 5
-        if len(call.args) > 4:
-            dilations = call.args[4] or [1]
-    ceil_mode = bool(call.args[ceil_place]) if len(call.args) > ceil_place else False
+    """Returns boxes widened by the windows of a pooling along rows and columns."""
+    options = _options(call)
+    kernels = options["kernel_size"]
+    strides = options.get("stride") or kernels
+    paddings = options.get("padding") or [0]
+    dilations = options.get("dilation") or [1]  # a mean has none
+    ceil_mode = bool(options.get("ceil_mode", False))
     responses: dict[int, Response] = {}
+    # A list of one number holds for both axes.
     for number in range(2):
         axis = call.source.ndim - 2 + number
-        # The largest of a unit row is where its window reaches, also for a mean.
+        # A window's maximum is 1 where it holds the row's 1: so far a mean's window reaches, too.
         output = F.max_pool1d(
             _unit_rows(call, axis),
             kernels[number % len(kernels)],
@@ -118,7 +137,7 @@ def pool(call: Call) -> Spread:
 
 @rule("_adaptive_avg_pool2d", "adaptive_max_pool2d", "mkldnn_adaptive_avg_pool2d")
 def adaptive_pool(call: Call) -> Spread:
-    """Returns boxes widened by windows that are chosen for the size of the result."""
+    """Returns boxes widened by the windows of a pooling that follow from the result's size."""
     responses: dict[int, Response] = {}
     for axis in (len(call.shape) - 2, len(call.shape) - 1):
         output = F.adaptive_avg_pool1d(_unit_rows(call, axis), call.shape[axis])
@@ -129,18 +148,28 @@ def adaptive_pool(call: Call) -> Spread:
 @rule("upsample_bilinear2d", "upsample_nearest2d", "upsample_bicubic2d")
 @rule("_upsample_bilinear2d_aa", "_upsample_nearest_exact2d", "_upsample_bicubic2d_aa")
 def resize(call: Call) -> Spread:
-    """Returns boxes widened by the interpolation, which is asked with its own options."""
-    stated = zip(call.function._schema.arguments, call.args, strict=False)
-    options = {argument.name: value for argument, value in stated}
+    """Returns boxes widened by the interpolation of rows and columns.
+
+    Which outputs it reaches is found by the operation itself, with the options of the call.
+    """
+    options = _options(call)
     corners = [options["align_corners"]] if "align_corners" in options else []
     responses: dict[int, Response] = {}
-    for axis, name in ((2, "scales_h"), (3, "scales_w")):
-        size = call.source.shape[axis]
-        wanted = call.shape[axis]
-        rows = torch.eye(size)[None, :, None]  # (1, n, 1, n)
-        output = call.function(rows, [1, wanted], *corners, None, options.get(name))
-        responses[axis] = _response(output.reshape(size, wanted))
+    for axis, scale_name in ((2, "scales_h"), (3, "scales_w")):
+        old_size = call.source.shape[axis]
+        new_size = call.shape[axis]
+        # Both axes are asked along columns: an image of one row with a channel for each index.
+        image = torch.eye(old_size)[None, :, None]  # (1, n, 1, n)
+        scales = (None, options.get(scale_name))  # of rows and of columns
+        output = call.function(image, [1, new_size], *corners, *scales)
+        responses[axis] = _response(output.reshape(old_size, new_size))
     return move_along(call, responses)
+
+
+def _options(call: Call) -> dict[str, Any]:
+    """The positional arguments of an operation by their names in aten, without those left out."""
+    arguments = zip(call.function._schema.arguments, call.args, strict=False)
+    return {argument.name: value for argument, value in arguments}
 
 
 _PADDING_MODES = {
@@ -156,7 +185,7 @@ def pad(call: Call) -> Spread:
     """Returns boxes moved by the padding, and widened where it repeats elements."""
     padding = list(call.args[1])
     responses: dict[int, Response] = {}
-    # Pairs of numbers before and behind, of the last axis first.
+    # Pairs of how many elements are added before and behind, those of the last axis first.
     for number, pair in enumerate(zip(padding[::2], padding[1::2], strict=True)):
         axis = call.source.ndim - 1 - number
         output = F.pad(_unit_rows(call, axis), pair, mode=_PADDING_MODES[call.name])
@@ -166,7 +195,7 @@ def pad(call: Call) -> Spread:
 
 @rule("pixel_shuffle")
 def pixel_shuffle(call: Call) -> Spread:
-    """Returns boxes where a cell becomes factor × factor pixels."""
+    """Returns boxes where `factor²` channels of a cell become factor × factor pixels."""
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -177,7 +206,7 @@ def pixel_shuffle(call: Call) -> Spread:
 
 @rule("pixel_unshuffle")
 def pixel_unshuffle(call: Call) -> Spread:
-    """Returns boxes where factor × factor pixels become a cell."""
+    """Returns boxes where factor × factor pixels become `factor²` channels of a cell."""
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -188,12 +217,15 @@ def pixel_unshuffle(call: Call) -> Spread:
 
 @rule("gather")
 def gather(call: Call) -> Spread:
-    """Returns boxes by the indices, such as those of a pooling; everything if they are unknown."""
+    """Returns boxes moved to where the indices of `torch.gather` take their elements.
+
+    All of the result if the indices have no values, as on the device "meta".
+    """
     indices = call.args[2]
     if call.place != 0 or indices.is_meta:
         return everywhere(call)
     axis = call.args[1] % call.source.ndim
-    # The first and the last place along the axis that each index is found at.
+    # The first and the last place along the axis, in any row, that each index is found at.
     indices = indices.cpu().movedim(axis, -1).reshape(-1, indices.shape[axis])
     places = torch.arange(indices.shape[1]).expand_as(indices).reshape(-1)
     indices = indices.reshape(-1)
