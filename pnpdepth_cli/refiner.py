@@ -17,7 +17,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
 from pnpdepth_cli.dataset.saved_result import save
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
-from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
+from pnpdepth_cli.frames.adapt import learn, reason_not_to_learn, weights_in_place
 from pnpdepth_cli.frames.frame import (
     Frame,
     Refined,
@@ -246,7 +246,7 @@ class Refiner:
 
     def _adapt_network(self, network: Network, opening: ExitStack) -> Network:
         """The network with the weights that it learnt, if they are better, and a note on them."""
-        why = too_little(len(self._adapt), self._adapt[0])
+        why = reason_not_to_learn(len(self._adapt), self._adapt[0])
         weights = "the network's own weights: "
         if why is None:
             named = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
