@@ -7,9 +7,10 @@ definition names. `prepare` makes a frame the network's input.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -160,10 +161,20 @@ class OpenNetwork:
             self._check_seen(prepared, frame)
             reader = AlignedDepth(self.network, prepared.points, self.settings.align)
             try:
-                # Without updates one pass of the whole network is enough.
                 if updates and self.is_updated(frame):
-                    result = self._updated(prepared, reader)
+                    z0 = self._front(prepared)
+                    with self._smaller_depth() as full_outputs:
+                        result = refine(
+                            self.cut(),
+                            prepared.arguments,
+                            prepared.points,
+                            self.settings,
+                            depth_of=reader,
+                            z0=z0,
+                        )
+                    result = _at_full_size(result, full_outputs, reader)
                 else:
+                    # One pass of the whole network is enough.
                     result = self._plain(prepared, reader)
             except DivergedError as error:
                 # A refinement that diverges ends with its last good depth, if it has one.
@@ -239,34 +250,33 @@ class OpenNetwork:
         loss = checked_loss(self.settings.loss)(at_points[known], prepared.points.depth[known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
 
-    def _updated(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
-        """The depth before and after the updates of z, both at full size.
+    def _smaller_depth(self) -> AbstractContextManager[list[Any]]:
+        """Returns a context in which the network gives the smaller depth of its definition.
 
-        Args:
-            prepared: The frame as the network takes it.
-            reader: Reads the network's output as metres.
-
-        Raises:
-            DivergedError: The loss is not finite.
+        Its list gets the full depth of the first forward, and of each without gradients. It stays
+        empty where the definition gives no smaller depth, or another layer is cut.
         """
-        z0 = self._front(prepared)
-        # Where the definition gives a smaller depth, updates are made by it. Its context lists the
-        # network's full outputs; without it the list is empty.
-        coarse = None if self._coarse is None else self._coarse(self.network.module)
-        with coarse or nullcontext([]) as full_outputs:
-            result = refine(
-                self.cut(),
-                prepared.arguments,
-                prepared.points,
-                self.settings,
-                depth_of=reader,
-                z0=z0,
-            )
-        if full_outputs:
-            before = reader(full_outputs[0])
-            after = reader(full_outputs[-1])
-            result = replace(result, before=before, after=after)
+        if self._coarse is None:
+            return nullcontext([])
+        return self._coarse(self.network.module)
+
+
+def _at_full_size(
+    result: Refinement, full_outputs: Sequence[object], reader: AlignedDepth
+) -> Refinement:
+    """A refinement by a smaller depth, with the full depth before and after the updates of z.
+
+    Args:
+        result: The refinement.
+        full_outputs: What the network returned for the full depth, the first for z_0 and the last
+            for the updated z. Empty if the depth of the refinement has full size.
+        reader: Reads the network's output as metres.
+    """
+    if not full_outputs:
         return result
+    before = reader(full_outputs[0])
+    after = reader(full_outputs[-1])
+    return replace(result, before=before, after=after)
 
 
 def prepare(network: Network, frame: Frame) -> PreparedFrame:
