@@ -34,12 +34,16 @@ _VALUES_PER_BYTE = 1032
 
 def max_pixels() -> int:
     """Returns the most pixels of an image, and rows or elements of any other array of numbers."""
-    return _chosen or min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
+    if _chosen:
+        return _chosen
+    return min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
 
 
 def max_network_pixels() -> int:
     """Returns the most pixels of the one image size that a network takes, by its file."""
-    return _chosen or min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
+    if _chosen:
+        return _chosen
+    return min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
 
 
 def max_file_bytes() -> int:
@@ -106,7 +110,9 @@ def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
     if not size:  # also of what /proc shows as files, some of which never end
         raise ModelError(f"{kind} {path} is empty (0 bytes); copy or create it again")
     claim = f"{kind} {path} has {size:,} bytes"
-    check_claim(claim, size, most or max_decoded_bytes(), error=ModelError)
+    if most is None:
+        most = max_decoded_bytes()
+    check_claim(claim, size, most, error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:

@@ -100,7 +100,7 @@ class Refiner:
             raise UsageError("network must be from load_network, or several in a list")
         if not isinstance(settings, Settings | None):
             raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
-        self._asked = settings or Settings()
+        self._asked = Settings() if settings is None else settings
         self._uncertainty = uncertainty
         self._keep_measured = keep_measured
         self._register = registration_to_make(registration, self._asked)
@@ -187,8 +187,8 @@ class Refiner:
     def share_registration(self, frames: Iterable[Pair]) -> None:
         """Decides by some frames together how the images of a sequence are moved to the points.
 
-        All images of the size of the first frame that tells it are moved alike from then on. An
-        image of another size is moved as its own points say.
+        Not all frames tell how. All images of the size of the first that does are moved alike from
+        then on. An image of another size is moved as its own points say.
 
         Args:
             frames: Frames (image, sparse) of the sequence, such as 16 spread over it.
@@ -230,7 +230,12 @@ class Refiner:
         ]
 
     def _is_moved_otherwise(self, frame: Frame, refined: Refined) -> bool:
-        """Whether any image of this size, with this one, was moved otherwise than another."""
+        """Whether images of this size, with this one, were moved to their points in two ways.
+
+        Args:
+            frame: The frame, before it was refined.
+            refined: The same frame refined, which says how its image was moved.
+        """
         if frame.image is None:
             return False
         moved = self._moved.setdefault(frame.size, set())
@@ -320,22 +325,22 @@ def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[
         InputError: The unit is needed, or the depth is no array of numbers.
         UsageError: There is no such unit.
     """
-    values = _numbers(depth, what)
+    numbers = _numbers(depth, what)
     if unit is not None:
         if unit not in UNITS:
             raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
-        return (values / UNITS[unit]).astype(np.float32)
-    known = values[np.isfinite(values) & (values > 0)]
-    if values.dtype.kind in "iu":
+        return (numbers / UNITS[unit]).astype(np.float32)
+    known = numbers[np.isfinite(numbers) & (numbers > 0)]
+    if numbers.dtype.kind in "iu":
         raise InputError(
-            f'{what} is of {values.dtype}; give its unit, such as unit="mm" or unit="m"'
+            f'{what} is of {numbers.dtype}; give its unit, such as unit="mm" or unit="m"'
         )
     if known.size and np.median(known) > FARTHEST_MEDIAN_M:
         raise InputError(
             f"{what} is {np.median(known):,.0f} in the median, which is too far for metres; give"
             ' its unit, such as unit="mm" or unit="m"'
         )
-    return values.astype(np.float32)
+    return numbers.astype(np.float32)
 
 
 def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
@@ -420,13 +425,13 @@ def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iter
     if isinstance(depth, list | tuple) and (not depth or np.ndim(depth[0]) > 1):
         maps = [*depth]
     for depth_map in maps:
-        values = _numbers(depth_map, "the depth map").astype(np.float32)
-        if values.shape != size:
-            raise InputError(f"the depth map is {values.shape}, but the image is {size}")
-        known = np.isfinite(values)
-        if not known.any():
+        numbers = _numbers(depth_map, "the depth map").astype(np.float32)
+        if numbers.shape != size:
+            raise InputError(f"the depth map is {numbers.shape}, but the image is {size}")
+        is_known = np.isfinite(numbers)
+        if not is_known.any():
             raise InputError("the depth map has no finite value")
-        yield torch.from_numpy(np.where(known, values, np.float32(np.nan)))
+        yield torch.from_numpy(np.where(is_known, numbers, np.float32(np.nan)))
 
 
 def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:
@@ -470,20 +475,20 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
     Integers are divided by their white: 255, or 65535 for uint16 with any value above 255, as
     files are read.
     """
-    values = _numbers(image, "an image")
-    if values.ndim == 2:
-        values = values[:, :, None].repeat(3, axis=2)
-    if values.ndim != 3 or values.shape[2] != 3 or not values.size:
+    pixels = _numbers(image, "an image")
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None].repeat(3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise InputError(f"an image has shape (H, W, 3) or (H, W), not {np.shape(image)}")
-    if values.dtype in FULL_SCALE:
-        white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]
-        return (values / white).astype(np.float32)
-    if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
+    if pixels.dtype in FULL_SCALE:
+        white = 255.0 if pixels.max() <= 255 else FULL_SCALE[pixels.dtype]
+        return (pixels / white).astype(np.float32)
+    if pixels.dtype.kind != "f" or not (pixels >= 0).all() or not (pixels <= 1).all():
         raise InputError(
             "an image is uint8, uint16, or float in 0..1; this one is"
-            f" {values.dtype} in {values.min()}..{values.max()}; divide it by its white"
+            f" {pixels.dtype} in {pixels.min()}..{pixels.max()}; divide it by its white"
         )
-    return values.astype(np.float32)
+    return pixels.astype(np.float32)
 
 
 def _points(
@@ -504,28 +509,28 @@ def _points(
     """
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), 0
-    values = _numbers(sparse, "sparse depth")
+    numbers = _numbers(sparse, "sparse depth")
     unknown = 0
-    if values.ndim != 2:
-        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
+    if numbers.ndim != 2:
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {numbers.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
-    if values.shape[1] == 3 and values.shape != size:
+    if numbers.shape[1] == 3 and numbers.shape != size:
         if size is None:
             raise InputError("rows of x, y and depth need an image for the size of the frame")
-        column = in_metres(values[:, 2], "the sparse depth", unit)
-        known = np.isfinite(values).all(axis=1) & (column > 0)
-        xy = values[known, :2].astype(np.float32)
-        depth = column[known]
-        unknown = int(np.count_nonzero(~known))
+        depth_of_rows = in_metres(numbers[:, 2], "the sparse depth", unit)
+        is_known = np.isfinite(numbers).all(axis=1) & (depth_of_rows > 0)
+        xy = numbers[is_known, :2].astype(np.float32)
+        depth = depth_of_rows[is_known]
+        unknown = int(np.count_nonzero(~is_known))
     else:
         # Anything else is a depth map, of which the known pixels are points.
-        if size is not None and values.shape != size:
-            raise InputError(f"the sparse depth map is {values.shape} but the image is {size}")
-        size = values.shape[0], values.shape[1]
-        values = in_metres(values, "the sparse depth", unit)
-        rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
+        if size is not None and numbers.shape != size:
+            raise InputError(f"the sparse depth map is {numbers.shape} but the image is {size}")
+        size = numbers.shape[0], numbers.shape[1]
+        numbers = in_metres(numbers, "the sparse depth", unit)
+        rows, columns = np.nonzero(np.isfinite(numbers) & (numbers > 0))
         xy = np.stack([columns, rows], axis=1).astype(np.float32)
-        depth = values[rows, columns]
+        depth = numbers[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
     return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown

@@ -128,13 +128,40 @@ def learn(
     # The loss before.
     theta = _weights_that_learn(network)
     before = _losses_of(network, validation, theta, seed)
-    # All updates, a few on each frame.
+    # The updates.
+    _make_updates(network, training, theta, seed=seed, on_step=on_step)
+    # The loss after.
+    weights = {name: weight.detach() for name, weight in theta.items()}
+    after = _losses_of(network, validation, theta, seed)
+    return Learnt(weights=weights, before=before, after=after)
+
+
+def _make_updates(
+    network: Network,
+    lessons: Sequence[Lesson],
+    theta: Weights,
+    *,
+    seed: int,
+    on_step: Callable[[], None],
+) -> None:
+    """Afterwards the weights theta have had `STEPS` updates, a few on each frame in turn.
+
+    Args:
+        network: The network.
+        lessons: The frames to learn from.
+        theta: Weights with gradients, which change in place.
+        seed: Random seed of the frames' order and of the hidden points.
+        on_step: Function that is called after each update.
+
+    Raises:
+        DivergedError: The loss is not finite.
+    """
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(theta.values(), LR, eps=EPSILON)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
-    order = _shuffle(len(training), generator)
+    order = _shuffle(len(lessons), generator)
     for first_step in range(0, STEPS, STEPS_A_VISIT):
-        lesson = training[next(order)]
+        lesson = lessons[next(order)]
         with _open_lesson(network, lesson, generator) as loss_of:
             for step in range(first_step, min(first_step + STEPS_A_VISIT, STEPS)):
                 optimiser.zero_grad()
@@ -150,10 +177,6 @@ def learn(
                 optimiser.step()
                 schedule.step()
                 on_step()
-    # The loss after.
-    weights = {name: value.detach() for name, value in theta.items()}
-    after = _losses_of(network, validation, theta, seed)
-    return Learnt(weights=weights, before=before, after=after)
 
 
 @contextmanager
@@ -162,8 +185,8 @@ def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
     parameters = dict(network.module.named_parameters())
     originals = {name: parameters[name].data for name in weights}
     try:
-        for name, value in weights.items():
-            parameters[name].data = value.to(parameters[name].dtype)
+        for name, weight in weights.items():
+            parameters[name].data = weight.to(parameters[name].dtype)
         yield
     finally:
         for name, original in originals.items():
@@ -221,13 +244,13 @@ def _open_lesson(
         is_hidden = next(halves).to(points.depth.device)
         shown = points.select(~is_hidden)
         hidden = points.select(is_hidden)
-        values = {name: value.to(parameters[name].dtype) for name, value in weights.items()}
+        typed_weights = {name: w.to(parameters[name].dtype) for name, w in weights.items()}
         arguments = tuple(tensor.clone() for tensor in prepared.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
-            output = functional_call(network.module, values, arguments)
+            output = functional_call(network.module, typed_weights, arguments)
         predicted = hidden.sample(reader(output))
-        known = predicted.isfinite()  # unknown where the network says so, such as in the sky
-        log_error = predicted[known].clamp_min(MIN_DEPTH).log() - hidden.depth[known].log()
+        is_known = predicted.isfinite()  # not where the network says so, such as in the sky
+        log_error = predicted[is_known].clamp_min(MIN_DEPTH).log() - hidden.depth[is_known].log()
         return log_error.abs().mean()
 
     with encoding_once(network, {}):
@@ -240,11 +263,12 @@ def _weights_that_learn(network: Network) -> dict[str, Tensor]:
     All floating-point parameters learn but those of the image encoder that the definition names.
     """
     encoder = network.definition.image_encoder
-    return {
-        name: parameter.detach().float().clone().requires_grad_()
-        for name, parameter in network.module.named_parameters()
-        if parameter.is_floating_point() and not (encoder and name.startswith(f"{encoder}."))
-    }
+    weights: dict[str, Tensor] = {}
+    for name, parameter in network.module.named_parameters():
+        is_of_encoder = encoder is not None and name.startswith(f"{encoder}.")
+        if parameter.is_floating_point() and not is_of_encoder:
+            weights[name] = parameter.detach().float().clone().requires_grad_()
+    return weights
 
 
 def _losses_of(
@@ -252,7 +276,11 @@ def _losses_of(
 ) -> NDArray[np.float64]:
     """(F,) the loss at hidden points of each of F frames with the weights theta.
 
-    With one seed the same points are hidden, whatever the weights.
+    Args:
+        network: The network.
+        lessons: The frames, and their points of which half is hidden.
+        theta: The weights.
+        seed: Random seed of the hidden points: with one seed they are the same for all weights.
     """
     losses: list[float] = []
     for lesson in lessons:

@@ -164,23 +164,24 @@ def expert_of(
         updates: Whether z may be updated.
         unexplained: What the network leaves unexplained, see `unexplained_by`.
     """
-    # The network predicts from all points; a prior is that of all points, too.
+    # The network predicts from all points; a prior is made from all points, too.
     whole = split.whole if prior is None else replace(split.whole, prior=prior.whole.aligned)
-    of_whole = prediction or network.refine(whole, updates=updates)
+    if prediction is None:
+        prediction = network.refine(whole, updates=updates)
     # A strong network's depth is that before updates of z, unless the user states their number. A
     # depth map has no z, so its two depths are one.
     is_updated = network.settings.iterations > 0
     share_of_aligned = 0.0
     if is_updated and not network.always_updated:
         share_of_aligned = strength_of(unexplained)
-    no_points = split.points.depth  # what is predicted at the validation points of a frame without
+    nothing = split.points.depth[:0]  # the prediction without validation points, (0,)
     expert = NetworkExpert(
         name=name,
-        at_validation=no_points,
-        updated_at_validation=no_points,
+        at_validation=nothing,
+        updated_at_validation=nothing,
         points=whole.points,
-        whole=of_whole,
-        kept=of_whole,
+        whole=prediction,
+        kept=prediction,
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
@@ -189,7 +190,7 @@ def expert_of(
     )
     if not len(split.points):
         return expert
-    # It predicts the validation points from the others; a prior is that of the others, too.
+    # It predicts the validation points from the others; a prior is made from the others, too.
     kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
     return _validated(expert, network, split, kept, updates=updates)
 
@@ -217,20 +218,21 @@ def _validated(
     is_stated = network.tuned or network.always_updated
     is_worth_it = share_of_aligned < 1 and (is_stated or not network.takes_points)
     prediction = network.refine(kept, updates=updates and is_worth_it)
-    at = _at_validation_points(_mix_with_aligned(prediction, share_of_aligned), split)
+    mixed = _mix_with_aligned(prediction, share_of_aligned)
+    predicted = _at_validation_points(mixed, split)
     harm = None
     # Updates that the user states may do harm, such as at a layer near to the depth.
     if network.tuned and prediction.updates and share_of_aligned < 1:
         without = _at_validation_points(prediction.aligned, split)
         error_without = split.error(without)
-        error_with = split.error(at)
+        error_with = split.error(predicted)
         if error_with > HARMFUL * error_without:
             harm = (error_without, error_with)
-            at = without
+            predicted = without
             share_of_aligned = 1.0
     return replace(
         expert,
-        at_validation=at,
+        at_validation=predicted,
         updated_at_validation=split.points.sample(prediction.updated),
         kept=prediction,
         share_of_aligned=share_of_aligned,
@@ -239,7 +241,12 @@ def _validated(
 
 
 def _at_validation_points(dense: Tensor, split: ValidatedFrame) -> Tensor:
-    """(M,) a depth (H, W) at the validation points, its residual at the others propagated."""
+    """(M,) metres, 0 = unknown: a depth at the validation points, its residual propagated.
+
+    Args:
+        dense: (H, W) metres, 0 = unknown: the depth.
+        split: The frame and its validation points; the residual is that at the other points.
+    """
     field = ResidualField(dense, split.kept.points, split.kept.rgb)
     return field.depth(split.points.xy, kind=split.propagation)
 
@@ -262,7 +269,8 @@ def expert_of_user(
     lacks_trust = False
     # What a network of the image alone leaves unexplained without updates decides on them.
     if not network.takes_points:
-        prediction = prediction or network.refine(split.whole, updates=network.always_updated)
+        if prediction is None:
+            prediction = network.refine(split.whole, updates=network.always_updated)
         unexplained = unexplained_by(prediction.aligned, split, judged)
         # Updates that the user states are made without trust, too.
         is_stated = network.always_updated or network.tuned
@@ -373,14 +381,14 @@ def _interpolation(split: ValidatedFrame) -> Expert:
 
     Its dense depth takes long, so it is computed where it is first asked for (`Expert.dense`).
     """
-    at = split.points.depth  # of no points in a frame without validation points
+    predicted = split.points.depth[:0]  # without validation points
     if len(split.points):
-        at = linear(split.kept.points, split.points.xy)
+        predicted = linear(split.kept.points, split.points.xy)
     return Expert(
         name=LINEAR,
         weight=WITHOUT_IMAGE,
-        at_validation=at,
-        updated_at_validation=at,
+        at_validation=predicted,
+        updated_at_validation=predicted,
         points=split.whole.points,
     )
 

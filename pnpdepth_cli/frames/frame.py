@@ -155,7 +155,7 @@ class Saver(Protocol):
     """What writes a refined frame; made above this package, which knows no files."""
 
     def __call__(self, refined: Refined, path: Path, *, overwrite: bool) -> None:
-        """Writes the frame."""
+        """Writes the frame's depth to a file, and its record beside that; see `Refined.save`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,15 +257,15 @@ class ValidationPoints:
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self.points):,} points)"
 
-    def error(self, at: Tensor) -> float:
+    def error(self, predicted: Tensor) -> float:
         """Returns the weighted mean absolute error in metres of a prediction of the points.
 
         A point without prediction counts as far off as a depth of 0 is.
 
         Args:
-            at: (M,) metres, 0 = unknown: predicted depth of each validation point.
+            predicted: (M,) metres, 0 = unknown: depth of each validation point.
         """
-        errors = (at - self.points.depth).abs()
+        errors = (predicted - self.points.depth).abs()
         return float((errors * self.weights).sum() / self.weights.sum())
 
 

@@ -61,10 +61,11 @@ def fit_weights(
     is_chosen = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
     if len(weighted) > 1 and bool(is_chosen.any()):
         # Log predictions and log depths, relative to the prediction with the prior weights.
-        at = torch.stack([expert.at_validation for expert in weighted], dim=1)[is_chosen].double()
-        mean = weighted_mean([(at[:, column], float(w)) for column, w in enumerate(prior)])
+        of_experts = [expert.at_validation[is_chosen].double() for expert in weighted]
+        mean = weighted_mean(list(zip(of_experts, prior.tolist(), strict=True)))
         centre = log_of(mean)
-        offsets = torch.where(at > 0, log_of(at) - centre[:, None], 0.0)
+        predicted = torch.stack(of_experts, dim=1)
+        offsets = torch.where(predicted > 0, log_of(predicted) - centre[:, None], 0.0)
         residual = log_of(split.points.depth.double()[is_chosen]) - centre
         counts = split.weights[is_chosen].double()
         fitted = _fit(prior, offsets.numpy(), residual.numpy(), counts.numpy())
@@ -76,9 +77,10 @@ def fit_weights(
 
 
 def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Floats:
-    """Weights (E,) of E experts, >= 0, their sum 1, with which `offsets @ weights` is `residual`.
+    """Weights (E,) of E experts, >= 0, their sum 1, that fit the experts' depths to the points.
 
-    It is so by Huber's loss, near the prior weights, by iteratively reweighted least squares.
+    `offsets @ weights` is close to `residual` by Huber's loss, and the weights are close to the
+    prior weights. It is solved by iteratively reweighted least squares.
 
     Args:
         prior: (E,) prior weights, all above 0, their sum 1.
@@ -88,8 +90,10 @@ def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Fl
     """
     from scipy.optimize import nnls
 
-    # The residual from which on Huber's loss is linear, and the root of the weight of the prior.
-    scale = max(_STD_OF_MEAN * float(np.average(np.abs(residual), weights=counts)), _LEAST_STD)
+    # The residual from which on Huber's loss is linear: their standard deviation.
+    mean_size = float(np.average(np.abs(residual), weights=counts))
+    scale = max(_STD_OF_MEAN * mean_size, _LEAST_STD)
+    # The factor of the rows of the prior weights, so that they count as `STRENGTH` such residuals.
     ridge = np.sqrt(STRENGTH) * scale
     sum_of_weights = np.full((1, len(prior)), _SUM_WEIGHT)
     fitted = prior
@@ -196,20 +200,20 @@ def _share_of_image(
         inliers: The frame without its outliers.
         weights: The weights in the fused depth, by name.
     """
-    own = experts.own
+    first = experts.own
     alone = experts.alone
-    if alone is None or own.user is None or own.user.takes_points:
+    if alone is None or first.user is None or first.user.takes_points:
         return []
     # Its error at the validation points, beside that of `compact`, says how much it may have.
     kept = split.kept
-    field = ResidualField(own.kept.aligned, kept.points, kept.rgb)
-    at = field.depth(split.points.xy, kind=split.propagation)
-    ratio = split.error(at) / max(split.error(alone.at_validation), LEAST_ERROR)
+    field = ResidualField(first.kept.aligned, kept.points, kept.rgb)
+    predicted = field.depth(split.points.xy, kind=split.propagation)
+    ratio = split.error(predicted) / max(split.error(alone.at_validation), LEAST_ERROR)
     fraction = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
     least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, fraction))
     # What it has already in the fused depth counts.
-    missing = least_weight - weights[own.name]
+    missing = least_weight - weights[first.name]
     if missing <= 0:
         return []
-    whole = ResidualField(own.whole.aligned, inliers.points, inliers.rgb)
-    return [Share(own.name, missing, whole.depth(kind=split.propagation), at)]
+    whole = ResidualField(first.whole.aligned, inliers.points, inliers.rgb)
+    return [Share(first.name, missing, whole.depth(kind=split.propagation), predicted)]

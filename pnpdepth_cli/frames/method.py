@@ -68,7 +68,7 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
         leaves_outliers_out=False,
         validates=validated,
         fuses=False,
-        propagation=asked.propagate or PAPER.propagate,
+        propagation=PAPER.propagate if asked.propagate is None else asked.propagate,
         unused=unused,
     )
 
@@ -160,9 +160,9 @@ class Method:
             companion = load_network(COMPANION, None, str(resolved[0].device))
             resolved.append(resolve_definition(companion, first))
         # Layers and settings are decided.
-        own, *others = resolved
+        first_network, *others = resolved
         self.members = (
-            resolve_member(own, first, asked),
+            resolve_member(first_network, first, asked),
             *(resolve_member(network, first, Settings()) for network in others),
         )
 

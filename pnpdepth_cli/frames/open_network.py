@@ -164,7 +164,7 @@ class OpenNetwork:
                 if updates and self.is_updated(frame):
                     z0 = self._front(prepared)
                     with self._smaller_depth() as full_outputs:
-                        result = refine(
+                        refinement = refine(
                             self.cut(),
                             prepared.arguments,
                             prepared.points,
@@ -172,32 +172,37 @@ class OpenNetwork:
                             depth_of=reader,
                             z0=z0,
                         )
-                    result = _at_full_size(result, full_outputs, reader)
+                    refinement = _at_full_size(refinement, full_outputs, reader)
                 else:
                     # One pass of the whole network is enough.
-                    result = self._plain(prepared, reader)
+                    refinement = self._plain(prepared, reader)
             except DivergedError as error:
                 # A refinement that diverges ends with its last good depth, if it has one.
                 if error.last_good is None:
                     raise
                 diverged = error
-                result = error.last_good
-        aligned = prepared.to_image(result.before)
+                refinement = error.last_good
+        aligned = prepared.to_image(refinement.before)
         updated = aligned
-        if result.after is not result.before:
-            updated = prepared.to_image(result.after)
+        if refinement.after is not refinement.before:
+            updated = prepared.to_image(refinement.after)
         return Prediction(
             aligned=aligned,
             updated=updated,
-            losses=result.losses,
-            step=result.step,
+            losses=refinement.losses,
+            step=refinement.step,
             diverged=diverged,
             alignment=reader.alignment,
             notes=reader.notes,
         )
 
     def _check_seen(self, prepared: PreparedFrame, frame: Frame) -> None:
-        """Raises NoPointsError if none of the frame's points lies where the network looks."""
+        """Raises NoPointsError if none of the frame's points lies where the network looks.
+
+        Args:
+            prepared: The frame as the network takes it.
+            frame: The frame.
+        """
         if not len(prepared.points):
             top, left, height, width = prepared.map.crop
             raise NoPointsError(
@@ -246,8 +251,9 @@ class OpenNetwork:
         with torch.no_grad():
             depth = reader(self._output_for(prepared)).detach()
         at_points = prepared.points.sample(depth)
-        known = at_points.isfinite()
-        loss = checked_loss(self.settings.loss)(at_points[known], prepared.points.depth[known])
+        is_known = at_points.isfinite()
+        loss_of = checked_loss(self.settings.loss)
+        loss = loss_of(at_points[is_known], prepared.points.depth[is_known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
 
     def _smaller_depth(self) -> AbstractContextManager[list[Any]]:
@@ -262,21 +268,21 @@ class OpenNetwork:
 
 
 def _at_full_size(
-    result: Refinement, full_outputs: Sequence[object], reader: AlignedDepth
+    refinement: Refinement, full_outputs: Sequence[object], reader: AlignedDepth
 ) -> Refinement:
     """A refinement by a smaller depth, with the full depth before and after the updates of z.
 
     Args:
-        result: The refinement.
+        refinement: The refinement by the smaller depth.
         full_outputs: What the network returned for the full depth, the first for z_0 and the last
             for the updated z. Empty if the depth of the refinement has full size.
         reader: Reads the network's output as metres.
     """
     if not full_outputs:
-        return result
+        return refinement
     before = reader(full_outputs[0])
     after = reader(full_outputs[-1])
-    return replace(result, before=before, after=after)
+    return replace(refinement, before=before, after=after)
 
 
 def prepare(network: Network, frame: Frame) -> PreparedFrame:
@@ -306,15 +312,15 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
             return (frame.predicted[network.definition.map_number][None, None],)
         return network.arguments_of(image, points, prior, intrinsics)
 
-    # A network that weighs its points is given the outliers, too.
-    points = to_network.points_to_network(frame.points)
-    given = points
+    # A network that weighs its points takes the outliers, too.
+    inliers = to_network.points_to_network(frame.points)
+    taken = inliers
     if frame.outliers is not None and network.definition.weighs_points:
-        given = points.joined(to_network.points_to_network(frame.outliers))
+        taken = inliers.joined(to_network.points_to_network(frame.outliers))
     return PreparedFrame(
         map=to_network,
-        arguments=arguments_for(given),
-        points=points.tensors(network.device),
+        arguments=arguments_for(taken),
+        points=inliers.tensors(network.device),
         arguments_for=arguments_for,
     )
 

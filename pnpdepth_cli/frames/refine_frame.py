@@ -117,11 +117,11 @@ def refine_frame(
         weights=weights,
         shares=shares,
     )
-    result = _refined(frame, inliers, experts, split, steps, pipeline)
+    refined = _refined(frame, inliers, experts, split, steps, pipeline)
     if with_stages:
         stages = _stages(experts, inliers, split, steps)
-        result = replace(result, stages={name: stage.numpy() for name, stage in stages.items()})
-    return result
+        refined = replace(refined, stages={name: stage.numpy() for name, stage in stages.items()})
+    return refined
 
 
 class Steps(NamedTuple):
@@ -250,16 +250,16 @@ def _refined(
         steps: What the steps gave.
         pipeline: The steps of the method.
     """
-    own = experts.own.whole
+    prediction = experts.own.whole  # of the user's first network
     notes = _notes(frame, inliers, experts, split, steps, pipeline)
     return Refined(
-        before=own.aligned.numpy(),
+        before=prediction.aligned.numpy(),
         depth=steps.depth.numpy(),
         used=inliers.points,
-        losses=own.losses,
-        step=own.step,
-        diverged=own.diverged,
-        alignment=own.alignment,
+        losses=prediction.losses,
+        step=prediction.step,
+        diverged=prediction.diverged,
+        alignment=prediction.alignment,
         propagation=split.propagation,
         notes=tuple(notes),
         validation=_validation(experts, split, steps.shares),
@@ -278,10 +278,16 @@ def _notes(
 ) -> list[str]:
     """What a person should know of the refined frame, a line each; warnings last.
 
-    The arguments are those of `_refined`.
+    Args:
+        frame: The frame with all its points.
+        inliers: The frame without its outliers.
+        experts: The experts.
+        split: The frame and its validation points.
+        steps: What the steps gave.
+        pipeline: The steps of the method.
     """
-    own = experts.own
-    notes = list(own.whole.notes)
+    first = experts.own
+    notes = list(first.whole.notes)
     # Of the image and the points.
     if frame.registration is not None:
         notes.append(
@@ -295,20 +301,20 @@ def _notes(
         )
     # Of the networks, and of the updates of the user's.
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
-    if own.harm is not None:
-        without, with_updates = own.harm
+    if first.harm is not None:
+        without, with_updates = first.harm
         notes.append(
-            f"{own.name}: these updates of z are not used, as they raise its error at"
+            f"{first.name}: these updates of z are not used, as they raise its error at"
             f" {len(split.points):,} validation points from {without:.4f} to {with_updates:.4f}"
         )
-    elif own.share_of_aligned > 0:
+    elif first.share_of_aligned > 0:
         notes.append(
-            f"{own.name} is strong: with its depth the points predict each other far better than"
-            f" without; {own.share_of_aligned:.0%} of it is taken before the updates of z"
+            f"{first.name} is strong: with its depth the points predict each other far better than"
+            f" without; {first.share_of_aligned:.0%} of it is taken before the updates of z"
         )
-    if pipeline.unused and not own.whole.updates:
+    if pipeline.unused and not first.whole.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
-        notes.append(f"{names}: not used, as z of {own.name} is not updated")
+        notes.append(f"{names}: not used, as z of {first.name} is not updated")
     return [*notes, *experts.warnings]
 
 
@@ -332,16 +338,16 @@ def _stages(
             return steps.propagated
         return _propagate(dense, frame, split, steps.judged)
 
-    own = experts.own
-    stages = {BEFORE: own.whole.aligned}
+    first = experts.own
+    stages = {BEFORE: first.whole.aligned}
     # Updates without a part in the result are no stage, but for those that do harm, which is shown.
-    if own.whole.updates and (own.share_of_aligned < 1 or own.harm is not None):
-        stages[UPDATED] = own.whole.updated
-    # The residual of a completion network on scan lines is not propagated (`fuse.Share`).
-    if own.of_scanner:
-        stages[PROPAGATED] = own.whole.updated
+    if first.whole.updates and (first.share_of_aligned < 1 or first.harm is not None):
+        stages[UPDATED] = first.whole.updated
+    # A completion network on scan lines has its share of the result without propagation.
+    if first.of_scanner:
+        stages[PROPAGATED] = first.whole.updated
     elif split.propagation != "none":
-        stages[PROPAGATED] = propagated(own.dense)
+        stages[PROPAGATED] = propagated(first.dense)
     if experts.alone is not None:
         stages[ALONE] = propagated(experts.alone.dense)
     return stages
@@ -359,7 +365,7 @@ def _validation(
         split: The frame and its validation points.
         shares: The shares of single networks in the result.
     """
-    own = experts.own
+    first = experts.own
     points = split.points
     if not len(points):
         return None
@@ -377,13 +383,13 @@ def _validation(
     if split.kept.outliers is not None:
         others = others.joined(split.kept.outliers)
     # The steps of the user's network, `compact` alone, the result and interpolation.
-    predicted = {BEFORE: points.sample(own.kept.aligned)}
-    if own.kept.updates:
-        predicted[UPDATED] = own.updated_at_validation
-    if own.of_scanner:
-        predicted[PROPAGATED] = own.updated_at_validation
+    predicted = {BEFORE: points.sample(first.kept.aligned)}
+    if first.kept.updates:
+        predicted[UPDATED] = first.updated_at_validation
+    if first.of_scanner:
+        predicted[PROPAGATED] = first.updated_at_validation
     elif split.propagation != "none":
-        predicted[PROPAGATED] = own.at_validation
+        predicted[PROPAGATED] = first.at_validation
     if experts.alone is not None:
         predicted[ALONE] = experts.alone.at_validation
     predicted[AFTER] = with_shares(fused, [(share.at_validation, share.weight) for share in shares])
@@ -391,7 +397,7 @@ def _validation(
     return Validation(
         points=points,
         kept=others,
-        network=own.kept.aligned,
+        network=first.kept.aligned,
         weights=split.weights,
         predicted=predicted,
     )

@@ -143,7 +143,8 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
             fields = fields_of(network, arguments, definition.layers)
             ordered = _by_preference(definition.layers, fields, enough_px)
             first_usable = partial(_first_usable, ordered)
-            return [by_shapes(network.module, arguments, first_usable) or definition.layers[0]]
+            layer = by_shapes(network.module, arguments, first_usable)
+            return [definition.layers[0] if layer is None else layer]
 
     # What was decided for this question in an earlier run is not decided again.
     question = f"layer of {definition.layers} for {enough_px:.6g} pixels of {frame.network}"
@@ -162,6 +163,7 @@ def _first_usable(
         arguments: Its arguments for a frame.
     """
     for layer in layers:
+        # `Split` raises ModelError where it cannot cut, and then the next layer is tried.
         with suppress(ModelError), Split(module, layer) as split, torch.no_grad():
             split.rear(split.front(*arguments))
             return layer
@@ -198,11 +200,12 @@ def _by_preference(
 
     Args:
         layers: Names of the layers, from the image to the depth.
-        fields: Their influential fields by name; layers without one are left out.
+        fields: How far one point reaches by each layer, in z and in the depth map, by name; layers
+            without such a field are left out.
         enough_px: Width in pixels of the depth map from which on a field is wide enough.
     """
     wide: list[str] = []
-    others: dict[str, tuple[int, float]] = {}
+    narrow: dict[str, tuple[int, float]] = {}
     for name in reversed(layers):
         if name not in fields:
             continue
@@ -212,8 +215,8 @@ def _by_preference(
             wide.append(name)
         else:
             patch_px = 0.0 if field.in_z is None else field.stride * min(field.in_z)
-            others[name] = (width_px, patch_px)
-    return [*wide, *sorted(others, key=others.__getitem__, reverse=True)]
+            narrow[name] = (width_px, patch_px)
+    return [*wide, *sorted(narrow, key=narrow.__getitem__, reverse=True)]
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
@@ -290,8 +293,8 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
     What the user gives replaces the network's own value. The paper's method takes the rest from the
     paper. The other methods propagate the residual, and take for the rest what serves that: at most
     `UPDATES` updates of z, none of a network that takes the points but no prior, and none of a
-    depth map. There a network of metres from the image alone is aligned where the points say that
-    it should be.
+    depth map. With them a network of metres from the image alone is aligned where the points say
+    that it should be.
 
     Args:
         network: The network, its definition with nothing left open.
@@ -329,7 +332,12 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
-    """The network with the input range of `choose_input_range`, and a note on that choice."""
+    """The network with the input range of `choose_input_range`, and a note on that choice.
+
+    Args:
+        network: The network, whose definition leaves its input range open.
+        frames: Frames with images, by which it is chosen.
+    """
     candidates = {name: with_input_range(network, name) for name in NORMALISATIONS}
     misfits = {
         name: _mean_alignment_error(candidate, frames) for name, candidate in candidates.items()

@@ -65,8 +65,8 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
         judged: The frame without outliers, and the residual fields by which they were told.
     """
     points = split.whole.points
-    known = int((points.sample(aligned) > 0).sum())
-    if split.has_scan_lines or known < MIN_POINTS or judged.constant is None:
+    known_count = int((points.sample(aligned) > 0).sum())
+    if split.has_scan_lines or known_count < MIN_POINTS or judged.constant is None:
         return 1.0
     field = judged.field
     if field is None or not field.is_of(aligned, points):
@@ -113,9 +113,10 @@ def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
         points: The frame's points without outliers.
     """
     # x is the network's log depth at the points, y theirs, both less their mean below.
-    at = points.sample(aligned).double()
-    x = log_of(at[at > 0])
-    y = log_of(points.depth[at > 0].double())
+    predicted = points.sample(aligned).double()
+    is_known = predicted > 0
+    x = log_of(predicted[is_known])
+    y = log_of(points.depth[is_known].double())
     count = len(x)
     if count < MIN_POINTS:
         return 0.0

@@ -198,11 +198,11 @@ def relative_shape(
         (H, W), or (M,) as `depth`.
     """
     # How far the network's own log depth ranges over a window, at every pixel.
-    known = network > 0
+    is_known = network > 0
     filled = network.new_tensor(1.0)  # where unknown, so that its logarithm is finite
-    if bool(known.any()):
-        filled = network[known].median()
-    log_network = torch.where(known, network, filled).log()[None, None]
+    if bool(is_known.any()):
+        filled = network[is_known].median()
+    log_network = torch.where(is_known, network, filled).log()[None, None]
     half = _WINDOW_PX // 2
     highest = F.max_pool2d(log_network, _WINDOW_PX, 1, half)
     lowest = -F.max_pool2d(-log_network, _WINDOW_PX, 1, half)
@@ -216,15 +216,15 @@ def relative_shape(
         positions = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
         network_range = positions.sample(ranges[0, 0])
     # Log depth of the nearest points.
-    _, near = nearest_points(points, queries, min(_AMONG, len(points)))
-    near_depths = points.depth.double().log()[near.reshape(len(queries), -1)]
-    low, high = near_depths.aminmax(dim=1)
+    _, numbers = nearest_points(points, queries, min(_AMONG, len(points)))
+    log_nearest = points.depth.double().log()[numbers.reshape(len(queries), -1)]
+    low, high = log_nearest.aminmax(dim=1)
     # The four differences of log depth, as in the module's list.
     log_depth = depth.clamp_min(_LEAST_DEPTH).log().double().flatten()
     log_linear = linear(points, xy).clamp_min(_LEAST_DEPTH).log().double().flatten()
     differences = (
         (log_linear - log_depth).abs(),
-        (near_depths[:, :_MEAN_OF].mean(dim=1) - log_depth).abs(),
+        (log_nearest[:, :_MEAN_OF].mean(dim=1) - log_depth).abs(),
         high - low,
         network_range.double(),
     )
@@ -284,16 +284,16 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     valid = supported & (sigma <= VALID_SIGMA * depth)
     # Pixels inside the hull, and those outside that are as near to a point. `flip` makes x and y of
     # rows and columns.
-    near = in_hull(points)
-    outside = torch.nonzero(~near).flip(1)
-    inside = torch.nonzero(near & ~beyond_range(points)).flip(1)
+    is_near = in_hull(points)
+    outside = torch.nonzero(~is_near).flip(1)
+    inside = torch.nonzero(is_near & ~beyond_range(points)).flip(1)
     if len(outside) and len(inside):
         sample = inside[:: max(1, len(inside) // _SAMPLED)]
         inside_px, _ = nearest_points(points, sample.double(), 1)
         outside_px, _ = nearest_points(points, outside.double(), 1)
         typical_px = float(inside_px.quantile(_TYPICAL_QUANTILE))
-        near[~near] = outside_px.flatten() <= _BEYOND_HULL * typical_px
-    return valid & near
+        is_near[~is_near] = outside_px.flatten() <= _BEYOND_HULL * typical_px
+    return valid & is_near
 
 
 def beyond_range(points: SparsePoints) -> Tensor:

@@ -39,20 +39,20 @@ class ValidatedFrame(ValidationPoints):
     hole: Tensor | None = None
     """(M,) number of the hole of a depth map that a validation point is in. None: in none."""
 
-    def gain(self, at: Tensor, other: Tensor) -> float:
+    def gain(self, predicted: Tensor, rival: Tensor) -> float:
         """Returns by how many standard errors one prediction is better than another.
 
         By absolute errors of log depth; negative where it is worse. Points in one hole of a depth
         map err together, so a hole counts as one point.
 
         Args:
-            at: (M,) metres, 0 = unknown: the prediction at the validation points.
-            other: (M,) metres, 0 = unknown: the prediction that it is compared with.
+            predicted: (M,) metres, 0 = unknown: the prediction at the validation points.
+            rival: (M,) metres, 0 = unknown: the prediction that it is compared with.
         """
         # How much nearer to the truth it is at each point, and what fraction the point counts.
         truth = log_of(self.points.depth)
         fractions = self.weights / self.weights.sum()
-        gains = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
+        gains = (log_of(rival) - truth).abs() - (log_of(predicted) - truth).abs()
         # Means of holes in place of points.
         if self.hole is not None:
             _, hole_of_point = torch.unique(self.hole, return_inverse=True)
@@ -78,12 +78,12 @@ def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
     has_scan_lines = scan_pattern(points.xy, points.size) is not None
     if propagation is None:
         propagation = "local" if has_scan_lines else "gp"
-    none = points.select(slice(0))
+    no_points = points.select(slice(0))
     return ValidatedFrame(
         whole=frame,
         kept=frame,
-        points=none,
-        weights=none.depth,
+        points=no_points,
+        weights=no_points.depth,
         has_scan_lines=has_scan_lines,
         propagation=propagation,
     )
@@ -122,9 +122,9 @@ def split_frame(
     validation = points.select(numbers)
     hole = None if hole is None else hole[numbers]
     # Each counts as much as it is consistent with its neighbours.
-    at = validation.sample(judged)
-    residual = validation.depth.double().log() - at.clamp_min(_LEAST_DEPTH).double().log()
-    weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
+    predicted = validation.sample(judged)
+    residual = validation.depth.double().log() - predicted.clamp_min(_LEAST_DEPTH).double().log()
+    weights = torch.where(predicted > 0, inlier_weights(validation, residual), 0.0).float()
     if not bool(weights.any()):
         weights = torch.ones_like(weights)
     return replace(whole, kept=kept, points=validation, weights=weights, hole=hole)

@@ -93,7 +93,7 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
             1 on.
         camera: The camera of all frames.
     """
-    result = points
+    joined = points
     for apart, scans in sorted(neighbours.items()):
         # The points of these neighbours in this frame's camera, their motions corrected.
         moved = []
@@ -106,14 +106,14 @@ def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera:
         agrees = _agrees(xy, xyz[:, 2], points)
         xy = xy[agrees]
         depth = xyz[agrees, 2]
-        distance_px, _ = cKDTree(result.xy).query(xy)
+        distance_px, _ = cKDTree(joined.xy).query(xy)
         is_free = distance_px >= apart
-        result = replace(
-            result,
-            xy=np.concatenate([result.xy, xy[is_free].astype(np.float32)]),
-            depth=np.concatenate([result.depth, depth[is_free].astype(np.float32)]),
+        joined = replace(
+            joined,
+            xy=np.concatenate([joined.xy, xy[is_free].astype(np.float32)]),
+            depth=np.concatenate([joined.depth, depth[is_free].astype(np.float32)]),
         )
-    return result
+    return joined
 
 
 def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
@@ -124,13 +124,13 @@ def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
         depth: (M,) their depths, metres.
         measured: The frame's own points.
     """
-    near = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
-    difference = np.abs(np.log(depth[:, None] / measured.depth[near]))
+    nearest = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
+    difference = np.abs(np.log(depth[:, None] / measured.depth[nearest]))
     # The nearest one agrees with it, or several of the nearest do.
     is_alike = difference[:, :_COMPARED] <= _TOLERANCE
     is_supported = is_alike[:, 0] | (is_alike.sum(axis=1) >= _AGREEING)
     # None that is close in the image has quite another depth.
-    offset = np.abs(measured.xy[near] - xy[:, None]) / _spacing_px(measured)
+    offset = np.abs(measured.xy[nearest] - xy[:, None]) / _spacing_px(measured)
     is_close = (offset <= _CLOSE).all(axis=2)
     is_contradicted = (is_close & (difference > _CONTRADICTION)).any(axis=1)
     agrees: Mask = is_supported & ~is_contradicted
@@ -149,8 +149,8 @@ def _nearest(tree: cKDTree, xy: NDArray[np.floating], count: int) -> NDArray[np.
         count: Number of points that are wanted.
     """
     ranks = np.arange(1, min(count, tree.n) + 1)  # a list of ranks gives a row for each pixel
-    _, near = tree.query(xy, k=ranks)
-    return np.asarray(near, np.intp)
+    _, numbers = tree.query(xy, k=ranks)
+    return np.asarray(numbers, np.intp)
 
 
 def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
@@ -163,11 +163,11 @@ def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
         xyz: (N, 3) the same points in the camera's coordinates, metres.
         tree: Tree of their pixel coordinates.
     """
-    near = _nearest(tree, points.xy, _NEIGHBOURS)
+    neighbours = _nearest(tree, points.xy, _NEIGHBOURS)
     # The normal is the direction in which the neighbours vary least.
-    around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
+    around = xyz[neighbours] - xyz[neighbours].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # rising variances
-    jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
+    jump = np.abs(np.log(points.depth[neighbours] / points.depth[:, None])).max(axis=1)
     is_flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
     return axes[:, :, 0], is_flat
 
@@ -243,9 +243,9 @@ def motion_of_images(
     """
     # Keypoints of the other frame, which have its depth, and the rays on which this one sees them.
     xy_there, xy_here = _matches(here, there)
-    depth, known = _depth_at(points, xy_there)
-    xyz = unproject(camera, xy_there[known], depth[known])
-    rays = rays_of(camera, xy_here[known])
+    depth, is_known = _depth_at(points, xy_there)
+    xyz = unproject(camera, xy_there[is_known], depth[is_known])
+    rays = rays_of(camera, xy_here[is_known])
     if len(xyz) < _MIN_INLIERS:
         return None, f"{len(xyz)} matches with depth, at least {_MIN_INLIERS} needed"
     # The motion that most matches agree with; rays are pixels of a camera of focal length 1.
@@ -280,6 +280,10 @@ def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
     """(M, 2) pixel coordinates of keypoints of the other image, and (M, 2) of their partners here.
 
     A keypoint is matched if its descriptor's nearest one here is clearly nearer than the next.
+
+    Args:
+        here: Keypoints of this frame's image.
+        there: Keypoints of the other frame's image.
     """
     xy_here, descriptors_here = here
     xy_there, descriptors_there = there
@@ -296,11 +300,15 @@ def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
     """Depth (M,) at pixels (M, 2), and (M,) where it is known: on one surface, beside a point.
 
     Depth is the inverse of the mean inverse depth of the nearest points, weighted by nearness.
+
+    Args:
+        points: The points.
+        xy: (M, 2) pixel coordinates.
     """
     if len(points) < _MIN_INLIERS or not len(xy):
         return np.zeros(len(xy)), np.zeros(len(xy), bool)
-    distance_px, near = cKDTree(points.xy).query(xy, k=_AROUND)
-    around = points.depth[near].astype(np.float64)
+    distance_px, numbers = cKDTree(points.xy).query(xy, k=_AROUND)
+    around = points.depth[numbers].astype(np.float64)
     is_smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
     is_near = distance_px[:, 0] < _REACH * _spacing_px(points)
     weights = 1 / np.maximum(distance_px, _LEAST_DISTANCE_PX)

@@ -143,6 +143,7 @@ class EdgeMap(NamedTuple):
 
     def _reduced(self, xy: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns (N,) and rows (N,) in the reduced image of pixels (N, 2) of the full one."""
+        # The centre of a pixel is half a pixel from the image's edge, about which it was reduced.
         x, y = np.floor((np.asarray(xy, np.float64) + 0.5) * self.scale).astype(np.intp).T
         return x, y
 

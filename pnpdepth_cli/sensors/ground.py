@@ -49,15 +49,16 @@ def height_above_ground(xyz: Floats) -> float | None:
         if height <= 0 or normal[1] < math.cos(math.radians(_MOST_TILT_DEG)):
             continue
         is_on = np.abs(sample @ normal - height) < _FLAT * height
-        on = int(np.count_nonzero(is_on))
-        if on > most_on:
-            most_on = on
+        count_on = int(np.count_nonzero(is_on))
+        if count_on > most_on:
+            most_on = count_on
             best = normal, height
     if best is None:
         return None
     # It is the ground if it has many of the points, and few are under it.
     normal, height = best
     depth_under = below @ normal - height
-    on = float((np.abs(depth_under) < _FLAT * height).mean())
-    under = float((depth_under > 2 * _FLAT * height).mean())
-    return height if on >= _LEAST_ON and under <= _MOST_UNDER else None
+    fraction_on = float((np.abs(depth_under) < _FLAT * height).mean())
+    fraction_under = float((depth_under > 2 * _FLAT * height).mean())
+    is_ground = fraction_on >= _LEAST_ON and fraction_under <= _MOST_UNDER
+    return height if is_ground else None

@@ -71,7 +71,9 @@ def rays_of_image(camera: Camera, size: Size) -> Floats:
 def _rays_of_image(
     intrinsics: tuple[float, ...], lens: str, distortion: Coefficients, size: Size
 ) -> Floats:
-    """`rays_of_image` of a camera given by hashable values, by which the cache finds them.
+    """The directions at all pixels of an image, (H, W, 2) x / z and y / z, read only.
+
+    The camera is given by hashable values, by which the cache finds them.
 
     Args:
         intrinsics: The nine numbers of the matrix, row after row.
@@ -186,6 +188,13 @@ def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats
     """Rising distances from the axis on the plane z = 1, and at which distance a lens shows each.
 
     The tangential parts of the lens, which are small, are left out.
+
+    Args:
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
+
+    Returns:
+        Two arrays of `_SAMPLES` distances; the second may fall where the lens turns back.
     """
     if lens == "fisheye":
         radius = np.tan(np.linspace(0, _WIDEST_ANGLE_RAD, _SAMPLES))
@@ -201,7 +210,13 @@ def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats
 
 
 def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """`distort`, but with a value also beyond the angle at which the distortion turns back."""
+    """(N, 2) where a lens model shows directions on the image plane, also where it turns back.
+
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
+    """
     if not len(plane):  # which OpenCV refuses
         return plane.copy()
     if lens == "fisheye":
@@ -210,9 +225,12 @@ def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> F
 
 
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
-    """`_distort_anywhere` by OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
+    """(N, 2) where a radial-tangential lens shows directions on the image plane.
 
-    Coefficients that are not given are 0.
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]; those that
+            are not given are 0.
     """
     padded = (*coefficients, *[0.0] * 14)[:14]
     if any(padded[12:]):  # the sensor is tilted; OpenCV takes 6 times as long
@@ -233,9 +251,12 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
 
 
 def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
-    """`_distort_anywhere` by OpenCV's k1 k2 k3 k4; those that are not given are 0.
+    """(N, 2) where a fisheye lens shows directions on the image plane.
 
-    With all 0 the distance to the centre is the angle to the axis, in radians.
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        coefficients: OpenCV's k1 k2 k3 k4; those that are not given are 0. With all 0 the distance
+            to the centre is the angle to the axis in radians.
     """
     padded = np.array((*coefficients, *[0.0] * 4)[:4])
     return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])

@@ -98,10 +98,10 @@ def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None) -> Mask:
         depth: (H, W); not finite, or <= 0, is unknown.
         keep: (H, W) true for pixels that may be kept. None: all.
     """
-    known = _known_pixels(depth)
+    is_known = _known_pixels(depth)
     if keep is not None:
-        known &= keep
-    return known & ~depth_edges(np.where(known, depth, 0))
+        is_known &= keep
+    return is_known & ~depth_edges(np.where(is_known, depth, 0))
 
 
 def _known_pixels(depth: NDArray[np.float32]) -> Mask:
@@ -119,8 +119,8 @@ def depth_edges(depth: NDArray[np.float32]) -> Mask:
     Args:
         depth: (H, W), 0 = unknown.
     """
-    known = depth > 0
-    inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
+    is_known = depth > 0
+    inverse = np.where(is_known, 1 / np.where(is_known, depth, 1), np.nan)
     is_edge = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         along_axis = np.moveaxis(inverse, axis, 0)
@@ -142,45 +142,53 @@ def points_of_depth(depth: NDArray[np.float32], camera: Camera) -> Floats:
     return _points(depth, _known_pixels(depth), rays)
 
 
-def _points(depth: NDArray[np.float32], known: Mask, rays: Floats) -> Floats:
-    """(H, W, 3) points in the camera's coordinates on rays (H, W, 2), 0 where depth is unknown."""
-    z = depth[known].astype(np.float64)
+def _points(depth: NDArray[np.float32], is_known: Mask, rays: Floats) -> Floats:
+    """(H, W, 3) points in the camera's coordinates, 0 where depth is unknown.
+
+    Args:
+        depth: (H, W).
+        is_known: (H, W) true where it is known.
+        rays: (H, W, 2) x / z and y / z of the directions of the pixels.
+    """
+    z = depth[is_known].astype(np.float64)
     points = np.zeros((*depth.shape, 3))
-    points[known] = np.column_stack([rays[known] * z[:, None], z])
+    points[is_known] = np.column_stack([rays[is_known] * z[:, None], z])
     return points
 
 
-def _normals(points: Floats, known: Mask) -> Floats:
+def _normals(points: Floats, is_known: Mask) -> Floats:
     """Unit normals (H, W, 3) towards the camera, from the differences of neighbouring pixels.
 
     0 where a pixel has no known neighbour in one of the two directions.
 
     Args:
         points: (H, W, 3) points in the camera's coordinates, 0 where unknown.
-        known: (H, W) true where a point is known.
+        is_known: (H, W) true where a point is known.
     """
-    across = _difference(points, known, 1)
-    normals = np.cross(_difference(points, known, 0), across)
+    down = _difference(points, is_known, 0)
+    across = _difference(points, is_known, 1)
+    normals = np.cross(down, across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     normals /= np.where(length > 0, length, 1)
-    away = (normals * points).sum(axis=2, keepdims=True) > 0
-    return np.where(away, -normals, normals)
+    # The camera is the origin: a normal along a point's ray points away from it, and is reversed.
+    is_away = (normals * points).sum(axis=2, keepdims=True) > 0
+    return np.where(is_away, -normals, normals)
 
 
-def _difference(points: Floats, known: Mask, axis: int) -> Floats:
+def _difference(points: Floats, is_known: Mask, axis: int) -> Floats:
     """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none.
 
     Args:
         points: (H, W, 3) points, 0 where unknown.
-        known: (H, W) true where a point is known.
+        is_known: (H, W) true where a point is known.
         axis: 0 for the neighbours above and below, 1 for those on the left and right.
     """
     points = np.moveaxis(points, axis, 0)
-    known = np.moveaxis(known, axis, 0)
+    is_known = np.moveaxis(is_known, axis, 0)
     # A point without a known neighbour on a side stands for it, so that the difference is smaller.
     before = points.copy()
     after = points.copy()
-    both = known[1:] & known[:-1]
+    both = is_known[1:] & is_known[:-1]
     before[1:][both] = points[:-1][both]
     after[:-1][both] = points[1:][both]
     return np.moveaxis(after - before, 0, axis)
@@ -245,23 +253,24 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
         min_views: How many views have to agree, this one included.
     """
     points, camera, pose = here
-    known = points[:, :, 2] > 0
-    rows, columns = np.nonzero(known)
+    is_known = points[:, :, 2] > 0
+    rows, columns = np.nonzero(is_known)
     xy = np.column_stack([columns, rows])
-    depth = points[known][:, 2].astype(float)
-    in_world = _apply(points[known], pose)
-    # Depths that agree are added up, this view's own first.
+    depth = points[is_known][:, 2].astype(float)
+    in_world = _apply(points[is_known], pose)
+    # Depths that agree are added up, this view's own first. A view agrees where what it has comes
+    # back to nearly the same pixel with nearly the same depth.
     total = depth.copy()
     count = np.ones(len(depth))
     for view in others:
         index, back = _project_back(in_world, pose, view)
         away_px = np.linalg.norm(pixels_of(camera, back) - xy[index], axis=1)
-        same_depth = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
-        agrees = (away_px <= _RETURN_PX) & same_depth
+        is_same_depth = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
+        agrees = (away_px <= _RETURN_PX) & is_same_depth
         total[index[agrees]] += back[agrees, 2]
         count[index[agrees]] += 1
-    mean_depth = np.zeros(known.shape, np.float32)
-    mean_depth[known] = np.where(count >= min_views, total / count, 0)
+    mean_depth = np.zeros(is_known.shape, np.float32)
+    mean_depth[is_known] = np.where(count >= min_views, total / count, 0)
     return mean_depth
 
 

@@ -100,7 +100,7 @@ class DropCounter:
             size: (H, W) of the image.
 
         Returns:
-            (M, 3) and (M, 2).
+            (M, 3) the points, and (M, 2) their pixel coordinates.
         """
         xy = pixels_of(camera, xyz)
         inside = self.keep(in_frame(xy, size), "outside the image")
@@ -252,13 +252,13 @@ def hidden_points(
     return is_hidden
 
 
-def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
+def _beam_at(passed_depth: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
     """(M, 2) pixels at which the camera sees a beam where it passes some depth, or its end.
 
     It is the end, the pixel of the measured point, where the beam does not pass that depth.
 
     Args:
-        near: (M,) the depth that each beam passes.
+        passed_depth: (M,) the depth that each beam passes.
         xy: (M, 2) pixel coordinates of the measured points.
         depth: (M,) their depths.
         scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
@@ -266,10 +266,10 @@ def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats
     with np.errstate(divide="ignore", invalid="ignore"):
         # The fraction of the way from scanner to point; the point in homogeneous coordinates is
         # linear in it.
-        fraction = (near - scanner[2]) / (depth - scanner[2])
+        fraction = (passed_depth - scanner[2]) / (depth - scanner[2])
         is_passed = (fraction > 0) & (fraction < 1)
         times_depth = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
-        return np.where(is_passed[:, None], times_depth / near[:, None], xy)
+        return np.where(is_passed[:, None], times_depth / passed_depth[:, None], xy)
 
 
 def hidden_among(xy: Floats, depth: Floats, size: Size) -> Mask:
@@ -334,11 +334,11 @@ def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
     """
     depth = as_depth_image(points)
     window = np.ones((window_px, window_px), np.uint8)
-    known = depth > 0
-    nearest = np.where(known, depth, np.float32(np.inf))
+    is_known = depth > 0
+    nearest = np.where(is_known, depth, np.float32(np.inf))
     for _ in range(2):  # of the window of a point, and of all windows that a point lies in
         lowest = cv2.erode(nearest, window, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
-        nearest = np.where(known, lowest, np.float32(np.inf))
+        nearest = np.where(is_known, lowest, np.float32(np.inf))
     column, row = points.xy.astype(np.intp).T
     return np.asarray(points.depth - nearest[row, column] > metres)
 
@@ -351,7 +351,7 @@ def interleaved(depth: NDArray[np.float32]) -> Mask:
     Args:
         depth: (H, W) the points' depths at their pixels, 0 = no point.
     """
-    known = np.where(depth > 0, depth, np.float32(np.inf))
+    known_depth = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
     # The nearest point in an area above each pixel, and in the same area turned to the other sides.
     reach = _INTERLEAVED_REACH_PX
@@ -359,7 +359,7 @@ def interleaved(depth: NDArray[np.float32]) -> Mask:
     above = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
     above[:reach, reach - half : reach + half + 1] = 1
     up, left, down, right = (
-        cv2.erode(known, np.rot90(above, quarter_turns)) < limit for quarter_turns in range(4)
+        cv2.erode(known_depth, np.rot90(above, quarter_turns)) < limit for quarter_turns in range(4)
     )
     opposite: Mask = (up & down) | (left & right)
     return opposite

@@ -208,9 +208,9 @@ def sample_points(
 
     Args:
         depth: (H, W) metres, 0 = unknown.
-        pattern: Pattern of the pixels that are sampled.
-        seed: Random seed of the pattern.
-        image: (H, W, 3) in 0..1 of the same view, for `features`.
+        pattern: Kind of the pattern, and how many points or lines are wanted.
+        seed: Random seed of the patterns "uniform" and "shuffle".
+        image: (H, W, 3) in 0…1 of the same view, for the pattern "features".
 
     Raises:
         NoPointsError: The depth map or the pattern leaves no point.
@@ -220,30 +220,37 @@ def sample_points(
     size = (depth.shape[0], depth.shape[1])
     if image is not None and image.shape[:2] != size:
         raise unequal_sizes("the image", image.shape, "the depth", size)
-    known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
-    if not known.size:
+    known_pixels = np.flatnonzero(np.isfinite(depth) & (depth > 0))
+    if not known_pixels.size:
         raise NoPointsError(
             "the depth map has no pixel with known depth to sample from; give one with depth above"
             " 0"
         )
-    wanted = pattern.wanted(known.size)
+    wanted = pattern.wanted(known_pixels.size)
     # The known pixels of the pattern, as row-major indices.
     match pattern.kind:
         case "uniform":
-            if wanted > known.size:
-                raise UsageError(f"{wanted:,} points of {known.size:,} known pixels; ask for fewer")
-            chosen = np.random.default_rng(seed).choice(known, wanted, replace=False)
+            if wanted > known_pixels.size:
+                raise UsageError(
+                    f"{wanted:,} points of {known_pixels.size:,} known pixels; ask for fewer"
+                )
+            chosen = np.random.default_rng(seed).choice(known_pixels, wanted, replace=False)
         case "shuffle":  # as Marigold-DC does, by numpy's legacy generator
-            rows = known[:, None].copy()  # rows of an array are shuffled unlike a flat one
+            rows = known_pixels[:, None].copy()  # rows of an array are shuffled unlike a flat one
             np.random.RandomState(seed).shuffle(rows)
             chosen = rows[:wanted, 0]
         case "grid":
-            chosen = np.intersect1d(_grid(pattern.fraction or wanted / depth.size, size), known)
+            fraction = pattern.fraction
+            if fraction is None:
+                fraction = wanted / depth.size
+            chosen = np.intersect1d(_grid(fraction, size), known_pixels)
         case "lines":
-            chosen = known[np.isin(known // size[1], _lines(pattern.wanted(size[0]), size[0]))]
-        case _:
+            height, width = size
+            lines = _lines(pattern.wanted(height), height)
+            chosen = known_pixels[np.isin(known_pixels // width, lines)]
+        case _:  # features
             corners = _corners(image, wanted)
-            chosen = corners[np.isin(corners, known)][:wanted]
+            chosen = corners[np.isin(corners, known_pixels)][:wanted]
     # Their depths.
     chosen = np.sort(chosen)
     if not chosen.size:
