@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+_OF_LEFT_AND_RIGHT = (3, 8, 9, 13)
+"""Coefficients of a radial-tangential lens that differ in sign between left and right: p2, s1, s2
+and tau_y."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
@@ -43,6 +47,23 @@ class Camera:
         intrinsics[:2] *= np.array([[width / self.size[1]], [height / self.size[0]]])
         intrinsics[:2, 2] -= 0.5
         return replace(self, intrinsics=intrinsics, size=(height, width))
+
+    def mirrored(self, width: int) -> Camera:
+        """Returns the camera of the same images, `width` pixels wide, left and right exchanged.
+
+        It sees the mirrored scene, in which x of every point is −x.
+        """
+        # x' = width − 1 − x for (−X, Y, Z): the focal length stays, skew and centre change.
+        intrinsics = self.intrinsics.copy()
+        intrinsics[0, 1] = -intrinsics[0, 1]
+        intrinsics[0, 2] = width - 1 - intrinsics[0, 2]
+        distortion = self.distortion
+        if self.lens == "radial-tangential":
+            distortion = tuple(
+                -coefficient if number in _OF_LEFT_AND_RIGHT else coefficient
+                for number, coefficient in enumerate(self.distortion)
+            )
+        return replace(self, intrinsics=intrinsics, distortion=distortion)
 
 
 class Extrinsics(NamedTuple):

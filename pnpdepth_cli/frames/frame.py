@@ -110,13 +110,19 @@ class Frame:
         )
 
     def mirrored(self) -> Frame:
-        """Returns the frame with left and right of image, points, outliers and prior exchanged."""
+        """Returns the frame with left and right of image, points and prior exchanged.
+
+        The outliers and the camera are mirrored with them. Depth maps in `predicted` are not: a
+        network that takes a prior, which alone sees mirrored frames, does not take them.
+        """
+        _, width = self.size
         return replace(
             self,
             rgb=None if self.rgb is None else self.rgb.flip(-1),
             points=self.points.mirrored(),
             outliers=None if self.outliers is None else self.outliers.mirrored(),
             prior=None if self.prior is None else self.prior.flip(-1),
+            camera=None if self.camera is None else self.camera.mirrored(width),
         )
 
     def without(self, outliers: Tensor) -> Frame:
