@@ -65,14 +65,17 @@ def load_network(
         device: torch device, such as "cpu" or "cuda:1".
 
     Raises:
+        UsageError: `spec` is of another type, or a definition is given for a name or a file.
         ModelError: There is no such network, it cannot be built, or its weights do not fit.
         DeviceError: The device cannot be used.
     """
     path = None if checkpoint is None else Path(checkpoint)
     if isinstance(spec, nn.Module):
-        known = definition or assume_definition(name=type(spec).__name__, build=lambda: spec)
-        known = replace(known, build=lambda: spec, complete=path is None)
-        return networks.load_network(known, path, device)
+        if definition is None:
+            definition = assume_definition(name=type(spec).__name__, build=lambda: spec)
+        # The module is there already; without a checkpoint it has its weights, too.
+        definition = replace(definition, build=lambda: spec, complete=path is None)
+        return networks.load_network(definition, path, device)
     if not isinstance(spec, str | Path):
         raise UsageError(f"spec must be a name, a path or a module, not {type(spec).__name__}")
     if definition is not None:
@@ -144,11 +147,10 @@ def score(
     Raises:
         InputError: The shapes differ, or the unit is not given and may be another than metres.
     """
-    arrays = [
-        in_metres(depth, "the predicted depth"),
-        in_metres(ground_truth, "the ground truth", unit),
-    ]
-    if arrays[0].shape != arrays[1].shape:
-        raise InputError(f"depth is {arrays[0].shape} but ground truth is {arrays[1].shape}")
-    predicted, known = (torch.from_numpy(values) for values in arrays)
-    return score_tensors(predicted, known, with_thresholds(thresholds))
+    predicted = in_metres(depth, "the predicted depth")
+    truth = in_metres(ground_truth, "the ground truth", unit)
+    if predicted.shape != truth.shape:
+        raise InputError(f"depth is {predicted.shape} but ground truth is {truth.shape}")
+    return score_tensors(
+        torch.from_numpy(predicted), torch.from_numpy(truth), with_thresholds(thresholds)
+    )

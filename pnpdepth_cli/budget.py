@@ -12,11 +12,14 @@ from pathlib import Path
 from pnpdepth_cli.errors import InputError, ModelError
 
 _MOST_PIXELS = 64_000_000
-"""Of the largest common cameras."""
+"""Pixels of the largest common cameras."""
 _MOST_FILE_BYTES = 1 << 30
+"""Bytes of a stored file, unless another number of pixels is set."""
+_LEAST_FILE_BYTES = 1 << 20
+"""Bytes that a file may have however few pixels are set."""
 _FILE_BYTES_PER_PIXEL = 4
 _DECODED_BYTES_PER_PIXEL = 8
-"""Of four channels of 16 bits."""
+"""Bytes of four channels of 16 bits."""
 _BYTES_PER_PIXEL = 64
 """Memory that reading and drawing takes at most."""
 _MOST_NETWORK_PIXELS = 4096 * 4096
@@ -30,35 +33,40 @@ _VALUES_PER_BYTE = 1032
 
 
 def max_pixels() -> int:
-    """Most pixels of an image, and rows or elements of any other array of numbers."""
-    return _chosen or min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
+    """Returns the most pixels of an image, and rows or elements of any other array of numbers."""
+    if _chosen:
+        return _chosen
+    return min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
 
 
 def max_network_pixels() -> int:
-    """Most pixels of the one image size that a network takes, by its file."""
-    return _chosen or min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
+    """Returns the most pixels of the one image size that a network takes, by its file."""
+    if _chosen:
+        return _chosen
+    return min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
 
 
 def max_file_bytes() -> int:
-    """Most bytes of a file with an image, depth, points or text, as stored."""
-    least = 1 << 20 if _chosen else _MOST_FILE_BYTES
+    """Returns the most bytes of a file with an image, depth, points or text, as stored."""
+    least = _LEAST_FILE_BYTES if _chosen else _MOST_FILE_BYTES
     return max(least, _FILE_BYTES_PER_PIXEL * max_pixels())
 
 
 def max_image_bytes() -> int:
-    """Most bytes that an image or array takes as its file stores it, decoded."""
-    return max(1 << 20, _DECODED_BYTES_PER_PIXEL * max_pixels())
+    """Returns the most bytes that an image or array takes as its file stores it, decoded."""
+    return max(_LEAST_FILE_BYTES, _DECODED_BYTES_PER_PIXEL * max_pixels())
 
 
 def max_decoded_bytes() -> int:
-    """Most bytes that one file's decoded content may take, such as the tensors of a checkpoint."""
+    """Returns the most bytes of one file's decoded content, such as the tensors of a checkpoint."""
     return _memory_bytes() // 2
 
 
 def max_values_from(file_bytes: int) -> int:
-    """Returns the most values that a file of this size may claim.
+    """Returns the most values that a file of so many bytes may claim to hold.
 
-    Any file may claim 2²⁵ values: an image of one colour takes almost no bytes.
+    Any file may claim 2²⁵ values: an image of one colour takes almost no bytes. More values need
+    the bytes that they cannot be compressed below.
     """
     return min(max_pixels(), max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
 
@@ -69,18 +77,30 @@ def check_claim(
     """Raises the error if a file claims more than may be taken, or less than nothing.
 
     Every reader calls this with what a file claims, before memory is taken for it.
-    The claim begins the message, as in "a.png has 9 pixels"; the way out ends it.
+
+    Args:
+        claim: What the file claims, as in "a.png has 9 pixels"; the message begins with it.
+        size: The number that it claims, such as 9.
+        most: The largest number that may be taken.
+        error: Class of the error.
+        way_out: What the user can do, which ends the message; empty for nothing.
     """
-    if not 0 <= size <= most:
-        text = f"{claim}, more than {most:,}"
-        raise error(f"{text}; {way_out}" if way_out else text)
+    if 0 <= size <= most:
+        return
+    if way_out:
+        raise error(f"{claim}, more than {most:,}; {way_out}")
+    raise error(f"{claim}, more than {most:,}")
 
 
 def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
     """Raises ModelError unless a file of a network, or of its weights, is there and may be read.
 
-    A device, a pipe and an empty file may not, nor may a file that is too large. The kind names the
-    file in the message, as in "checkpoint".
+    A device, a pipe and an empty file may not, nor may a file that is too large.
+
+    Args:
+        path: The file.
+        kind: What the message calls the file, as in "checkpoint".
+        most: Most bytes that it may have. None: `max_decoded_bytes`.
     """
     if not path.exists():
         raise ModelError(f"{kind} {path} does not exist; check the path")
@@ -90,25 +110,28 @@ def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
     if not size:  # also of what /proc shows as files, some of which never end
         raise ModelError(f"{kind} {path} is empty (0 bytes); copy or create it again")
     claim = f"{kind} {path} has {size:,} bytes"
-    check_claim(claim, size, most or max_decoded_bytes(), error=ModelError)
+    if most is None:
+        most = max_decoded_bytes()
+    check_claim(claim, size, most, error=ModelError)
 
 
 def set_max_pixels(max_pixels: int | None) -> None:
-    """Allow images of this many pixels, and files in proportion; None restores the default."""
+    """Sets the most pixels of an image, and of files in proportion; None restores the default."""
     global _chosen
     _chosen = max_pixels
 
 
 def max_pixels_given() -> int | None:
-    """What `set_max_pixels` was given; None for the default."""
+    """Returns what `set_max_pixels` was given; None for the default."""
     return _chosen
 
 
-_chosen: int | None = None
+_chosen: int | None = None  # pixels that `set_max_pixels` was given
 
 
 @functools.cache
 def _memory_bytes() -> int:
+    """The machine's memory."""
     import psutil  # 20 ms that `--help` does not pay
 
     return int(psutil.virtual_memory().total)

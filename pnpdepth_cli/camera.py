@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+_OF_LEFT_AND_RIGHT = (3, 8, 9, 13)
+"""Coefficients of a radial-tangential lens that differ in sign between left and right: p2, s1, s2
+and tau_y."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
@@ -26,18 +30,40 @@ class Camera:
 
     @property
     def has_lens(self) -> bool:
-        """Whether the image differs from a pinhole camera's."""
+        """Whether the lens distorts, so that the image differs from a pinhole camera's."""
         return self.lens != "radial-tangential" or any(self.distortion)
 
     def resized(self, height: int, width: int) -> Camera:
-        """Returns the camera of its images, whose size is known, in height × width pixels."""
+        """Returns the camera of the same images resized to height × width pixels.
+
+        Raises:
+            ValueError: The size of its images is unknown.
+        """
         if self.size is None:
             raise ValueError("a camera whose image size is unknown cannot be resized")
+        # Half a pixel leads from pixel centres to the image's corner, about which pixels scale.
         intrinsics = self.intrinsics.copy()
         intrinsics[:2, 2] += 0.5
         intrinsics[:2] *= np.array([[width / self.size[1]], [height / self.size[0]]])
         intrinsics[:2, 2] -= 0.5
         return replace(self, intrinsics=intrinsics, size=(height, width))
+
+    def mirrored(self, width: int) -> Camera:
+        """Returns the camera of the same images, `width` pixels wide, left and right exchanged.
+
+        It sees the mirrored scene, in which x of every point is −x.
+        """
+        # x' = width − 1 − x for (−X, Y, Z): the focal length stays, skew and centre change.
+        intrinsics = self.intrinsics.copy()
+        intrinsics[0, 1] = -intrinsics[0, 1]
+        intrinsics[0, 2] = width - 1 - intrinsics[0, 2]
+        distortion = self.distortion
+        if self.lens == "radial-tangential":
+            distortion = tuple(
+                -coefficient if number in _OF_LEFT_AND_RIGHT else coefficient
+                for number, coefficient in enumerate(self.distortion)
+            )
+        return replace(self, intrinsics=intrinsics, distortion=distortion)
 
 
 class Extrinsics(NamedTuple):
@@ -47,22 +73,28 @@ class Extrinsics(NamedTuple):
     translation: Floats  # (3,) metres, the scanner's origin in the camera's coordinates
 
     def apply(self, points: NDArray[np.floating]) -> Floats:
-        """Returns (N, 3) points of the scanner in the camera's coordinates, metres."""
+        """Returns points (N, 3) of the scanner's coordinates in the camera's, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def __matmul__(self, other: Extrinsics) -> Extrinsics:
-        """Returns the pose beside this camera of what has the other pose beside the scanner."""
-        turn, shift = self
-        return Extrinsics(turn @ other.rotation, turn @ other.translation + shift)
+        """Returns the pose beside the camera of a third sensor.
+
+        Args:
+            other: Pose of that sensor beside the scanner.
+        """
+        rotation = self.rotation @ other.rotation
+        translation = self.rotation @ other.translation + self.translation
+        return Extrinsics(rotation, translation)
 
     def inverse(self) -> Extrinsics:
         """Returns the pose of the camera in the scanner's coordinates."""
         return Extrinsics(self.rotation.T, -self.rotation.T @ self.translation)
 
     def square(self) -> Floats:
-        """Returns the pose as a (4, 4) matrix."""
+        """Returns the pose as a matrix (4, 4) of homogeneous coordinates."""
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.translation
         return matrix
 
 

@@ -58,7 +58,7 @@ class SparsePoints(Generic[A]):
 
     @functools.cached_property
     def tree(self: SparsePoints[Tensor]) -> cKDTree:
-        """The tree of the coordinates, by which the nearest points are found."""
+        """The k-d tree of the pixel coordinates, which finds nearest points; kept once made."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.xy.cpu().double().numpy())
@@ -76,7 +76,10 @@ class SparsePoints(Generic[A]):
         return replace(self, xy=xy - 0.5, size=(height, width))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
-        """Returns the points inside these rows and columns, in coordinates of that crop."""
+        """Returns the points inside a crop of the frame, in its coordinates, with its size.
+
+        The crop is `height` rows from row `top`, and `width` columns from column `left`.
+        """
         xy = self.xy + 0.0  # a copy, in either library
         xy[:, 0] -= left
         xy[:, 1] -= top
@@ -91,9 +94,9 @@ class SparsePoints(Generic[A]):
         return replace(self, xy=torch.stack([self.size[1] - 1 - x, y], dim=1))
 
     def where(self, mask: Tensor | NDArray[np.bool_]) -> SparsePoints[A]:
-        """Returns the points where mask, (N,) bool, is true; this very object if it is everywhere.
+        """Returns the points where mask, (N,) bool, is true; this very object if all of it is true.
 
-        What is remembered of the object, such as its tree, stays known.
+        So what is kept of the object, such as its tree, is not computed again.
         """
         return self if bool(mask.all()) else self.select(mask)
 
@@ -121,12 +124,13 @@ class SparsePoints(Generic[A]):
         return SparsePoints(xy=xy, depth=depth, size=self.size, dropped=self.dropped)
 
     def known_in(self: SparsePoints[Tensor], depth: Tensor) -> Tensor:
-        """Returns (N,) bool, whether all pixels that a point is sampled from are known.
+        """Returns (N,) bool, whether all pixels that `sample` reads a point from are known.
 
         Args:
-            depth: (h, w), 0 = unknown.
+            depth: (h, w), 0 = unknown, of the same field of view.
         """
-        return self.sample((depth > 0).float()) > 0.999  # of products of weights
+        known_weight = self.sample((depth > 0).float())  # 1 but for rounding where all are known
+        return known_weight > 0.999
 
     def sample(self: SparsePoints[Tensor], dense: Tensor) -> Tensor:
         """Returns the values (N,) of a dense map at the points, differentiable in `dense`.
@@ -135,7 +139,10 @@ class SparsePoints(Generic[A]):
         Beyond the outermost pixel centres the border value holds.
 
         Args:
-            dense: (…, h, w), one map of the same field of view.
+            dense: (…, h, w), one map of the same field of view, on the device of the points.
+
+        Raises:
+            ValueError: There are several maps.
         """
         height, width = dense.shape[-2:]
         xy = self.resized(height, width).xy
@@ -144,15 +151,24 @@ class SparsePoints(Generic[A]):
             raise ValueError(f"one map is expected, not shape {tuple(dense.shape)}")
         x = xy[:, 0].clamp(0, width - 1)
         y = xy[:, 1].clamp(0, height - 1)
-        left, top = x.floor().long(), y.floor().long()
-        fx, fy = x - left, y - top
-        if not bool((fx != 0).any()) and not bool((fy != 0).any()):
+        left = x.floor().long()
+        top = y.floor().long()
+        from_left = x - left
+        from_top = y - top
+        # Whole coordinates need no interpolation.
+        if not bool((from_left != 0).any()) and not bool((from_top != 0).any()):
             return flat[top * width + left]
-        # On the grid both neighbours are the same pixel: one of weight 0 may be infinite.
-        right, bottom = x.ceil().long(), y.ceil().long()
-        upper = flat[top * width + left] * (1 - fx) + flat[top * width + right] * fx
-        lower = flat[bottom * width + left] * (1 - fx) + flat[bottom * width + right] * fx
-        return upper * (1 - fy) + lower * fy
+        # `ceil` instead of + 1: on the grid both neighbours are the same pixel. The next one would
+        # have weight 0, but may be infinite, and 0 · inf is NaN.
+        right = x.ceil().long()
+        bottom = y.ceil().long()
+        top_left = flat[top * width + left]
+        top_right = flat[top * width + right]
+        bottom_left = flat[bottom * width + left]
+        bottom_right = flat[bottom * width + right]
+        upper = top_left * (1 - from_left) + top_right * from_left
+        lower = bottom_left * (1 - from_left) + bottom_right * from_left
+        return upper * (1 - from_top) + lower * from_top
 
     def scatter(self: SparsePoints[Tensor]) -> Tensor:
         """Returns (1, 1, H, W) metres, 0 = unknown: each point on its pixel, the nearest wins."""
@@ -171,15 +187,16 @@ def in_frame(xy: Tensor, size: Size, *, closed: bool = ...) -> Tensor: ...
 @overload
 def in_frame(xy: NDArray[np.floating], size: Size, *, closed: bool = ...) -> NDArray[np.bool_]: ...
 def in_frame(xy: Any, size: Size, *, closed: bool = False) -> Any:
-    """Returns (N,) true where the nearest pixel lies in the frame; false for NaN.
+    """Returns (N,) true where a coordinate lies in a pixel of the frame; false for NaN.
 
     Args:
         xy: (N, 2) pixel coordinates.
         size: (height, width) of the frame.
-        closed: Whether the right and bottom edges of the frame belong to it.
+        closed: Whether the right and bottom edges of the frame belong to it, as the others do.
     """
+    # Pixels reach half a pixel to each side of their centres.
     x, y = xy[:, 0], xy[:, 1]
     right = size[1] - 0.5
     bottom = size[0] - 0.5
-    inside = (x <= right) & (y <= bottom) if closed else (x < right) & (y < bottom)
-    return (x >= -0.5) & (y >= -0.5) & inside
+    before_ends = (x <= right) & (y <= bottom) if closed else (x < right) & (y < bottom)
+    return (x >= -0.5) & (y >= -0.5) & before_ends

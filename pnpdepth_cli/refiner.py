@@ -17,7 +17,7 @@ from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
 from pnpdepth_cli.dataset.saved_result import save
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
-from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
+from pnpdepth_cli.frames.adapt import learn, reason_not_to_learn, weights_in_place
 from pnpdepth_cli.frames.frame import (
     Frame,
     Refined,
@@ -45,8 +45,10 @@ FARTHEST_MEDIAN_M = 200.0
 DECIDED_BY = 5
 """So many frames of one size decide together how later ones are moved to their points."""
 
-_OPEN: set[nn.Module] = set()  # modules that refiners have cut open
+_OPEN: set[nn.Module] = set()
+"""Modules that refiners have cut open."""
 _OPENING = threading.Lock()
+"""Lock of `_OPEN`."""
 
 Pair = tuple[ArrayLike | None, ArrayLike | SparsePoints]
 """An image and its sparse depth; see `Refiner.refine`."""
@@ -90,7 +92,7 @@ class Refiner:
         registration: Registration = "auto",
         adapt: Sequence[Pair] = (),
     ) -> None:
-        # What is asked for, checked.
+        # What the user asks for, checked.
         self._networks = list(network) if isinstance(network, Sequence) else [network]
         if not self._networks or not all(
             isinstance(network, Network) for network in self._networks
@@ -98,7 +100,7 @@ class Refiner:
             raise UsageError("network must be from load_network, or several in a list")
         if not isinstance(settings, Settings | None):
             raise UsageError(f"settings must be Settings, not {type(settings).__name__}")
-        self._asked = settings or Settings()
+        self._asked = Settings() if settings is None else settings
         self._uncertainty = uncertainty
         self._keep_measured = keep_measured
         self._register = registration_to_make(registration, self._asked)
@@ -106,8 +108,10 @@ class Refiner:
         # What follows from the first frame, and lasts until the refiner is closed.
         self._method: Method | None = None
         self._is_closed = False
-        self._moved: dict[tuple[int, int], set[str]] = {}  # how images were moved, by their size
-        self._telling: dict[tuple[int, int], list[Evidence]] = {}  # of the first frames, likewise
+        self._moved: dict[tuple[int, int], set[str]] = {}
+        """How images were moved to their points, as texts, by the image's (H, W)."""
+        self._evidences: dict[tuple[int, int], list[Evidence]] = {}
+        """What the first frames tell of the registration, by the image's (H, W)."""
         self._stack = ExitStack()
         self._lock = threading.Lock()
         check_combination(self._asked, len(self._networks))
@@ -159,20 +163,23 @@ class Refiner:
                 before that, whose `diverged` is this error's message.
             UsageError: The refiner is closed.
         """
+        # The arrays are checked and refined, by one thread at a time.
         frame = frame_of_arrays(image, sparse, self._register, unit, camera, depth)
         with self._lock:
             method = self._method_for(frame)
-            decision = self._keep_registration(method, frame)
+            notes_on_registration = self._keep_registration(method, frame)
             refined = method.refine(frame, with_stages=stages)
             decides_alone = self._register == "auto" and frame.size not in method.registrations
-            differs = decides_alone and self._differs(frame, refined)
-        notes = [*method.own.network.notes, *frame.notes, *decision, *refined.notes]
-        if differs:
+            is_moved_otherwise = decides_alone and self._is_moved_otherwise(frame, refined)
+        # What a person should know, and how the frame is saved.
+        notes = [*method.own.network.notes, *frame.notes, *notes_on_registration, *refined.notes]
+        if is_moved_otherwise:
             notes.append(
                 "note: images of this size were moved to their points in different ways;"
                 " `share_registration` decides once for a sequence"
             )
         refined = replace(refined, notes=tuple(notes), saver=save)
+        # A refinement that diverged is an error that has the frame before that.
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
@@ -180,7 +187,8 @@ class Refiner:
     def share_registration(self, frames: Iterable[Pair]) -> None:
         """Decides by some frames together how the images of a sequence are moved to the points.
 
-        Images of the size of the first one are then all moved alike; else each decides alone.
+        Not all frames tell how. All images of the size of the first that does are moved alike from
+        then on. An image of another size is moved as its own points say.
 
         Args:
             frames: Frames (image, sparse) of the sequence, such as 16 spread over it.
@@ -188,22 +196,29 @@ class Refiner:
         Raises:
             InputError: A frame is no such pair, or cannot be used.
         """
-        read = [_frame_of_pair(pair, self._register) for pair in frames]
-        if read:
+        checked = [_frame_of_pair(pair, self._register) for pair in frames]
+        if checked:
             with self._lock:
-                self._method_for(read[0]).share_registration(read)
+                self._method_for(checked[0]).share_registration(checked)
 
     def _keep_registration(self, method: Method, frame: Frame) -> list[str]:
-        """Lets the first frames of a size decide how it and later ones are moved, and says so."""
+        """Returns a note if this frame completes the `DECIDED_BY` of its size that decide together.
+
+        From then on, images of that size are all moved to their points alike.
+
+        Args:
+            method: The method, which gets the registration.
+            frame: The frame that is refined next.
+        """
         if self._register != "auto" or frame.size in method.registrations:
             return []
-        telling = self._telling.setdefault(frame.size, [])
-        of_frame = frame.evidence_of_registration
-        if of_frame is not None:
-            telling.append(of_frame)
-        if len(telling) < DECIDED_BY:
+        evidences = self._evidences.setdefault(frame.size, [])
+        evidence = frame.evidence_of_registration
+        if evidence is not None:
+            evidences.append(evidence)
+        if len(evidences) < DECIDED_BY:
             return []
-        shared = estimate_registration(self._telling.pop(frame.size))
+        shared = estimate_registration(self._evidences.pop(frame.size))
         method.registrations[frame.size] = shared
         # Nothing is said of images that were never moved, and stay.
         if shared is None and self._moved.get(frame.size, set()) <= {str(None)}:
@@ -214,8 +229,13 @@ class Refiner:
             " together; `share_registration` decides it by other frames"
         ]
 
-    def _differs(self, frame: Frame, refined: Refined) -> bool:
-        """Whether this image was moved otherwise than the earlier ones of its size."""
+    def _is_moved_otherwise(self, frame: Frame, refined: Refined) -> bool:
+        """Whether images of this size, with this one, were moved to their points in two ways.
+
+        Args:
+            frame: The frame, before it was refined.
+            refined: The same frame refined, which says how its image was moved.
+        """
         if frame.image is None:
             return False
         moved = self._moved.setdefault(frame.size, set())
@@ -223,10 +243,18 @@ class Refiner:
         return len(moved) > 1
 
     def _method_for(self, first: Frame) -> Method:
-        """The method, which this frame decides if it is the first."""
+        """The method with its networks open; what is left open is decided by the first frame.
+
+        Args:
+            first: The frame that is refined, which is the first if there is no method yet.
+
+        Raises:
+            UsageError: The refiner is closed, or another one uses a network.
+        """
         if self._is_closed:
             raise UsageError("this Refiner is closed; make another one, or stay inside its `with`")
         if self._method is None:
+            # Where any step fails, the stack undoes those before it.
             with ExitStack() as opening:
                 opening.enter_context(_opened([network.module for network in self._networks]))
                 networks = list(self._networks)
@@ -245,12 +273,19 @@ class Refiner:
         return self._method
 
     def _adapt_network(self, network: Network, opening: ExitStack) -> Network:
-        """The network with the weights that it learnt, if they are better, and a note on them."""
-        why = too_little(len(self._adapt), self._adapt[0])
+        """The network with a note on what it learnt from the frames of `adapt`.
+
+        Its module has the learnt weights until the stack closes, if they are better.
+
+        Args:
+            network: The network, its definition with nothing left open.
+            opening: Stack of what is undone when the refiner closes.
+        """
+        why = reason_not_to_learn(len(self._adapt), self._adapt[0])
         weights = "the network's own weights: "
         if why is None:
-            named = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
-            learnt = learn(network, named, seed=self._asked.seed)
+            named_frames = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
+            learnt = learn(network, named_frames, seed=self._asked.seed)
             why = str(learnt)
             if learnt.is_better:
                 weights = ""
@@ -260,7 +295,11 @@ class Refiner:
 
 @contextmanager
 def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
-    """Inside, no other refiner opens these modules: two cuts of one would disturb each other."""
+    """Inside, no other refiner opens these modules: two cuts of one would disturb each other.
+
+    Raises:
+        UsageError: A module is open already, or is among these twice.
+    """
     with _OPENING:
         if len(set(modules)) < len(modules) or not _OPEN.isdisjoint(modules):
             raise UsageError(
@@ -275,40 +314,47 @@ def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
 
 
 def in_metres(depth: ArrayLike, what: str, unit: Unit | None = None) -> NDArray[np.float32]:
-    """Returns depth as float32 metres; not finite or <= 0 is unknown.
+    """Returns depth as float32 metres, of the same shape; unknown depth stays as it is.
 
     Args:
-        depth: Depth in an array of any shape.
+        depth: Depth in an array of any shape; not finite or <= 0 is unknown.
         what: Name of the depth in messages.
         unit: Unit of the depth; needed for integers, and for depth that is too large for metres.
 
     Raises:
-        InputError: The unit is needed.
+        InputError: The unit is needed, or the depth is no array of numbers.
         UsageError: There is no such unit.
     """
-    values = _numbers(depth, what)
+    numbers = _numbers(depth, what)
     if unit is not None:
         if unit not in UNITS:
             raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
-        return (values / UNITS[unit]).astype(np.float32)
-    known = values[np.isfinite(values) & (values > 0)]
-    if values.dtype.kind in "iu":
+        return (numbers / UNITS[unit]).astype(np.float32)
+    known = numbers[np.isfinite(numbers) & (numbers > 0)]
+    if numbers.dtype.kind in "iu":
         raise InputError(
-            f'{what} is of {values.dtype}; give its unit, such as unit="mm" or unit="m"'
+            f'{what} is of {numbers.dtype}; give its unit, such as unit="mm" or unit="m"'
         )
     if known.size and np.median(known) > FARTHEST_MEDIAN_M:
         raise InputError(
             f"{what} is {np.median(known):,.0f} in the median, which is too far for metres; give"
             ' its unit, such as unit="mm" or unit="m"'
         )
-    return values.astype(np.float32)
+    return numbers.astype(np.float32)
 
 
 def _numbers(values: ArrayLike, what: str) -> NDArray[Any]:
-    """An array of real numbers. Raises InputError if the values are none."""
+    """An array of real numbers or bools. Raises InputError if the values are none.
+
+    Args:
+        values: What the user gives.
+        what: Name of the values in messages.
+    """
     try:
         array = np.asarray(values)
-    except (ValueError, TypeError, RuntimeError) as error:  # ragged rows, a tensor on a GPU
+    # numpy raises ValueError for ragged rows; torch TypeError for a tensor on a GPU, and
+    # RuntimeError for one with a gradient.
+    except (ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{what} cannot be made an array: {error}") from None
     if array.dtype.kind not in "buif":
         raise InputError(f"{what} must be an array of numbers, not {type(values).__name__}")
@@ -323,11 +369,23 @@ def frame_of_arrays(
     camera: ArrayLike | Camera | None = None,
     depth: ArrayLike | Sequence[ArrayLike] = (),
 ) -> Frame:
-    """Returns the frame of an image and its sparse depth; see `Refiner.refine`.
+    """Returns the frame of an image and its sparse depth, checked.
+
+    Points outside the image are left out; a note counts them.
+
+    Args:
+        image: Image as `Refiner.refine` takes it, or None.
+        sparse: Sparse depth as `Refiner.refine` takes it.
+        register: How the image is to be moved to the points. None: it is not, and both are taken as
+            of one view.
+        unit: Unit of the depth of an array.
+        camera: Intrinsics (3, 3) in pixels of the image, or a Camera.
+        depth: Depth map (H, W) of another network, or several in a list.
 
     Raises:
-        InputError: Image or points cannot be used.
+        InputError: Image, points, camera or depth maps cannot be used.
     """
+    # Image and points, these in pixels of the image.
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
     points, unknown = _points(sparse, size, unit)
@@ -335,7 +393,13 @@ def frame_of_arrays(
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
-    lost = {"outside the image": len(points) - len(inside), "without a depth above 0": unknown}
+    # What is not used, by reason.
+    unused = {"outside the image": len(points) - len(inside), "without a depth above 0": unknown}
+    notes = [
+        f"sparse: {count:,} points {reason} are not used"
+        for reason, count in unused.items()
+        if count
+    ]
     return Frame(
         rgb=None if rgb is None else tensor_of(rgb),
         points=inside,
@@ -343,27 +407,43 @@ def frame_of_arrays(
         predicted=tuple(_maps(depth, inside.size)),
         register=register,
         one_view=register is None,
-        notes=tuple(f"sparse: {n:,} points {why} are not used" for why, n in lost.items() if n),
+        notes=tuple(notes),
     )
 
 
 def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iterator[Tensor]:
-    """The depth maps (H, W), NaN = unknown. Raises InputError if one has another size."""
+    """Yields depth maps of networks (H, W) float32 in their own numbers, NaN = unknown.
+
+    Args:
+        depth: One map, also as a list of rows; or a list of maps, which may be empty.
+        size: (H, W) of the image.
+
+    Raises:
+        InputError: A map has another size, or no finite value.
+    """
     maps: list[Any] = [depth]
     if isinstance(depth, list | tuple) and (not depth or np.ndim(depth[0]) > 1):
         maps = [*depth]
-    for numbers in maps:
-        values = _numbers(numbers, "the depth map").astype(np.float32)
-        if values.shape != size:
-            raise InputError(f"the depth map is {values.shape}, but the image is {size}")
-        known = np.isfinite(values)
-        if not known.any():
+    for depth_map in maps:
+        numbers = _numbers(depth_map, "the depth map").astype(np.float32)
+        if numbers.shape != size:
+            raise InputError(f"the depth map is {numbers.shape}, but the image is {size}")
+        is_known = np.isfinite(numbers)
+        if not is_known.any():
             raise InputError("the depth map has no finite value")
-        yield torch.from_numpy(np.where(known, values, np.float32(np.nan)))
+        yield torch.from_numpy(np.where(is_known, numbers, np.float32(np.nan)))
 
 
 def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:
-    """The camera of an image (H, W). Raises InputError if no camera has these intrinsics."""
+    """The camera of an image, which a user gives as intrinsics or as a Camera.
+
+    Args:
+        camera: Intrinsics (3, 3) in pixels of the image, or a Camera of images of this size.
+        size: (H, W) of the image.
+
+    Raises:
+        InputError: The camera is of another size, or no camera has these intrinsics.
+    """
     if isinstance(camera, Camera):
         if camera.size is not None and camera.size != size:
             raise InputError(f"the camera's images are {camera.size}, but the image is {size}")
@@ -379,60 +459,78 @@ def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:
 
 
 def _frame_of_pair(pair: Pair, register: Register) -> Frame:
+    """The frame of a pair (image, sparse); `register` says how the image is to be moved.
+
+    Raises:
+        InputError: It is no pair, or cannot be used.
+    """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"frames are pairs (image, sparse), not {type(pair).__name__}")
     return frame_of_arrays(*pair, register)
 
 
 def _rgb(image: ArrayLike) -> NDArray[np.float32]:
-    """The image as (H, W, 3) in 0…1."""
-    values = _numbers(image, "an image")
-    if values.ndim == 2:
-        values = values[:, :, None].repeat(3, axis=2)
-    if values.ndim != 3 or values.shape[2] != 3 or not values.size:
+    """The image as (H, W, 3) float32 in 0…1. Raises InputError if it is none.
+
+    Integers are divided by their white: 255, or 65535 for uint16 with any value above 255, as
+    files are read.
+    """
+    pixels = _numbers(image, "an image")
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None].repeat(3, axis=2)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise InputError(f"an image has shape (H, W, 3) or (H, W), not {np.shape(image)}")
-    if values.dtype in FULL_SCALE:
-        white = 255.0 if values.max() <= 255 else FULL_SCALE[values.dtype]  # as files are read
-        return (values / white).astype(np.float32)
-    if values.dtype.kind != "f" or not (values >= 0).all() or not (values <= 1).all():
+    if pixels.dtype in FULL_SCALE:
+        white = 255.0 if pixels.max() <= 255 else FULL_SCALE[pixels.dtype]
+        return (pixels / white).astype(np.float32)
+    if pixels.dtype.kind != "f" or not (pixels >= 0).all() or not (pixels <= 1).all():
         raise InputError(
             "an image is uint8, uint16, or float in 0..1; this one is"
-            f" {values.dtype} in {values.min()}..{values.max()}; divide it by its white"
+            f" {pixels.dtype} in {pixels.min()}..{pixels.max()}; divide it by its white"
         )
-    return values.astype(np.float32)
+    return pixels.astype(np.float32)
 
 
 def _points(
     sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
 ) -> tuple[SparsePoints, int]:
-    """The points, and how many rows have no depth.
+    """The points, and how many rows of x, y and depth have no finite depth above 0.
 
-    Points of a map have the map's size, rows of x, y and depth the image's.
+    Points of a map have the map's size, rows the image's.
+
+    Args:
+        sparse: Depth map, rows or points, as `Refiner.refine` takes them.
+        size: (H, W) of the image. None: there is no image.
+        unit: Unit of the depth of an array.
+
+    Raises:
+        InputError: The array is neither, its size is not the image's, or its unit is not known.
+        NoPointsError: No depth is known.
     """
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), 0
-    values = _numbers(sparse, "sparse depth")
+    numbers = _numbers(sparse, "sparse depth")
     unknown = 0
-    if values.ndim != 2:
-        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {values.shape}")
+    if numbers.ndim != 2:
+        raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {numbers.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
-    if values.shape[1] == 3 and values.shape != size:
+    if numbers.shape[1] == 3 and numbers.shape != size:
         if size is None:
             raise InputError("rows of x, y and depth need an image for the size of the frame")
-        column = in_metres(values[:, 2], "the sparse depth", unit)
-        known = np.isfinite(values).all(axis=1) & (column > 0)
-        xy = values[known, :2].astype(np.float32)
-        depth = column[known]
-        unknown = int(np.count_nonzero(~known))
+        depth_of_rows = in_metres(numbers[:, 2], "the sparse depth", unit)
+        is_known = np.isfinite(numbers).all(axis=1) & (depth_of_rows > 0)
+        xy = numbers[is_known, :2].astype(np.float32)
+        depth = depth_of_rows[is_known]
+        unknown = int(np.count_nonzero(~is_known))
     else:
         # Anything else is a depth map, of which the known pixels are points.
-        if size is not None and values.shape != size:
-            raise InputError(f"the sparse depth map is {values.shape} but the image is {size}")
-        size = values.shape[0], values.shape[1]
-        values = in_metres(values, "the sparse depth", unit)
-        rows, columns = np.nonzero(np.isfinite(values) & (values > 0))
+        if size is not None and numbers.shape != size:
+            raise InputError(f"the sparse depth map is {numbers.shape} but the image is {size}")
+        size = numbers.shape[0], numbers.shape[1]
+        numbers = in_metres(numbers, "the sparse depth", unit)
+        rows, columns = np.nonzero(np.isfinite(numbers) & (numbers > 0))
         xy = np.stack([columns, rows], axis=1).astype(np.float32)
-        depth = values[rows, columns]
+        depth = numbers[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
     return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown

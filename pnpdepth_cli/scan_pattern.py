@@ -27,14 +27,21 @@ _ALONG = 3.0
 """Spacings along a line to its next point, at most."""
 _ACROSS = 0.35
 """Spacings across lines to the next point of the same line, at most."""
+_LEAST_ACROSS_PX = 1.0
+"""Pixels across lines that are allowed in any case: points lie on whole pixels."""
 
 
 def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | None:
-    """Returns the spacing of (N, 2) pixel coordinates in an image (H, W); None without scan lines.
+    """Returns the spacings of points along and across scan lines, pixels; None without such lines.
 
-    It is the median distance in pixels to the next point along a row, and along a column. With scan
-    lines, points are much denser along rows, and the nearest point is in the same row.
+    They are the median distances from a point to the next along a row, and along a column. With
+    scan lines, points are much denser along rows, and the nearest point is in the same row.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image.
+        size: (H, W) of the image.
     """
+    # Columns and rows of the pixels; the image's right and bottom edge are in its last ones.
     pixels = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp)
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
     if len(x) < _MIN_POINTS:
@@ -44,9 +51,9 @@ def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | 
     if not _ACROSS_OVER_ALONG * along <= across < np.inf:
         return None
     # The nearest point is one of the same line. Of random points in a wide area it is not.
-    every = max(1, len(x) // _SAMPLED)
+    step = max(1, len(x) // _SAMPLED)
     points = np.column_stack([x, y]).astype(np.float64)
-    to_itself_and_next, _ = cKDTree(points).query(points[::every], k=2)
+    to_itself_and_next, _ = cKDTree(points).query(points[::step], k=2)
     nearest = max(1.0, float(np.median(to_itself_and_next[:, 1])))
     return (along, across) if along <= _ALONG_OVER_NEAREST * nearest else None
 
@@ -55,40 +62,61 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     """Returns (N,) the number of each point's scan line, from the top; None without scan lines.
 
     Each point is linked with the next one to the right in nearly the same row; a line that is
-    interrupted, as by the sky, is several.
+    interrupted, as by the sky, is several. With fewer than `MIN_LINES` there are none.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image.
+        size: (H, W) of the image.
     """
-    if (spacing := scan_pattern(xy, size)) is None:
+    spacing = scan_pattern(xy, size)
+    if spacing is None:
         return None
+    # All pairs of points that are near enough along and across the lines: in a box of side `reach`.
     xy = np.asarray(xy, np.float64)
     along_px, across_px = spacing
-    reach = np.array([_ALONG * along_px, max(1.0, _ACROSS * across_px)])
+    reach = np.array([_ALONG * along_px, max(_LEAST_ACROSS_PX, _ACROSS * across_px)])
     first, second = cKDTree(xy / reach).query_pairs(1.0, p=np.inf, output_type="ndarray").T
+    # The left and the right point of each pair; pairs in one column are no neighbours on a line.
     left = np.where(xy[first, 0] <= xy[second, 0], first, second)
     right = first + second - left
     offset = np.abs(xy[right] - xy[left])
-    ahead = offset[:, 0] > 0
-    left, right, offset = left[ahead], right[ahead], offset[ahead]
+    is_beside = offset[:, 0] > 0
+    left, right, offset = left[is_beside], right[is_beside], offset[is_beside]
+    # Of the pairs of each left point, sorted by distance in units of the reach, the first one.
     order = np.lexsort((offset @ (1 / reach), left))
-    nearest = order[np.diff(left[order], prepend=-1) > 0]
+    is_first = np.diff(left[order], prepend=-1) > 0
+    nearest = order[is_first]
+    # Points that are linked, directly or not, are a line.
     links = coo_matrix((np.ones(len(nearest)), (left[nearest], right[nearest])), (len(xy),) * 2)
     count, line = connected_components(links, directed=False)
     if count < MIN_LINES:
         return None
-    height = np.bincount(line, xy[:, 1]) / np.bincount(line)
-    number: NDArray[np.intp] = np.argsort(np.argsort(height, kind="stable"))[line]
+    # Lines are numbered by their mean row; the inner `argsort` gives the lines in that order, the
+    # outer one the number of each.
+    mean_row = np.bincount(line, xy[:, 1]) / np.bincount(line)
+    number: NDArray[np.intp] = np.argsort(np.argsort(mean_row, kind="stable"))[line]
     return number
 
 
 def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
-    """The median distance in pixels from a point to the next in its row or a row beside it."""
+    """The median distance in pixels from a point to the next one to its right.
+
+    The next one is in the same row or a row beside it. Infinite where most points have none.
+
+    Args:
+        column: (N,) column of each point.
+        row: (N,) row of each point. With the two exchanged, the distance is downwards.
+    """
+    # Row-major indices of the pixels with points, in rising order and each once.
     width = int(column.max()) + 1
     pixels = np.sort(row * width + column)
     pixels = pixels[np.diff(pixels, prepend=-1) > 0]  # np.unique takes 100 times as long
     row, column = np.divmod(pixels, width)
+    # In each of three rows, the first pixel after this column is the next in that order.
     gaps = np.full(len(pixels), np.inf)
-    for beside in row - 1, row, row + 1:
-        after = np.searchsorted(pixels, beside * width + column, "right")
+    for searched_row in row - 1, row, row + 1:
+        after = np.searchsorted(pixels, searched_row * width + column, "right")
         next_row, next_column = np.divmod(pixels[after.clip(max=len(pixels) - 1)], width)
-        found = (after < len(pixels)) & (next_row == beside)
-        gaps = np.where(found, np.minimum(gaps, next_column - column), gaps)
+        has_next = (after < len(pixels)) & (next_row == searched_row)
+        gaps = np.where(has_next, np.minimum(gaps, next_column - column), gaps)
     return float(np.median(gaps))

@@ -16,6 +16,7 @@ from pnpdepth_cli import choices
 from pnpdepth_cli.errors import UsageError
 
 LARGEST_SEED = 2**32 - 1
+"""numpy takes no larger one."""
 OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
 """The settings that have no effect without updates of z."""
 
@@ -23,8 +24,12 @@ OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
 def option(default: Any, help: str, **details: object) -> Any:
     """Returns a dataclass field that the user can set, with its help on the command line.
 
-    The details are arguments of the option in click, such as its metavar; and `choices`, `least`
-    and `most` of a whole number, and `flag`, its spelling where that is not the field's name.
+    Args:
+        default: Value of the field where the user sets none.
+        help: Text of the option in `--help`.
+        details: Arguments of the option in click, such as its metavar; and `choices`, the names
+            that it takes, `least` and `most` of a whole number, and `flag`, its spelling where that
+            is not the field's name.
     """
     return field(default=default, metadata={"help": help, **details})
 
@@ -35,7 +40,7 @@ def options_of(group: type) -> list[Field[Any]]:
 
 
 def flag_of(declared: Field[Any]) -> str:
-    """Returns how the command line spells a field, such as `--lr`."""
+    """Returns how the command line spells a field that was made by `option`, such as `--lr`."""
     return str(declared.metadata.get("flag", f"--{declared.name.replace('_', '-')}"))
 
 
@@ -99,28 +104,33 @@ class Settings:
 
     def __new__(cls, *_: object, **values: object) -> Settings:
         """Raises UsageError for a name that is no setting, with the likely one."""
-        known = [setting.name for setting in fields(cls)]
-        for name in values.keys() - {*known}:
+        settings = [setting.name for setting in fields(cls)]
+        for name in values.keys() - {*settings}:
             import difflib
 
-            likely = difflib.get_close_matches(name, known, n=1)
+            likely = difflib.get_close_matches(name, settings, n=1)
             if likely:
                 raise UsageError(f"there is no setting {name!r}; did you mean {likely[0]!r}?")
-            raise UsageError(f"there is no setting {name!r}; there are {', '.join(known)}")
+            raise UsageError(f"there is no setting {name!r}; there are {', '.join(settings)}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
+        """Checks the values that are given, and makes a step in digits a number.
+
+        Raises:
+            UsageError: A value is out of range, or is no name of its list.
+        """
         for name, value in self.given().items():
             if name in _NAMES:
-                valid = isinstance(value, str) and value in _NAMES[name]
+                is_valid = isinstance(value, str) and value in _NAMES[name]
                 wanted = f"one of {', '.join(_NAMES[name])}"
             else:
-                is_valid, wanted = _CHECKS[name]
-                valid = is_valid(value)
-            if not valid:
+                check, wanted = _CHECKS[name]
+                is_valid = check(value)
+            if not is_valid:
                 raise UsageError(f"{name} must be {wanted}, got {value!r}")
         if self.lr is not None and not str(self.lr).strip().endswith("%"):
-            object.__setattr__(self, "lr", float(self.lr))  # one spelling of a step
+            object.__setattr__(self, "lr", float(self.lr))  # the class is frozen
 
     @property
     def of_updates(self) -> list[str]:
@@ -133,18 +143,20 @@ class Settings:
         return self.method == "paper"
 
     def given(self) -> dict[str, Any]:
-        """Returns the fields that are not open."""
+        """Returns the values that are not at their defaults, by name."""
         values = ((setting, getattr(self, setting.name)) for setting in fields(self))
         return {setting.name: value for setting, value in values if value != setting.default}
 
     def over(self, others: Settings) -> Settings:
-        """Returns these settings, and the others' where these are open."""
+        """Returns these settings, with the others' values where these are open."""
         return replace(others, **self.given())
 
     def closed(self) -> ClosedSettings:
-        """Returns these settings, and the paper's where these are open."""
+        """Returns how z is updated and what follows, with the paper's values where it is open."""
         names = {setting.name for setting in fields(ClosedSettings)}
-        return ClosedSettings(**{k: v for k, v in self.given().items() if k in names})
+        return ClosedSettings(
+            **{name: value for name, value in self.given().items() if name in names}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,17 +178,20 @@ class ClosedSettings:
 
 
 def _is_number(value: object) -> bool:
+    """Whether a value is a finite number of at least 0, and no bool."""
     return isinstance(value, Real) and not isinstance(value, bool) and 0 <= float(value) < math.inf
 
 
 def _is_whole(value: object) -> bool:
+    """Whether a value is a whole number of at least 0, and no bool."""
     return isinstance(value, Integral) and _is_number(value)
 
 
 def _is_step(value: object) -> bool:
+    """Whether a value is a finite number above 0, or a text of one, also with % behind it."""
     try:
         return 0 < float(str(value).strip().removesuffix("%")) < math.inf
-    except ValueError:
+    except ValueError:  # of `float`: the text is no number
         return False
 
 
@@ -185,6 +200,7 @@ _NAMES: Mapping[str, Collection[str]] = {"schedule": choices.SCHEDULES} | {
     for setting in options_of(Settings)
     if "choices" in setting.metadata
 }
+"""The names that a setting takes, by setting; those without names are in `_CHECKS`."""
 _CHECKS: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "layer": (lambda value: isinstance(value, str), "the name of a layer, or a fraction as text"),
     "iterations": (_is_whole, "a whole number >= 0"),
@@ -192,7 +208,7 @@ _CHECKS: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "blur": (_is_number, ">= 0"),
     "seed": (_is_whole, "a whole number >= 0"),
 }
-"""Whether a value of the field is valid, and what it must be."""
+"""Function that tells whether a value of a setting is valid, and what it must be, by setting."""
 
 PAPER = Settings(**asdict(ClosedSettings()))
 """The settings of the paper, none open but the layer."""

@@ -8,33 +8,46 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 _noted: ContextVar[dict[str, float] | None] = ContextVar("_noted", default=None)
+"""Seconds by part, of the stage that is running. None: nothing is noted."""
 
 
 @contextmanager
 def spent_on(part: str) -> Iterator[None]:
-    """Notes the time inside as spent on this part, but for what is noted of other parts inside."""
-    parts = _noted.get()
-    if parts is None:
+    """Inside, the time counts as spent on one part of a stage, but for that on parts inside it.
+
+    Nothing is noted outside `parts_of`.
+
+    Args:
+        part: Name of the part, such as "import".
+    """
+    seconds = _noted.get()
+    if seconds is None:
         yield
         return
     start = time.perf_counter()
-    before = sum(parts.values())
+    before = sum(seconds.values())
     try:
         yield
     finally:
-        others = sum(parts.values()) - before
-        parts[part] = parts.get(part, 0.0) + time.perf_counter() - start - others
+        on_others = sum(seconds.values()) - before
+        on_this = time.perf_counter() - start - on_others
+        seconds[part] = seconds.get(part, 0.0) + on_this
 
 
 @contextmanager
 def parts_of(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Adds the seconds of the parts noted inside under `STAGE: PART`."""
+    """Inside, `spent_on` notes parts of a stage; afterwards their seconds are added to a table.
+
+    Args:
+        seconds: The table, seconds by name; a part is under `STAGE: PART`.
+        stage: Name of the stage, such as "load network".
+    """
     parts = dict[str, float]()
     token = _noted.set(parts)
     try:
         yield
     finally:
         _noted.reset(token)
-        for name, spent in parts.items():
-            key = f"{stage}: {name}"
-            seconds[key] = round(seconds.get(key, 0.0) + spent, 4)
+        for part, spent_s in parts.items():
+            key = f"{stage}: {part}"
+            seconds[key] = round(seconds.get(key, 0.0) + spent_s, 4)

@@ -47,7 +47,13 @@ Weights = Mapping[str, Tensor]
 """Values of parameters in float32, by name."""
 
 Lesson = tuple[PreparedFrame, SparsePoints]
-"""A frame to learn from, and its points to hide and to ask for: those that are no outliers."""
+"""A frame to learn from, and those of its points that are hidden from the network and asked for:
+all that are no outliers."""
+
+_LARGEST_PERIOD = 5
+"""One frame of so many is for validation, in a long sequence."""
+_LEAST_FOR_VALIDATION = 3
+"""Frames for validation, at least, where a sequence has `LEAST_FRAMES`: the t test needs some."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,20 +66,25 @@ class Learnt:
 
     @property
     def is_better(self) -> bool:
-        """Whether the loss fell beyond chance."""
+        """Whether the loss fell, in the mean and beyond chance, by a t test of its log ratios."""
         from scipy.stats import ttest_1samp
 
-        fell = ttest_1samp(np.log(self.after / self.before), 0, alternative="less")
-        return bool(self.after.mean() < self.before.mean() and fell.pvalue < SIGNIFICANT)
+        test = ttest_1samp(np.log(self.after / self.before), 0, alternative="less")
+        return bool(self.after.mean() < self.before.mean() and test.pvalue < SIGNIFICANT)
 
     def __str__(self) -> str:
         change = self.after.mean() / self.before.mean() - 1
-        unsure = "" if self.is_better else " is not beyond chance"
-        return f"{change:+.1%} loss at hidden points of {len(self.after)} frames{unsure}"
+        doubt = "" if self.is_better else " is not beyond chance"
+        return f"{change:+.1%} loss at hidden points of {len(self.after)} frames{doubt}"
 
 
-def too_little(count: int, first: Frame) -> str | None:
-    """Returns why a sequence of so many frames, the first of which is given, teaches nothing."""
+def reason_not_to_learn(count: int, first: Frame) -> str | None:
+    """Returns why the points of a sequence teach a network nothing; None if they can teach it.
+
+    Args:
+        count: Number of frames of the sequence.
+        first: Its first frame, whose points stand for those of all.
+    """
     if count < LEAST_FRAMES:
         return f"{count} frames; at least {LEAST_FRAMES} are needed"
     if is_dense(first.points):
@@ -88,13 +99,15 @@ def learn(
     seed: int = 0,
     on_step: Callable[[], None] = lambda: None,
 ) -> Learnt:
-    """Returns what the weights of a network learn from the points of a sequence.
+    """Returns weights of a network that learnt from the points of a sequence, and their losses.
 
     The network itself does not change.
 
     Args:
-        frames: Frames with their names, at least `LEAST_FRAMES`.
+        network: Network that takes sparse depth, not cut.
+        frames: Frames with their names for messages, at least `LEAST_FRAMES`.
         seed: Random seed of the frames' order and of the hidden points.
+        on_step: Function that is called after each of the `STEPS` updates.
 
     Raises:
         UsageError: The network takes no sparse depth.
@@ -107,22 +120,50 @@ def learn(
             f"network {name!r} takes no sparse depth, so none can be hidden from it; adapt one that"
             " takes it"
         )
-    # Some frames are for validation.
+    # One frame of each period is for validation; a short sequence has shorter periods.
     lessons = [_lesson(network, name, frame) for name, frame in frames]
-    every = max(2, min(5, len(lessons) // 3))
-    validation = lessons[every - 1 :: every]
-    training = [lesson for number, lesson in enumerate(lessons, 1) if number % every]
+    period = max(2, min(_LARGEST_PERIOD, len(lessons) // _LEAST_FOR_VALIDATION))
+    validation = lessons[period - 1 :: period]
+    training = [lesson for number, lesson in enumerate(lessons, 1) if number % period]
     # The loss before.
     theta = _weights_that_learn(network)
     before = _losses_of(network, validation, theta, seed)
-    # All updates, a few on each frame.
+    # The updates.
+    _make_updates(network, training, theta, seed=seed, on_step=on_step)
+    # The loss after.
+    weights = {name: weight.detach() for name, weight in theta.items()}
+    after = _losses_of(network, validation, theta, seed)
+    return Learnt(weights=weights, before=before, after=after)
+
+
+def _make_updates(
+    network: Network,
+    lessons: Sequence[Lesson],
+    theta: Weights,
+    *,
+    seed: int,
+    on_step: Callable[[], None],
+) -> None:
+    """Afterwards the weights theta have had `STEPS` updates, a few on each frame in turn.
+
+    Args:
+        network: The network.
+        lessons: The frames to learn from.
+        theta: Weights with gradients, which change in place.
+        seed: Random seed of the frames' order and of the hidden points.
+        on_step: Function that is called after each update.
+
+    Raises:
+        DivergedError: The loss is not finite.
+    """
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(theta.values(), LR, eps=EPSILON)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
-    visited = _shuffle(len(training), generator)
-    for first in range(0, STEPS, STEPS_A_VISIT):
-        with _open_lesson(network, training[next(visited)], generator) as loss_of:
-            for step in range(first, min(first + STEPS_A_VISIT, STEPS)):
+    order = _shuffle(len(lessons), generator)
+    for first_step in range(0, STEPS, STEPS_A_VISIT):
+        lesson = lessons[next(order)]
+        with _open_lesson(network, lesson, generator) as loss_of:
+            for step in range(first_step, min(first_step + STEPS_A_VISIT, STEPS)):
                 optimiser.zero_grad()
                 with torch.enable_grad():
                     loss = loss_of(theta)
@@ -136,9 +177,6 @@ def learn(
                 optimiser.step()
                 schedule.step()
                 on_step()
-    weights = {name: value.detach() for name, value in theta.items()}
-    after = _losses_of(network, validation, theta, seed)
-    return Learnt(weights=weights, before=before, after=after)
 
 
 @contextmanager
@@ -147,8 +185,8 @@ def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
     parameters = dict(network.module.named_parameters())
     originals = {name: parameters[name].data for name in weights}
     try:
-        for name, value in weights.items():
-            parameters[name].data = value.to(parameters[name].dtype)
+        for name, weight in weights.items():
+            parameters[name].data = weight.to(parameters[name].dtype)
         yield
     finally:
         for name, original in originals.items():
@@ -156,13 +194,24 @@ def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
 
 
 def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
-    """The lesson of a frame. Raises NoPointsError with fewer than two points."""
+    """A frame as the network takes it, and its points to learn from, without outliers.
+
+    Args:
+        network: The network that learns.
+        name: The frame's name in messages.
+        frame: The frame.
+
+    Raises:
+        NoPointsError: The network sees fewer than two points.
+    """
     prepared = prepare(network, frame.registered())
     points = prepared.points
     if len(points) < 2:
         raise NoPointsError(
             f"{name}: {len(points)} points; hiding some needs 2, so leave this frame out"
         )
+    # An outlier among few points may be all that is seen of a small object. Outliers contradict
+    # their neighbours: beside a constant depth.
     if len(points) >= FEW_POINTS:
         outlying = ResidualField(torch.ones(points.size), points.tensors(), None).outliers
         points = points.select(~outlying.to(points.xy.device))
@@ -173,10 +222,17 @@ def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
 def _open_lesson(
     network: Network, lesson: Lesson, generator: torch.Generator
 ) -> Iterator[Callable[[Weights], Tensor]]:
-    """Gives a function: the loss L(f_θ(x, D_s ∖ m), m) for θ, with another m at every call.
+    """Inside, a function of weights θ returns the loss at points that the network is not given.
 
-    The points are divided into two halves, and each half is hidden once before they are divided
-    anew: halves that complement each other make steps that agree more.
+    The loss is L(f_θ(x, D_s ∖ m), m), where x is the frame's image, D_s its points and m a half of
+    these, another one at every call. The points are divided into two halves, and each half is
+    hidden once before they are divided anew: halves that complement each other make steps that
+    agree more.
+
+    Args:
+        network: The network f.
+        lesson: The frame and its points.
+        generator: Generator of the halves.
     """
     prepared, points = lesson
     reader = AlignedDepth(network, prepared.points, network.definition.default_alignment)
@@ -188,13 +244,13 @@ def _open_lesson(
         is_hidden = next(halves).to(points.depth.device)
         shown = points.select(~is_hidden)
         hidden = points.select(is_hidden)
-        values = {name: value.to(parameters[name].dtype) for name, value in weights.items()}
+        typed_weights = {name: w.to(parameters[name].dtype) for name, w in weights.items()}
         arguments = tuple(tensor.clone() for tensor in prepared.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
-            output = functional_call(network.module, values, arguments)
+            output = functional_call(network.module, typed_weights, arguments)
         predicted = hidden.sample(reader(output))
-        known = predicted.isfinite()  # unknown where the network says so, such as in the sky
-        log_error = predicted[known].clamp_min(MIN_DEPTH).log() - hidden.depth[known].log()
+        is_known = predicted.isfinite()  # not where the network says so, such as in the sky
+        log_error = predicted[is_known].clamp_min(MIN_DEPTH).log() - hidden.depth[is_known].log()
         return log_error.abs().mean()
 
     with encoding_once(network, {}):
@@ -202,19 +258,30 @@ def _open_lesson(
 
 
 def _weights_that_learn(network: Network) -> dict[str, Tensor]:
-    """θ at its start."""
+    """θ at its start: float32 copies, by name, of the parameters that learn, with gradients.
+
+    All floating-point parameters learn but those of the image encoder that the definition names.
+    """
     encoder = network.definition.image_encoder
-    return {
-        name: parameter.detach().float().clone().requires_grad_()
-        for name, parameter in network.module.named_parameters()
-        if parameter.is_floating_point() and not (encoder and name.startswith(f"{encoder}."))
-    }
+    weights: dict[str, Tensor] = {}
+    for name, parameter in network.module.named_parameters():
+        is_of_encoder = encoder is not None and name.startswith(f"{encoder}.")
+        if parameter.is_floating_point() and not is_of_encoder:
+            weights[name] = parameter.detach().float().clone().requires_grad_()
+    return weights
 
 
 def _losses_of(
     network: Network, lessons: Sequence[Lesson], theta: Weights, seed: int
 ) -> NDArray[np.float64]:
-    """The loss at hidden points of each frame; with a seed the same points are hidden."""
+    """(F,) the loss at hidden points of each of F frames with the weights theta.
+
+    Args:
+        network: The network.
+        lessons: The frames, and their points of which half is hidden.
+        theta: The weights.
+        seed: Random seed of the hidden points: with one seed they are the same for all weights.
+    """
     losses: list[float] = []
     for lesson in lessons:
         generator = torch.Generator().manual_seed(seed)
@@ -224,13 +291,13 @@ def _losses_of(
 
 
 def _shuffle(count: int, generator: torch.Generator) -> Iterator[int]:
-    """0 … count − 1 without end, shuffled anew when all were there."""
+    """Yields 0 … count − 1 without end, shuffled anew when all were there."""
     while True:
         yield from torch.randperm(count, generator=generator).tolist()
 
 
 def _halves(count: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """(count,) bool without end: a random half, then the other one."""
+    """Yields masks (count,) bool without end: a random half, its complement, another half, …"""
     while True:
         is_second = (torch.randperm(count, generator=generator) % 2).bool()
         yield ~is_second

@@ -1,5 +1,7 @@
 """The experts of a frame: what predicts it from its points, and with which prior weight.
 
+The prior weight is the weight in the fused depth before the validation points change it.
+
 1. The user's networks predict, aligned with the points, z updated.
 2. `compact` predicts with each one's depth as a prior, and without.
 3. Linear interpolation predicts; and, where the image is in doubt, `compact` with a grey image.
@@ -50,6 +52,8 @@ NO_GAIN = 0.5
 have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image at most 0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
+LEAST_ERROR = 1e-9
+"""Metres; errors at validation points are at least this before they are divided by."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +61,12 @@ class Expert:
     """What predicts a frame from its points: linear interpolation, or a network."""
 
     name: str
-    weight: float = 0.0  # prior weight; with 0 it has no part
-    at: Tensor  # (M,) metres, 0 = unknown: at the validation points, from the others
-    updated: Tensor  # (M,) the same, the residual not propagated
-    points: SparsePoints  # all points
+    weight: float = 0.0  # prior weight; with 0 it has no part in the fused depth
+    at_validation: Tensor
+    """(M,) metres, 0 = unknown: its depth at the M validation points, predicted from the other
+    points, its residual at these propagated."""
+    updated_at_validation: Tensor  # (M,) the same, the residual not propagated
+    points: SparsePoints  # all points, those for validation too
     user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
     of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
 
@@ -75,26 +81,28 @@ class NetworkExpert(Expert):
     """A network that predicts the frame, perhaps with another network's depth as a prior."""
 
     whole: Prediction  # from all points
-    kept: Prediction  # from the others; the same as `whole` without validation
+    kept: Prediction  # from all but the validation points; the same as `whole` without any
     frame: Frame | None = None  # what it is shown mirrored, too. None: it sees one frame
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
     unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
-    not_updated: float = 0.0  # 0…1, the part that the aligned depth has beside the updated one
-    untrusted: bool = False  # whether z is not updated only because of missing trust
+    share_of_aligned: float = 0.0
+    """0…1, the part in its depth of the aligned depth, before updates of z. The updated depth has
+    the rest."""
+    lacks_trust: bool = False  # whether z is not updated only because `trust_in_image` is 0
     harm: tuple[float, float] | None = None
     """Errors in metres at the validation points without and with updates of z, if these are not
     used because of them."""
 
     @property
     def strength(self) -> float:
-        """0…1, how strong the network is."""
+        """0…1, how strong the network is on this frame, by `unexplained`."""
         return strength_of(self.unexplained)
 
     @functools.cached_property
     def dense(self) -> Tensor:
         """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
         if self.mirrored is None:
-            return _mix_with_aligned(self.whole, self.not_updated)
+            return _mix_with_aligned(self.whole, self.share_of_aligned)
         return weighted_mean([(self.whole.updated, 1), (self.mirrored, 1)])
 
 
@@ -120,11 +128,15 @@ class Experts(NamedTuple):
             and expert.user.name == expert.name
         ]
 
-    def replaced(self, changed: Sequence[Expert]) -> Experts:
-        """Returns these experts after a step that changed some of them, all in the same order."""
-        by_name = {expert.name: expert for expert in changed if isinstance(expert, NetworkExpert)}
+    def replaced(self, every: Sequence[Expert]) -> Experts:
+        """Returns these experts after a step that changed some of them.
+
+        Args:
+            every: All experts, changed or not, in the order of `Experts.every`.
+        """
+        by_name = {expert.name: expert for expert in every if isinstance(expert, NetworkExpert)}
         alone = None if self.alone is None else by_name[self.alone.name]
-        return self._replace(own=by_name[self.own.name], alone=alone, every=list(changed))
+        return self._replace(own=by_name[self.own.name], alone=alone, every=list(every))
 
 
 def expert_of(
@@ -132,70 +144,110 @@ def expert_of(
     split: ValidatedFrame,
     name: str,
     *,
-    known: Prediction | None = None,
+    prediction: Prediction | None = None,
     prior: NetworkExpert | None = None,
     user: OpenNetwork | None = None,
     updates: bool = True,
     unexplained: float = 1.0,
 ) -> NetworkExpert:
-    """Returns the predictions of one network, without a prior weight yet.
+    """Returns what one network predicts from all points, and without the validation points.
+
+    The prior weight of the expert is still 0.
 
     Args:
         network: The network, open.
         split: The frame and its validation points.
         name: Name of the expert.
-        known: Prediction from all points, if there is one already.
-        prior: Expert whose depth the network is given.
+        prediction: What the network predicts from all points. None: it is computed.
+        prior: Expert whose aligned depth the network takes as its prior. None: it takes none.
         user: The user's network whose depth it is, or has as a prior.
         updates: Whether z may be updated.
         unexplained: What the network leaves unexplained, see `unexplained_by`.
     """
-    whole = split.whole
-    kept = split.kept
-    # A prior is given with all points, and made from the others where the others are used.
-    if prior is not None:
-        whole = replace(whole, prior=prior.whole.aligned)
-        kept = replace(kept, prior=prior.kept.aligned)
-    # The network predicts from all points, and the validation points from the others.
-    of_whole = known or network.refine(whole, updates=updates)
-    of_kept = of_whole
-    is_updated = network.settings.iterations > 0  # a depth map is not: it has no z
-    not_updated = strength_of(unexplained) if is_updated and not network.always_updated else 0.0
-    at = updated = split.points.depth
-    harm = None
-    if len(split.points):
-        again = network.tuned or network.always_updated or not network.takes_points
-        of_kept = network.refine(kept, updates=updates and again and not_updated < 1)
-        at = _at_validation_points(_mix_with_aligned(of_kept, not_updated), split, kept)
-        updated = split.points.sample(of_kept.updated)
-        # Updates that the user states may do harm, such as at a layer near to the depth.
-        if network.tuned and of_kept.updates and not_updated < 1:
-            without = _at_validation_points(of_kept.aligned, split, kept)
-            error_without = split.error(without)
-            error_with = split.error(at)
-            if error_with > HARMFUL * error_without:
-                harm = (error_without, error_with)
-                at = without
-                not_updated = 1.0
-    return NetworkExpert(
+    # The network predicts from all points; a prior is made from all points, too.
+    whole = split.whole if prior is None else replace(split.whole, prior=prior.whole.aligned)
+    if prediction is None:
+        prediction = network.refine(whole, updates=updates)
+    # A strong network's depth is that before updates of z, unless the user states their number. A
+    # depth map has no z, so its two depths are one.
+    is_updated = network.settings.iterations > 0
+    share_of_aligned = 0.0
+    if is_updated and not network.always_updated:
+        share_of_aligned = strength_of(unexplained)
+    nothing = split.points.depth[:0]  # the prediction without validation points, (0,)
+    expert = NetworkExpert(
         name=name,
-        at=at,
-        updated=updated,
+        at_validation=nothing,
+        updated_at_validation=nothing,
         points=whole.points,
-        whole=of_whole,
-        kept=of_kept,
+        whole=prediction,
+        kept=prediction,
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
         unexplained=unexplained,
-        not_updated=not_updated,
+        share_of_aligned=share_of_aligned,
+    )
+    if not len(split.points):
+        return expert
+    # It predicts the validation points from the others; a prior is made from the others, too.
+    kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
+    return _validated(expert, network, split, kept, updates=updates)
+
+
+def _validated(
+    expert: NetworkExpert,
+    network: OpenNetwork,
+    split: ValidatedFrame,
+    kept: Frame,
+    *,
+    updates: bool,
+) -> NetworkExpert:
+    """The expert with what its network predicts at the validation points.
+
+    Args:
+        expert: The expert, with its prediction from all points.
+        network: Its network, open.
+        split: The frame and its validation points, of which there are some.
+        kept: The frame without these, with the expert's prior, if it has one.
+        updates: Whether z may be updated.
+    """
+    share_of_aligned = expert.share_of_aligned
+    # Updates of a network that takes points gain little and take as long as all else. So they are
+    # spared here, unless the user states them.
+    is_stated = network.tuned or network.always_updated
+    is_worth_it = share_of_aligned < 1 and (is_stated or not network.takes_points)
+    prediction = network.refine(kept, updates=updates and is_worth_it)
+    mixed = _mix_with_aligned(prediction, share_of_aligned)
+    predicted = _at_validation_points(mixed, split)
+    harm = None
+    # Updates that the user states may do harm, such as at a layer near to the depth.
+    if network.tuned and prediction.updates and share_of_aligned < 1:
+        without = _at_validation_points(prediction.aligned, split)
+        error_without = split.error(without)
+        error_with = split.error(predicted)
+        if error_with > HARMFUL * error_without:
+            harm = (error_without, error_with)
+            predicted = without
+            share_of_aligned = 1.0
+    return replace(
+        expert,
+        at_validation=predicted,
+        updated_at_validation=split.points.sample(prediction.updated),
+        kept=prediction,
+        share_of_aligned=share_of_aligned,
         harm=harm,
     )
 
 
-def _at_validation_points(dense: Tensor, split: ValidatedFrame, kept: Frame) -> Tensor:
-    """(M,) a depth (H, W) at the validation points, its residual at the others propagated."""
-    field = ResidualField(dense, kept.points, kept.rgb)
+def _at_validation_points(dense: Tensor, split: ValidatedFrame) -> Tensor:
+    """(M,) metres, 0 = unknown: a depth at the validation points, its residual propagated.
+
+    Args:
+        dense: (H, W) metres, 0 = unknown: the depth.
+        split: The frame and its validation points; the residual is that at the other points.
+    """
+    field = ResidualField(dense, split.kept.points, split.kept.rgb)
     return field.depth(split.points.xy, kind=split.propagation)
 
 
@@ -207,46 +259,55 @@ def expert_of_user(
     Args:
         network: The network, open.
         split: The frame and its validation points.
-        judged: How its outliers were told.
-        needs_trust: Whether only what `trust` trusts gets into the result.
+        judged: The frame without outliers, and what the network that told them predicts.
+        needs_trust: Whether a network has no part in the result if `trust_in_image` is 0, so that
+            updates of its z would be in vain.
     """
-    whole = judged.by(network)
+    prediction = judged.by(network)
     unexplained = 1.0
-    updates = True
-    untrusted = False
-    # What its depth without updates leaves unexplained decides whether z is updated.
+    may_update = True
+    lacks_trust = False
+    # What a network of the image alone leaves unexplained without updates decides on them.
     if not network.takes_points:
-        whole = whole or network.refine(split.whole, updates=network.always_updated)
-        unexplained = unexplained_by(whole.aligned, split, judged)
-        # Without trust, which is in the aligned depth, updates would not reach the result.
-        stated = network.always_updated or network.tuned
-        if needs_trust and not stated:
-            updates = trust_in_image(whole.aligned, split.whole.points) > 0
-        gains = network.always_updated or strength_of(unexplained) < 1
-        wanted = gains and not whole.updates and network.is_updated(split.whole)
-        untrusted = wanted and not updates
-        if wanted and updates:
-            whole = network.refine(split.whole)
+        if prediction is None:
+            prediction = network.refine(split.whole, updates=network.always_updated)
+        unexplained = unexplained_by(prediction.aligned, split, judged)
+        # Updates that the user states are made without trust, too.
+        is_stated = network.always_updated or network.tuned
+        if needs_trust and not is_stated:
+            may_update = trust_in_image(prediction.aligned, split.whole.points) > 0
+        # A strong network gains nothing by updates, but a stated number of them is made.
+        can_gain = network.always_updated or strength_of(unexplained) < 1
+        is_missing = can_gain and not prediction.updates and network.is_updated(split.whole)
+        lacks_trust = is_missing and not may_update
+        if is_missing and may_update:
+            prediction = network.refine(split.whole)
     expert = expert_of(
         network,
         split,
         network.name,
-        known=whole,
+        prediction=prediction,
         user=network,
-        updates=updates,
+        updates=may_update,
         unexplained=unexplained,
     )
-    return replace(expert, untrusted=untrusted)
+    return replace(expert, lacks_trust=lacks_trust)
 
 
-def _mix_with_aligned(prediction: Prediction, not_updated: float) -> Tensor:
-    """The mean (H, W) of updated and aligned depth, the latter of which has this part.
+def _mix_with_aligned(prediction: Prediction, share_of_aligned: float) -> Tensor:
+    """(H, W) metres, 0 = unknown: the weighted mean of a network's aligned and its updated depth.
 
     The steps of the updates are large against the error of a strong network, which they make worse.
+
+    Args:
+        prediction: What the network gives.
+        share_of_aligned: Weight 0…1 of the aligned depth; the updated one has the rest.
     """
-    if not prediction.updates or not_updated <= 0:
+    if not prediction.updates or share_of_aligned <= 0:
         return prediction.updated
-    return weighted_mean([(prediction.updated, 1 - not_updated), (prediction.aligned, not_updated)])
+    return weighted_mean(
+        [(prediction.updated, 1 - share_of_aligned), (prediction.aligned, share_of_aligned)]
+    )
 
 
 def networks_alone(
@@ -257,16 +318,16 @@ def networks_alone(
     Args:
         networks: The networks, open.
         split: The frame and its validation points.
-        judged: How its outliers were told.
+        judged: The frame without outliers, and what the network that told them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
-    own = [
+    of_users = [
         replace(expert_of_user(network, split, judged), weight=1 / len(networks))
         for network in networks
     ]
-    return Experts(own=own[0], alone=None, every=[*own])
+    return Experts(own=of_users[0], alone=None, every=[*of_users])
 
 
 def fused_experts(
@@ -281,54 +342,65 @@ def fused_experts(
         networks: The networks, open, the user's first.
         fusing: The one of them that takes a prior.
         split: The frame and its validation points.
-        judged: How its outliers were told.
+        judged: The frame without outliers, and what the network that told them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
     # The user's networks predict.
     users = [network for network in networks if network is not fusing]
-    own = [expert_of_user(network, split, judged, needs_trust=True) for network in users]
+    of_users = [expert_of_user(network, split, judged, needs_trust=True) for network in users]
     # The network that takes a prior predicts without one.
-    alone = expert_of(fusing, split, fusing.name, known=judged.by(fusing))
+    alone = expert_of(fusing, split, fusing.name, prediction=judged.by(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
     with_prior: list[NetworkExpert] = []
-    merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in own]
-    for number, (user, expert) in enumerate(zip(users, own, strict=True)):
+    merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in of_users]
+    for number, (user, expert) in enumerate(zip(users, of_users, strict=True)):
         share = trust(user, expert, split, alone) * merits[number] / sum(merits)
         weight = (OWN + (OWN_STRONG - OWN) * expert.strength) * share
-        own[number] = replace(expert, weight=0.0 if expert.of_scanner else weight)
+        # On scan lines a completion network has its weight by `fuse.shares_on_lines`.
+        of_users[number] = replace(expert, weight=0.0 if expert.of_scanner else weight)
         if share > 0:
             name = f"{fusing.name} with {expert.name}"
-            both = expert_of(fusing, split, name, prior=expert, user=user, updates=False)
-            with_prior.append(replace(both, weight=WITH_PRIOR * share))
-    # The rest of the prior weights is that of the network without a prior.
-    rest = 1 - sum(expert.weight for expert in (*own, *with_prior))
-    alone = replace(alone, weight=rest)
-    # Linear interpolation predicts; its dense depth, which takes long, only where it has a part.
-    at = split.points.depth
-    if len(split.points):
-        at = linear(split.kept.points, split.points.xy)
-    interpolation = Expert(
-        name=LINEAR, weight=WITHOUT_IMAGE, at=at, updated=at, points=split.whole.points
-    )
+            prior_expert = expert_of(fusing, split, name, prior=expert, user=user, updates=False)
+            with_prior.append(replace(prior_expert, weight=WITH_PRIOR * share))
+    # What is left of the prior weights is that of the network without a prior.
+    left = 1 - sum(expert.weight for expert in (*of_users, *with_prior))
+    alone = replace(alone, weight=left)
     experts = Experts(
-        own=own[0] if own else alone,
-        alone=alone if own else None,
-        every=[*own, *with_prior, alone, interpolation],
+        own=of_users[0] if of_users else alone,
+        alone=alone if of_users else None,
+        every=[*of_users, *with_prior, alone, _interpolation(split)],
     )
     # Where the image does not help, an expert that does not see it joins.
     return _with_blind_expert(fusing, split, experts)
 
 
+def _interpolation(split: ValidatedFrame) -> Expert:
+    """Linear interpolation as an expert.
+
+    Its dense depth takes long, so it is computed where it is first asked for (`Expert.dense`).
+    """
+    predicted = split.points.depth[:0]  # without validation points
+    if len(split.points):
+        predicted = linear(split.kept.points, split.points.xy)
+    return Expert(
+        name=LINEAR,
+        weight=WITHOUT_IMAGE,
+        at_validation=predicted,
+        updated_at_validation=predicted,
+        points=split.whole.points,
+    )
+
+
 def trust(
     network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, alone: NetworkExpert
 ) -> float:
-    """Returns 0…1, the part of its prior weights that a network gets, by what it explains.
+    """Returns 0…1, the fraction of its prior weights that a user's network gets.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points is that of `alone`, and none if it is twice that. Another one has what
-    `trust_in_image` says.
+    the validation points is that of `alone`, and none if it is twice that. Without validation
+    points it has none. Another one has what `trust_in_image` says.
 
     Args:
         network: The network, open.
@@ -341,48 +413,64 @@ def trust(
     # A network that takes the points: by its error beside that of `alone`.
     if not len(split.points):
         return 0.0
-    ratio = split.error(expert.updated) / max(split.error(alone.at), 1e-9)
+    error = split.error(expert.updated_at_validation)
+    ratio = error / max(split.error(alone.at_validation), LEAST_ERROR)
     return min(1.0, max(0.0, 2.0 - ratio))
 
 
 def _with_blind_expert(fusing: OpenNetwork, split: ValidatedFrame, experts: Experts) -> Experts:
     """The experts, joined by one that sees a grey image where the image is in doubt.
 
-    There is a warning where the image does not lower the error at validation points.
+    It is in doubt where `fusing` does not predict the validation points clearly better than linear
+    interpolation. There is a warning where the grey image does about as well, too.
+
+    Args:
+        fusing: The network that takes a prior, open.
+        split: The frame and its validation points.
+        experts: The experts, with those of `fusing` without a prior and of linear interpolation.
     """
     rgb = split.whole.rgb
     count = len(split.points)
     if rgb is None or split.whole.one_view or count < ENOUGH_FOR_DOUBT:
-        return experts
-    by_name = {expert.name: expert.at for expert in experts.every}
-    at = by_name[fusing.name]
+        return experts  # nothing can be in doubt, or nothing tells it
+    by_name = {expert.name: expert.at_validation for expert in experts.every}
+    with_image = by_name[fusing.name]
     interpolated = by_name[LINEAR]
-    of_linear = split.gain(at, interpolated)
-    if of_linear >= DOUBT:
+    gain_over_linear = split.gain(with_image, interpolated)
+    if gain_over_linear >= DOUBT:
         return experts
     # The image is in doubt: a grey one takes its place.
     fusing.next_image()
     grey = torch.full_like(rgb, 0.5)
-    blind = replace(split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey))
-    expert = expert_of(fusing, blind, f"{fusing.name} without the image", updates=False)
+    without_image = replace(
+        split, whole=replace(split.whole, rgb=grey), kept=replace(split.kept, rgb=grey)
+    )
+    name = f"{fusing.name} without the image"
+    blind = expert_of(fusing, without_image, name, updates=False)
     fusing.next_image()
-    every = [*experts.every, replace(expert, weight=WITHOUT_IMAGE, frame=None)]
-    # It helps nothing if the grey one does as well.
-    if (of_linear + split.gain(at, expert.at)) / 2 >= NO_GAIN:
+    every = [*experts.every, replace(blind, weight=WITHOUT_IMAGE, frame=None)]
+    # The image helps if it beats interpolation and the grey image, in the mean of both gains.
+    gain_over_grey = split.gain(with_image, blind.at_validation)
+    if (gain_over_linear + gain_over_grey) / 2 >= NO_GAIN:
         return experts._replace(every=every)
-    without = min(split.error(interpolated), split.error(expert.at))
+    least_error = min(split.error(interpolated), split.error(blind.at_validation))
     warning = (
         f"warning: the image does not lower the error: at {count:,} validation points it is"
-        f" {split.error(at):.4f} with the image and {without:.4f} without it; check"
+        f" {split.error(with_image):.4f} with the image and {least_error:.4f} without it; check"
         " the registration"
     )
     return experts._replace(every=every, warnings=(warning,))
 
 
 def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, float]) -> Experts:
-    """Returns the experts; of few points, those of the network that takes a prior see two frames.
+    """Returns the experts, those of `fusing` with their depth of the mirrored frame, too.
 
-    The second is the mirrored frame. An expert without weight does not need it.
+    That is so with fewer than `MIRRORED_BELOW` points. An expert without weight does not need it.
+
+    Args:
+        fusing: The network that takes a prior, open.
+        experts: The experts.
+        weights: Their weights in the fused depth, by name.
     """
     fusing.next_image()  # all these experts share what is computed for the mirrored image
     every: list[Expert] = []
@@ -397,18 +485,19 @@ def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, f
 
 
 def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
-    """Returns the weighted geometric mean (…) of depths (…) in metres; 0 is unknown.
+    """Returns the weighted geometric mean of depths, metres, of their shape; 0 is unknown.
 
     Args:
-        depths: Depths of one shape and their weights. A depth has no weight where it is unknown.
+        depths: Depths in metres, all of one shape, and their weights, of which one is above 0. A
+            depth has no weight where it is unknown (0).
     """
-    depths = [(depth, weight) for depth, weight in depths if weight > 0]
-    if len(depths) == 1:
-        return depths[0][0]
-    logarithm = torch.zeros_like(depths[0][0])
+    weighted = [(depth, weight) for depth, weight in depths if weight > 0]
+    if len(weighted) == 1:
+        return weighted[0][0]
+    logarithm = torch.zeros_like(weighted[0][0])
     total = torch.zeros_like(logarithm)
-    for depth, weight in depths:
-        known = (depth > 0) * weight
-        logarithm += known * depth.clamp_min(torch.finfo(depth.dtype).tiny).log()
-        total += known
+    for depth, weight in weighted:
+        weight_if_known = (depth > 0) * weight
+        logarithm += weight_if_known * depth.clamp_min(torch.finfo(depth.dtype).tiny).log()
+        total += weight_if_known
     return torch.where(total > 0, (logarithm / total.clamp_min(1e-6)).exp(), 0.0)

@@ -29,7 +29,7 @@ from pnpdepth_cli.settings import ClosedSettings, Settings
 
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
-"""What the user says of the registration: "auto", "off", or zoom, right and down in pixels."""
+"""What the user says of the registration: "auto", "off", or zoom, and pixels right and down."""
 Register = ImageRegistration | Literal["auto"] | None
 """How an image is to be moved to its points. "auto": as the points say."""
 AnyFrame = TypeVar("AnyFrame", bound="Frame")
@@ -77,7 +77,7 @@ class Frame:
 
     @functools.cached_property
     def evidence_of_registration(self) -> Evidence | None:
-        """What the points tell of the registration; None where they tell nothing."""
+        """What image and points tell of the registration; None where they tell nothing."""
         image = self.image
         return None if image is None else evidence(image, self.points)
 
@@ -87,14 +87,16 @@ class Frame:
         return estimate_registration([self.evidence_of_registration])
 
     def registered(self: AnyFrame) -> AnyFrame:
-        """Returns the frame with its image moved to the points, if it has to be."""
+        """Returns the frame with its image moved to the points; itself if that is not to be done.
+
+        Depth maps of networks move with the image, and the points stay.
+        """
         image = self.image
         if image is None or self.register is None:
             return self
         registration = self._registration_of_points if self.register == "auto" else self.register
         if registration is None:
             return replace(self, register=None)
-        # Depth maps of networks belong to the image, so they are moved with it.
         predicted = [
             torch.from_numpy(registration.apply_to(depth_map.numpy()))
             for depth_map in self.predicted
@@ -108,17 +110,27 @@ class Frame:
         )
 
     def mirrored(self) -> Frame:
-        """Returns the frame with left and right of image, points and prior exchanged."""
+        """Returns the frame with left and right of image, points and prior exchanged.
+
+        The outliers and the camera are mirrored with them. Depth maps in `predicted` are not: a
+        network that takes a prior, which alone sees mirrored frames, does not take them.
+        """
+        _, width = self.size
         return replace(
             self,
             rgb=None if self.rgb is None else self.rgb.flip(-1),
             points=self.points.mirrored(),
             outliers=None if self.outliers is None else self.outliers.mirrored(),
             prior=None if self.prior is None else self.prior.flip(-1),
+            camera=None if self.camera is None else self.camera.mirrored(width),
         )
 
     def without(self, outliers: Tensor) -> Frame:
-        """Returns the frame with some of its points, (N,) bool, moved to its outliers."""
+        """Returns the frame with some of its points moved from `points` to `outliers`.
+
+        Args:
+            outliers: (N,) bool, which of the frame's N points are moved.
+        """
         if not bool(outliers.any()):
             return self
         left_out = self.points.select(outliers)
@@ -149,7 +161,7 @@ class Saver(Protocol):
     """What writes a refined frame; made above this package, which knows no files."""
 
     def __call__(self, refined: Refined, path: Path, *, overwrite: bool) -> None:
-        """Writes the frame."""
+        """Writes the frame's depth to a file, and its record beside that; see `Refined.save`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,13 +263,16 @@ class ValidationPoints:
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self.points):,} points)"
 
-    def error(self, at: Tensor) -> float:
-        """Returns the weighted mean absolute error in metres of a prediction (M,).
+    def error(self, predicted: Tensor) -> float:
+        """Returns the weighted mean absolute error in metres of a prediction of the points.
 
         A point without prediction counts as far off as a depth of 0 is.
+
+        Args:
+            predicted: (M,) metres, 0 = unknown: depth of each validation point.
         """
-        error = (at - self.points.depth).abs()
-        return float((error * self.weights).sum() / self.weights.sum())
+        errors = (predicted - self.points.depth).abs()
+        return float((errors * self.weights).sum() / self.weights.sum())
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -271,7 +286,13 @@ class Validation(ValidationPoints):
 
 
 def registration_to_make(registration: Registration, settings: Settings) -> Register:
-    """Returns how images are to be moved. The paper's method moves none unless numbers are given.
+    """Returns how images are to be moved to their points; None if they are not.
+
+    The paper's method moves none unless numbers are given.
+
+    Args:
+        registration: What the user says.
+        settings: The settings, which say whether the method is the paper's.
 
     Raises:
         UsageError: There is no such registration.
@@ -287,7 +308,7 @@ def registration_to_make(registration: Registration, settings: Settings) -> Regi
 
 
 def tensor_of(image: NDArray[np.float32]) -> Tensor:
-    """Returns an image (H, W, 3) as a tensor (3, H, W)."""
+    """Returns an image (H, W, 3) as a tensor (3, H, W) of the same values."""
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
 
 

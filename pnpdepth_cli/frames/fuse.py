@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pnpdepth_cli.camera import Floats
 from pnpdepth_cli.completion.residual_field import ResidualField
-from pnpdepth_cli.frames.experts import Expert, Experts, weighted_mean
+from pnpdepth_cli.frames.experts import LEAST_ERROR, Expert, Experts, weighted_mean
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.validation import ValidatedFrame, log_of
 
@@ -30,90 +31,115 @@ ALL_ON_LINES = 1.5
 least weight. Simulated networks of 4 and 9 % error have 0.4 to 1.55, FastDepth 1.9 to 2.5."""
 NONE_ON_LINES = 2.0
 """The same quotient, from which on it has no least weight."""
-LEAST_ERROR = 1e-9
-"""Metres; errors at validation points are at least this before they are divided by."""
-
 
 # Of the fit of the weights.
 _PASSES = 5  # of iteratively reweighted least squares
 _STD_OF_MEAN = 1.25  # standard deviation over the mean size of normal errors
 _LEAST_STD = 1e-3  # of log depth, from which on a residual counts less
+_LEAST_SIZE = 1e-9  # of a residual of log depth before it is divided by
 _SUM_WEIGHT = 1e4  # of the row by which the weights add up to 1
 
 
 def fit_weights(
     experts: Sequence[Expert], split: ValidatedFrame, chosen: Tensor | None = None
 ) -> dict[str, float]:
-    """Returns the weights of the experts by name, >= 0, their sum 1.
+    """Returns the weights of the experts in the fused depth by name, >= 0, their sum 1.
 
     They minimise the residuals of log depth at the validation points by Huber's loss, plus
     `STRENGTH` times the squared distance from the prior weights. An expert without prior weight has
     none. Where an expert predicts nothing, the others' mean stands for it.
 
     Args:
-        experts: The experts.
+        experts: The experts, of which one has a prior weight.
         split: The frame and its validation points.
         chosen: (M,) bool, the validation points to fit. None: all.
     """
-    having = [expert for expert in experts if expert.weight > 0]
-    prior = np.array([expert.weight for expert in having])
+    weighted = [expert for expert in experts if expert.weight > 0]
+    prior = np.array([expert.weight for expert in weighted])
     prior = prior / prior.sum()
     fitted = prior
-    points = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
-    if len(having) > 1 and bool(points.any()):
-        from scipy.optimize import nnls
-
+    is_chosen = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
+    if len(weighted) > 1 and bool(is_chosen.any()):
         # Log predictions and log depths, relative to the prediction with the prior weights.
-        at = torch.stack([expert.at for expert in having], dim=1)[points].double()
-        mean = weighted_mean([(at[:, k], float(w)) for k, w in enumerate(prior)])
+        of_experts = [expert.at_validation[is_chosen].double() for expert in weighted]
+        mean = weighted_mean(list(zip(of_experts, prior.tolist(), strict=True)))
         centre = log_of(mean)
-        offsets = torch.where(at > 0, log_of(at) - centre[:, None], 0.0).numpy()
-        residual = (log_of(split.points.depth.double()[points]) - centre).numpy()
-        shares = split.weights[points].double().numpy()
-        # Each pass weighs large residuals down, and solves for weights >= 0 whose sum is 1.
-        scale = max(_STD_OF_MEAN * float(np.average(np.abs(residual), weights=shares)), _LEAST_STD)
-        ridge = np.sqrt(STRENGTH) * scale
-        sum_of_one = np.full((1, len(prior)), _SUM_WEIGHT)
-        for _ in range(_PASSES):
-            size = np.abs(residual - offsets @ fitted)
-            root = np.sqrt(shares * np.minimum(1, scale / np.maximum(size, 1e-9)))
-            system = [offsets * root[:, None], ridge * np.eye(len(prior)), sum_of_one]
-            right = [residual * root, ridge * prior, [_SUM_WEIGHT]]
-            fitted, _ = nnls(np.concatenate(system), np.concatenate(right))
-            fitted /= fitted.sum()
+        predicted = torch.stack(of_experts, dim=1)
+        offsets = torch.where(predicted > 0, log_of(predicted) - centre[:, None], 0.0)
+        residual = log_of(split.points.depth.double()[is_chosen]) - centre
+        counts = split.weights[is_chosen].double()
+        fitted = _fit(prior, offsets.numpy(), residual.numpy(), counts.numpy())
     # An expert without prior weight has none.
     weights = {expert.name: 0.0 for expert in experts}
-    for expert, weight in zip(having, fitted, strict=True):
+    for expert, weight in zip(weighted, fitted, strict=True):
         weights[expert.name] = float(weight)
     return weights
 
 
+def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Floats:
+    """Weights (E,) of E experts, >= 0, their sum 1, that fit the experts' depths to the points.
+
+    `offsets @ weights` is close to `residual` by Huber's loss, and the weights are close to the
+    prior weights. It is solved by iteratively reweighted least squares.
+
+    Args:
+        prior: (E,) prior weights, all above 0, their sum 1.
+        offsets: (M, E) log depth of each expert at each of M points, less a mean of the experts'.
+        residual: (M,) measured log depth at the points, less the same mean.
+        counts: (M,) how much each point counts.
+    """
+    from scipy.optimize import nnls
+
+    # The residual from which on Huber's loss is linear: their standard deviation.
+    mean_size = float(np.average(np.abs(residual), weights=counts))
+    scale = max(_STD_OF_MEAN * mean_size, _LEAST_STD)
+    # The factor of the rows of the prior weights, so that they count as `STRENGTH` such residuals.
+    ridge = np.sqrt(STRENGTH) * scale
+    sum_of_weights = np.full((1, len(prior)), _SUM_WEIGHT)
+    fitted = prior
+    for _ in range(_PASSES):
+        # Large residuals are weighed down.
+        size = np.abs(residual - offsets @ fitted)
+        root = np.sqrt(counts * np.minimum(1, scale / np.maximum(size, _LEAST_SIZE)))
+        # Rows of the least squares: the points, the prior weights, and the sum of 1.
+        rows = [offsets * root[:, None], ridge * np.eye(len(prior)), sum_of_weights]
+        targets = [residual * root, ridge * prior, [_SUM_WEIGHT]]
+        fitted, _ = nnls(np.concatenate(rows), np.concatenate(targets))
+        fitted /= fitted.sum()
+    return fitted
+
+
 class Share(NamedTuple):
-    """A part of the result that one network has by itself, beside the fused depth."""
+    """The part of the result that one network has by itself, beside the fused depth."""
 
     name: str
-    part: float
+    weight: float
     """0…1, its weight in the result."""
     dense: Tensor
-    """(H, W) metres: its depth."""
-    at: Tensor
-    """(M,) metres: its depth at the validation points, from the others."""
+    """(H, W) metres, 0 = unknown: its depth."""
+    at_validation: Tensor
+    """(M,) metres, 0 = unknown: its depth at the M validation points, from the other points."""
 
 
 def with_shares(fused: Tensor, shares: Sequence[tuple[Tensor, float]]) -> Tensor:
-    """Returns the fused depth (…) with the depths (…) of single networks, by their parts."""
-    rest = 1 - sum(weight for _, weight in shares)
-    return weighted_mean([(fused, rest), *shares])
+    """Returns the weighted geometric mean of the fused depth and depths of single networks.
+
+    Args:
+        fused: Depth in metres, 0 = unknown, of any shape. It has the weight that the others leave.
+        shares: Depths of that shape, and their weights, whose sum is at most 1.
+    """
+    left = 1 - sum(weight for _, weight in shares)
+    return weighted_mean([(fused, left), *shares])
 
 
 def shares_on_lines(
     experts: Experts, split: ValidatedFrame, inliers: Frame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """Returns the parts that single networks have in a frame of scan lines.
+    """Returns the shares of single networks in the result of a frame of scan lines.
 
     Its validation points are whole lines beside others, where `compact` and interpolation are best.
     So they do not show what a completion network of that scanner is worth, nor an image network
-    between the lines.
+    between the lines. There are none without validation points.
 
     Args:
         experts: The experts.
@@ -132,16 +158,21 @@ def shares_on_lines(
 def _shares_of_scanner(
     experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The parts of completion networks of the scanner.
+    """The shares of the user's completion networks; none if there is no such network that fits.
 
-    A network has one if its error at the points, which it was given, is at most the error of the
-    experts' mean at the validation points.
+    A network fits if its error at the points, which it was given, is at most the error of the
+    experts' mean at the validation points, which they were not given.
+
+    Args:
+        experts: The experts.
+        split: The frame and its validation points.
+        weights: The weights in the fused depth, by name.
     """
     of_scanner = [expert for expert in experts if expert.of_scanner]
     if not of_scanner:
         return []
     # Those that fit the points that they were given.
-    mean = weighted_mean([(expert.at, weights[expert.name]) for expert in experts])
+    mean = weighted_mean([(expert.at_validation, weights[expert.name]) for expert in experts])
     limit = split.error(mean)
     points = split.whole.points
     fitting = [
@@ -149,29 +180,40 @@ def _shares_of_scanner(
         for expert in of_scanner
         if (points.sample(expert.dense) - points.depth).abs().mean() <= limit
     ]
-    # They share the weight.
-    part = OWN_SCANNER / max(len(fitting), 1)
-    return [Share(expert.name, part, expert.dense, expert.updated) for expert in fitting]
+    # They share the weight equally.
+    weight = OWN_SCANNER / max(len(fitting), 1)
+    return [
+        Share(expert.name, weight, expert.dense, expert.updated_at_validation) for expert in fitting
+    ]
 
 
 def _share_of_image(
     experts: Experts, split: ValidatedFrame, inliers: Frame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The part of the user's image network, its aligned depth propagated; none if it has enough."""
-    own = experts.own
+    """The share of the user's first network, its aligned depth propagated; none if it has enough.
+
+    There is none either if it takes points, or if no other network is fused with it.
+
+    Args:
+        experts: The experts.
+        split: The frame and its validation points.
+        inliers: The frame without its outliers.
+        weights: The weights in the fused depth, by name.
+    """
+    first = experts.own
     alone = experts.alone
-    if alone is None or own.user is None or own.user.takes_points:
+    if alone is None or first.user is None or first.user.takes_points:
         return []
     # Its error at the validation points, beside that of `compact`, says how much it may have.
     kept = split.kept
-    field = ResidualField(own.kept.aligned, kept.points, kept.rgb)
-    at = field.depth(split.points.xy, kind=split.propagation)
-    ratio = split.error(at) / max(split.error(alone.at), LEAST_ERROR)
-    trusted = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
-    least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, trusted))
+    field = ResidualField(first.kept.aligned, kept.points, kept.rgb)
+    predicted = field.depth(split.points.xy, kind=split.propagation)
+    ratio = split.error(predicted) / max(split.error(alone.at_validation), LEAST_ERROR)
+    fraction = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
+    least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, fraction))
     # What it has already in the fused depth counts.
-    part = least_weight - weights[own.name]
-    if part <= 0:
+    missing = least_weight - weights[first.name]
+    if missing <= 0:
         return []
-    whole = ResidualField(own.whole.aligned, inliers.points, inliers.rgb)
-    return [Share(own.name, part, whole.depth(kind=split.propagation), at)]
+    whole = ResidualField(first.whole.aligned, inliers.points, inliers.rgb)
+    return [Share(first.name, missing, whole.depth(kind=split.propagation), predicted)]

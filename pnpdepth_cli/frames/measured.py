@@ -19,40 +19,40 @@ MAP = 0.5
 
 
 def with_measured(refined: Refined) -> Refined:
-    """Returns a refined frame that has the points' own depth at their pixels.
+    """Returns a refined frame with the measured depth itself at the pixels of its points.
 
-    A note counts the pixels, and the points between pixels, which are not kept. Of several points
-    at a pixel the nearest counts. Outliers are no points of the result and are not kept.
+    A note counts these pixels, and the points between pixels, whose depth is not kept. Of several
+    points at a pixel the nearest counts. The depth of outliers is not kept: they are not in `used`.
 
     Raises:
         UsageError: All points lie between pixels.
     """
     points = refined.used
-    whole = _at_whole_pixels(points)
-    if not bool(whole.any()):
+    is_at_pixel = _at_whole_pixels(points)
+    if not bool(is_at_pixel.any()):
         raise UsageError(
             f"`keep_measured`: all {len(points):,} points lie between pixels; it takes a depth map"
             " of the image's size, or points at whole pixels"
         )
-    measured = points.where(whole).scatter()[0, 0].numpy()
+    measured = points.where(is_at_pixel).scatter()[0, 0].numpy()
     depth = np.where(measured > 0, measured, refined.depth)
     note = f"measured pixels: {int((measured > 0).sum()):,} have the depth of their points"
-    between = len(points) - int(whole.sum())
+    between = len(points) - int(is_at_pixel.sum())
     if between:
         note += f"; {between:,} of {len(points):,} points lie between pixels, and are not kept"
     return replace(refined, depth=depth, notes=(*refined.notes, note))
 
 
 def with_note_on_measured(refined: Refined) -> Refined:
-    """Returns a refined frame of a depth map with a note on the measured pixels that are changed.
+    """Returns a refined frame with a note on its measured pixels whose depth differs, if any does.
 
-    Other frames, and those without such a pixel, have none.
+    A pixel differs from `CHANGED_M` on. Only a frame whose points are a depth map has a note.
     """
     points = refined.used
     height, width = points.size
     points = points.where(_at_whole_pixels(points))
     if len(points) < MAP * height * width:
-        return refined
+        return refined  # its points are no depth map
     change = (points.sample(torch.from_numpy(refined.depth)) - points.depth).abs()
     count = int((change > CHANGED_M).sum())
     if not count:

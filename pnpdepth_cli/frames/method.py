@@ -30,12 +30,12 @@ _TRIED = 3  # after so many frames that tell nothing of the registration, no mor
 
 
 def check_combination(asked: Settings, networks: int, maps: int = 0) -> None:
-    """Checks that settings of z come with a network, and the paper's method with one.
+    """Checks that settings of z come with a network, and the paper's method with only one.
 
     Args:
         asked: Settings that the user gives.
-        networks: How many networks there are.
-        maps: How many depth maps there are besides.
+        networks: Number of networks.
+        maps: Number of depth maps besides, which take the place of networks.
 
     Raises:
         UsageError: They do not.
@@ -60,6 +60,7 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
         asked: Settings that the user gives.
         validated: Whether the paper's method is validated, for which each frame is refined again.
     """
+    # Who states 0 updates knows that settings of updates are not used.
     unused = tuple(asked.of_updates) if asked.iterations != 0 else ()
     if not asked.is_paper:
         return Pipeline(propagation=asked.propagate, unused=unused)
@@ -67,15 +68,20 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
         leaves_outliers_out=False,
         validates=validated,
         fuses=False,
-        propagation=asked.propagate or PAPER.propagate,
+        propagation=PAPER.propagate if asked.propagate is None else asked.propagate,
         unused=unused,
     )
 
 
 def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
-    """The networks, joined by as many depth maps.
+    """The networks, joined by stand-ins for the depth maps of a frame.
 
-    The included network refines a map; any other one is refined first, and a map is one more.
+    With the included network, which takes a prior, the maps are the user's networks and come first.
+    Any other network is the user's first, and the maps follow.
+
+    Args:
+        networks: The networks.
+        count: Number of depth maps of each frame.
     """
     maps = [stored_map(number, count) for number in range(count)]
     if count and networks[0].definition.takes_prior:
@@ -84,7 +90,7 @@ def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
 
 
 def _used(member: OpenNetwork) -> UsedNetwork:
-    """What a result keeps of a network."""
+    """What a result keeps of a network: its name, layer, settings, input and output."""
     definition = member.network.definition
     return UsedNetwork(
         name=member.name,
@@ -149,14 +155,14 @@ class Method:
         # joins, unless it is the user's.
         if self._maps and (asked.method == "alone" or first.rgb is None):
             resolved = [network for network in resolved if not network.definition.takes_prior]
-        named = {network.definition.name for network in resolved}
-        if asked.method == "fused" and first.rgb is not None and COMPANION not in named:
+        names = {network.definition.name for network in resolved}
+        if asked.method == "fused" and first.rgb is not None and COMPANION not in names:
             companion = load_network(COMPANION, None, str(resolved[0].device))
             resolved.append(resolve_definition(companion, first))
         # Layers and settings are decided.
-        own, *others = resolved
+        first_network, *others = resolved
         self.members = (
-            resolve_member(own, first, asked),
+            resolve_member(first_network, first, asked),
             *(resolve_member(network, first, Settings()) for network in others),
         )
 
@@ -170,14 +176,14 @@ class Method:
 
     @property
     def own(self) -> OpenNetwork:
-        """The user's network."""
+        """The user's first network."""
         return self.members[0]
 
     def refine(self, frame: Frame, *, with_stages: bool = False) -> Refined:
         """Returns one frame refined, the same whatever was refined before.
 
         Args:
-            frame: The frame.
+            frame: The frame, with as many depth maps as the first one.
             with_stages: Whether the depth after each step is returned, too.
 
         Raises:
@@ -210,17 +216,20 @@ class Method:
         return with_uncertainty(refined, of_matches=frame.of_matches)
 
     def share_registration(self, frames: Iterable[Frame]) -> None:
-        """Decides the registration that images of one size share, by all these frames together.
+        """Decides by some frames together how all images of one size are moved to their points.
 
         The size is that of the first image that tells it. A frame of another size decides alone.
+
+        Args:
+            frames: Frames of a sequence, read as they are needed.
         """
-        usable: list[Evidence] = []
-        for read, frame in enumerate(frames, 1):
+        evidences: list[Evidence] = []
+        for number, frame in enumerate(frames, 1):
             if frame.register == "auto":
-                of_frame = frame.evidence_of_registration
-                if of_frame is not None:
-                    usable.append(of_frame)
-            if read == _TRIED and not usable:  # such as scans, none of which will tell
+                evidence = frame.evidence_of_registration
+                if evidence is not None:
+                    evidences.append(evidence)
+            if number == _TRIED and not evidences:  # such as scans, none of which will tell
                 break
-        if usable:
-            self.registrations = {usable[0].size: estimate_registration(usable)}
+        if evidences:
+            self.registrations = {evidences[0].size: estimate_registration(evidences)}

@@ -7,9 +7,10 @@ definition names. `prepare` makes a frame the network's input.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -48,12 +49,13 @@ class PreparedFrame:
     points: SparsePoints
     """The points that the network sees, in its pixels and on its device, without outliers."""
     arguments_for: Callable[[SparsePoints], tuple[Tensor, ...]]
-    """Gives the arguments for some of the points; all else is the same."""
+    """Function that returns the arguments for other points in the network's pixels; all else is the
+    same."""
 
     def to_image(self, depth: Tensor) -> Tensor:
-        """Returns depth (1, 1, h, w) of the network's pixels as (H, W) of the image.
+        """Returns a depth (1, 1, h, w) of the network's pixels as (H, W) of the image, on the CPU.
 
-        0 where it is unknown.
+        Both are in metres. The result is 0 where depth is not finite, not above 0, or not seen.
         """
         image = self.map.depth_to_image(depth).cpu()
         return torch.where(image.isfinite() & (image > 0), image, 0.0).float()
@@ -62,9 +64,10 @@ class PreparedFrame:
 class OpenNetwork:
     """A network of the method, with nothing left open, as a context manager.
 
-    It is cut when z is first updated, and stays open from frame to frame.
+    It is cut when z is first updated, and stays cut from frame to frame.
 
     Args:
+        network: The network, its definition with nothing left open.
         layer: Layer to cut at.
         settings: How its output is aligned and z is updated.
         coarse: Whether z is updated by a smaller depth, which is faster, if the definition gives
@@ -85,8 +88,11 @@ class OpenNetwork:
         tuned: bool = False,
     ) -> None:
         definition = network.definition
-        self.network, self.layer, self.settings = network, layer, settings
-        self.name, self.weighs_points = definition.name, definition.weighs_points
+        self.network = network
+        self.layer = layer
+        self.settings = settings
+        self.name = definition.name
+        self.weighs_points = definition.weighs_points
         self.takes_points = "sparse" in definition.input_kind
         self.takes_prior = definition.takes_prior
         self.always_updated = always_updated
@@ -96,8 +102,8 @@ class OpenNetwork:
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None
-        self._output: object = None  # for z_0
-        self._encoded: dict[str, object] = {}
+        self._output: object = None  # what the network returns for z_0
+        self._encoded: dict[str, object] = {}  # output of the image encoder by its name
 
     def __enter__(self) -> OpenNetwork:
         self._open.enter_context(encoding_once(self.network, self._encoded))
@@ -127,13 +133,14 @@ class OpenNetwork:
     def is_updated(self, frame: Frame) -> bool:
         """Returns whether z is updated in this frame.
 
-        That is wherever it gains anything, or where the user states the number of updates. With a
-        LiDAR's points, updates of a network that takes them gain 1 % and take as long as all else.
+        That is wherever it gains anything, or where the user states the number of updates.
         """
         if not self.settings.iterations:
             return False
         if self.always_updated or not self.takes_points:
             return True
+        # Of a network that takes the points, few points gain nothing. With a LiDAR's points updates
+        # gain 1 % and take as long as all else.
         fewest = MIRRORED_BELOW if self.takes_prior else FEW_POINTS
         return len(frame.points) >= fewest and not is_dense(frame.points)
 
@@ -147,59 +154,69 @@ class OpenNetwork:
         Raises:
             PnpDepthError: The refinement fails.
         """
-        network = self.network
-        settings = self.settings
         diverged = None
-        with out_of_memory_is_a_device_error(network.device):
+        with out_of_memory_is_a_device_error(self.network.device):
             # The frame is made the network's input, and its output is read as metres.
-            prepared = prepare(network, frame)
-            if not len(prepared.points):
-                top, left, height, width = prepared.map.crop
-                raise NoPointsError(
-                    f"none of the {len(frame.points)} sparse points lies in rows {top} to"
-                    f" {top + height - 1} and columns {left} to {left + width - 1}, which is what"
-                    f" network {self.name!r} sees of the image; use another network, or crop the"
-                    " image"
-                )
-            reader = AlignedDepth(network, prepared.points, settings.align)
+            prepared = prepare(self.network, frame)
+            self._check_seen(prepared, frame)
+            reader = AlignedDepth(self.network, prepared.points, self.settings.align)
             try:
-                # Without updates one pass of the whole network is enough.
-                if not (updates and self.is_updated(frame)):
-                    result = self._plain(prepared, reader)
-                else:
-                    # z is updated; the first and the last depth have full size.
+                if updates and self.is_updated(frame):
                     z0 = self._front(prepared)
-                    coarse = None if self._coarse is None else self._coarse(network.module)
-                    with coarse or nullcontext([]) as at_full_size:
-                        result = refine(
-                            self.cut(), prepared.arguments, prepared.points, settings,
-                            depth_of=reader, z0=z0,
-                        )  # fmt: skip
-                    if at_full_size:
-                        before = reader(at_full_size[0])
-                        after = reader(at_full_size[-1])
-                        result = replace(result, before=before, after=after)
+                    with self._smaller_depth() as full_outputs:
+                        refinement = refine(
+                            self.cut(),
+                            prepared.arguments,
+                            prepared.points,
+                            self.settings,
+                            depth_of=reader,
+                            z0=z0,
+                        )
+                    refinement = _at_full_size(refinement, full_outputs, reader)
+                else:
+                    # One pass of the whole network is enough.
+                    refinement = self._plain(prepared, reader)
             except DivergedError as error:
-                # A refinement that diverges ends with its last good depth.
+                # A refinement that diverges ends with its last good depth, if it has one.
                 if error.last_good is None:
                     raise
                 diverged = error
-                result = error.last_good
-        aligned = updated = prepared.to_image(result.before)
-        if result.after is not result.before:
-            updated = prepared.to_image(result.after)
+                refinement = error.last_good
+        aligned = prepared.to_image(refinement.before)
+        updated = aligned
+        if refinement.after is not refinement.before:
+            updated = prepared.to_image(refinement.after)
         return Prediction(
             aligned=aligned,
             updated=updated,
-            losses=result.losses,
-            step=result.step,
+            losses=refinement.losses,
+            step=refinement.step,
             diverged=diverged,
             alignment=reader.alignment,
             notes=reader.notes,
         )
 
+    def _check_seen(self, prepared: PreparedFrame, frame: Frame) -> None:
+        """Raises NoPointsError if none of the frame's points lies where the network looks.
+
+        Args:
+            prepared: The frame as the network takes it.
+            frame: The frame.
+        """
+        if not len(prepared.points):
+            top, left, height, width = prepared.map.crop
+            raise NoPointsError(
+                f"none of the {len(frame.points)} sparse points lies in rows {top} to"
+                f" {top + height - 1} and columns {left} to {left + width - 1}, which is what"
+                f" network {self.name!r} sees of the image; use another network, or crop the"
+                " image"
+            )
+
     def _front(self, prepared: PreparedFrame) -> Tensor:
-        """z_0. It is the same for all points if the network takes the image alone."""
+        """z_0, the output of the cut layer for a frame.
+
+        It is the same for all points if the network takes the image alone, and is kept then.
+        """
         z0 = self._z0
         if z0 is None:
             with torch.no_grad():
@@ -208,11 +225,14 @@ class OpenNetwork:
         return z0
 
     def _output_for(self, prepared: PreparedFrame) -> object:
-        """The network's output for z_0. It is the same for all points, as `_front` is."""
+        """What the network returns for a frame without updates of z.
+
+        It is the same for all points if the network takes the image alone, and is kept then.
+        """
         output = self._output
         may_be_updated = self._of_image_only and self.settings.iterations > 0
         if output is None and may_be_updated and self._coarse is None:
-            # Updates may follow, from the same front.
+            # Updates may follow from the same z_0. (Those of a smaller depth need their own pass.)
             output = self.cut().rear(self._front(prepared))
         elif output is None:
             # A network whose z is never updated need not be cut.
@@ -222,17 +242,57 @@ class OpenNetwork:
         return output
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
-        """The depth without updates, of one pass of the network."""
+        """The depth of one pass of the network, without updates of z, and its loss at the points.
+
+        Args:
+            prepared: The frame as the network takes it.
+            reader: Reads the network's output as metres.
+        """
         with torch.no_grad():
             depth = reader(self._output_for(prepared)).detach()
         at_points = prepared.points.sample(depth)
-        known = at_points.isfinite()
-        loss = checked_loss(self.settings.loss)(at_points[known], prepared.points.depth[known])
+        is_known = at_points.isfinite()
+        loss_of = checked_loss(self.settings.loss)
+        loss = loss_of(at_points[is_known], prepared.points.depth[is_known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
+
+    def _smaller_depth(self) -> AbstractContextManager[list[Any]]:
+        """Returns a context in which the network gives the smaller depth of its definition.
+
+        Its list gets the full depth of the first forward, and of each without gradients. It stays
+        empty where the definition gives no smaller depth, or another layer is cut.
+        """
+        if self._coarse is None:
+            return nullcontext([])
+        return self._coarse(self.network.module)
+
+
+def _at_full_size(
+    refinement: Refinement, full_outputs: Sequence[object], reader: AlignedDepth
+) -> Refinement:
+    """A refinement by a smaller depth, with the full depth before and after the updates of z.
+
+    Args:
+        refinement: The refinement by the smaller depth.
+        full_outputs: What the network returned for the full depth, the first for z_0 and the last
+            for the updated z. Empty if the depth of the refinement has full size.
+        reader: Reads the network's output as metres.
+    """
+    if not full_outputs:
+        return refinement
+    before = reader(full_outputs[0])
+    after = reader(full_outputs[-1])
+    return replace(refinement, before=before, after=after)
 
 
 def prepare(network: Network, frame: Frame) -> PreparedFrame:
-    """Returns the frame as the network takes it; `points` may be empty.
+    """Returns the frame as the network takes it: resized, its points in the network's pixels.
+
+    The points may be none, if all lie outside what the network sees.
+
+    Args:
+        network: The network, whose definition says what it takes.
+        frame: The frame.
 
     Raises:
         UsageError: The network needs an image or intrinsics, and the frame has none.
@@ -247,27 +307,34 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
 
     def arguments_for(points: SparsePoints) -> tuple[Tensor, ...]:
+        """The network's arguments for points in its pixels; for a stored depth map, that map."""
         if network.definition.input_kind == "map":
             return (frame.predicted[network.definition.map_number][None, None],)
         return network.arguments_of(image, points, prior, intrinsics)
 
-    points = given = to_network.points_to_network(frame.points)
+    # A network that weighs its points takes the outliers, too.
+    inliers = to_network.points_to_network(frame.points)
+    taken = inliers
     if frame.outliers is not None and network.definition.weighs_points:
-        given = points.joined(to_network.points_to_network(frame.outliers))
+        taken = inliers.joined(to_network.points_to_network(frame.outliers))
     return PreparedFrame(
         map=to_network,
-        arguments=arguments_for(given),
-        points=points.tensors(network.device),
+        arguments=arguments_for(taken),
+        points=inliers.tensors(network.device),
         arguments_for=arguments_for,
     )
 
 
 @contextmanager
 def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None]:
-    """Inside, the image encoder runs once, if the definition names one; its output is kept.
+    """Inside, the network's image encoder runs once for an image, and its output is used again.
+
+    That is so if the definition names an encoder.
 
     Args:
-        encoded: Kept outputs by the encoder's name; the caller clears them for another image.
+        network: The network.
+        encoded: Output of the encoder by its name, which this fills; the caller clears it for
+            another image.
     """
     name = network.definition.image_encoder
     if name is None:
@@ -275,6 +342,7 @@ def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None
         return
 
     def encode(_module: nn.Module, _inputs: object, run: Run) -> object:
+        """What the encoder gives, in place of its own forward."""
         if name not in encoded:
             encoded[name] = run()
         return encoded[name]

@@ -31,7 +31,7 @@ from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, w
 from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
 LEAST_PART = 0.01
-"""A network with less weight has no part in the result, which is said."""
+"""A network whose experts have less weight together has no part in the result; a note says so."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,9 @@ class Pipeline:
     """Which steps a method has, besides the network's own."""
 
     leaves_outliers_out: bool = True
+    """Whether points that contradict the others are left out."""
     validates: bool = True
+    """Whether a fifth of the points are validation points, which are predicted from the others."""
     fuses: bool = True
     """Whether a network that takes a prior is fused with the others, where there is one."""
     propagation: str | None = None
@@ -56,11 +58,11 @@ def refine_frame(
     seed: int = 0,
     with_stages: bool = False,
 ) -> Refined:
-    """Returns the frame refined.
+    """Returns the frame refined by the steps of a method.
 
     Args:
         networks: The networks, open, the user's first.
-        frame: The frame, its image moved to its points.
+        frame: The frame, its image moved to its points already.
         pipeline: The steps of the method.
         seed: Random seed of the validation points.
         with_stages: Whether the depth after each step is returned, too.
@@ -71,7 +73,7 @@ def refine_frame(
     for network in networks:
         network.next_image()
     # Points that contradict their neighbours are outliers. The network that weighs its points
-    # judges, else the user's: a useless network does not decide which points are used.
+    # tells them, else the user's: a useless network does not decide which points are used.
     judge = next((network for network in networks if network.weighs_points), networks[0])
     if pipeline.leaves_outliers_out:
         judged = without_outliers(judge, frame, networks)
@@ -94,8 +96,8 @@ def refine_frame(
     weights = fit_weights(experts.every, split)
     if fusing is not None:
         experts = with_mirrored(fusing, experts, weights)
-    having = [expert for expert in experts.every if weights[expert.name] > 0]
-    fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in having])
+    weighted = [expert for expert in experts.every if weights[expert.name] > 0]
+    fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in weighted])
     # Points far from the depth of a network that weighs them are outliers, too.
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
         inliers = inliers.without(far_points(judged.prediction.aligned, inliers.points))
@@ -106,7 +108,7 @@ def refine_frame(
     shares: list[Share] = []
     if pipeline.fuses and split.has_scan_lines:
         shares = shares_on_lines(experts, split, inliers, weights)
-        depth = with_shares(propagated, [(share.dense, share.part) for share in shares])
+        depth = with_shares(propagated, [(share.dense, share.weight) for share in shares])
     steps = Steps(
         judged=judged.field,
         fused=fused,
@@ -115,85 +117,87 @@ def refine_frame(
         weights=weights,
         shares=shares,
     )
-    result = _refined(frame, inliers, experts, split, steps, pipeline)
+    refined = _refined(frame, inliers, experts, split, steps, pipeline)
     if with_stages:
         stages = _stages(experts, inliers, split, steps)
-        result = replace(result, stages={name: depth.numpy() for name, depth in stages.items()})
-    return result
+        refined = replace(refined, stages={name: stage.numpy() for name, stage in stages.items()})
+    return refined
 
 
 class Steps(NamedTuple):
-    """What the steps of one frame gave."""
+    """What the steps of one frame gave; depths are (H, W) metres, 0 = unknown."""
 
-    judged: ResidualField | None  # that told the outliers. None: none did
-    fused: Tensor  # (H, W) metres
-    propagated: Tensor  # (H, W) metres, its residual propagated
-    depth: Tensor  # (H, W) metres, with the shares of single networks
-    weights: Mapping[str, float]  # of the experts in `fused`
-    shares: list[Share]  # of single networks in `depth`
+    judged: ResidualField | None  # the field that told the outliers. None: none did
+    fused: Tensor  # the weighted mean of the experts
+    propagated: Tensor  # the same, its residual at the points propagated
+    depth: Tensor  # the result: `propagated` with the shares of single networks
+    weights: Mapping[str, float]  # weights of the experts in `fused`, by name
+    shares: list[Share]  # the shares of single networks in `depth`
 
     @property
     def weights_in_depth(self) -> dict[str, float]:
         """The weights of all experts in the result; their sum is 1."""
-        rest = 1 - sum(share.part for share in self.shares)
-        weights = {name: rest * weight for name, weight in self.weights.items()}
+        of_fused = 1 - sum(share.weight for share in self.shares)
+        weights = {name: of_fused * weight for name, weight in self.weights.items()}
         for share in self.shares:
-            weights[share.name] += share.part
+            weights[share.name] += share.weight
         return weights
 
 
 def without_outliers(
     judge: OpenNetwork, frame: Frame, networks: Sequence[OpenNetwork] = ()
 ) -> Judged:
-    """Returns the frame without its outliers, and what a network gives for it.
+    """Returns the frame without its outliers, and what a network, the judge, gives for it.
 
-    Outliers differ from its prediction otherwise than their neighbours do. Of many points, those
-    that contradict their neighbours by themselves are outliers too. None is a point that agrees
-    with a strong network.
+    An outlier differs from the judge's prediction otherwise than its neighbours do. From
+    `FEW_POINTS` points on, one whose depth alone contradicts its neighbours is an outlier, too. A
+    point that agrees with a strong network is none.
 
-    z of a network that takes the image alone is not updated yet: how strong the network is tells
+    z of a judge that takes the image alone is not updated yet: how strong the network is tells
     whether it will be (`expert_of_user`).
 
     Args:
-        judge: The network that judges.
-        frame: The frame.
-        networks: All networks of the frame.
+        judge: The network beside whose prediction outliers are told, open.
+        frame: The frame with all its points.
+        networks: All networks of the frame, open, for those that are strong.
 
     Raises:
         NoPointsError: No point lies where the network predicts.
     """
-    # Points that contradict their neighbours by themselves are suspected.
+    # Points that contradict their neighbours are suspected: outliers beside a constant depth.
     points = frame.points
     constant = ResidualField(torch.ones(points.size), points, frame.rgb)
     suspected = constant.outliers
     consistent = frame
     if bool(suspected.any()):
         consistent = replace(frame, points=points.select(~suspected))
-    # The judge predicts from the others. If it weighs its points it predicts again, as it is given
-    # the outliers too, once they are known.
-    again = bool(suspected.any()) and judge.weighs_points
-    prediction = judge.refine(consistent, updates=judge.takes_points and not again)
+    # The judge predicts from the others. A judge that weighs its points is given the outliers, too,
+    # once they are known; so it predicts again, and this first time without updates.
+    predicts_again = bool(suspected.any()) and judge.weighs_points
+    updates = judge.takes_points and not predicts_again
+    prediction = judge.refine(consistent, updates=updates)
     # Outliers beside its prediction.
     field = ResidualField(prediction.aligned, points, frame.rgb)
     outlying = field.outliers
     if len(points) >= FEW_POINTS:
         outlying = outlying | suspected
     if bool(outlying.any()) and not is_dense(points):
-        outlying = outlying & contradict_strong(networks, frame, constant)
+        outlying = outlying & outliers_beside_strong(networks, frame, constant)
     # What the judge gives for the frame without them.
     inliers = frame.without(outlying)
-    if again or not torch.equal(outlying, suspected):
+    if predicts_again or not torch.equal(outlying, suspected):
         prediction = judge.refine(inliers, updates=judge.takes_points)
     return Judged(judge, inliers, prediction, field, constant)
 
 
-def contradict_strong(
+def outliers_beside_strong(
     networks: Sequence[OpenNetwork], frame: Frame, constant: ResidualField
 ) -> Tensor:
-    """Returns (N,) bool: the outliers beside every strong network that takes the image alone.
+    """Returns (N,) bool: which points are outliers beside the depth of every strong network.
 
-    All points are, without such a network. With few points, `compact` knows less of the scene than
-    it does.
+    A strong network takes the image alone, and with its depth the points predict each other far
+    better than with a constant one (`strength_of`). With few points it knows more of the scene than
+    `compact` does. Without any such network all points are true.
 
     Args:
         networks: The networks, open.
@@ -214,13 +218,14 @@ def contradict_strong(
 def _propagate(
     depth: Tensor, frame: Frame, split: ValidatedFrame, field: ResidualField | None
 ) -> Tensor:
-    """Depth (H, W) with its residual at the points propagated.
+    """Depth (H, W) metres, 0 = unknown, with its residual at the points propagated.
 
     Args:
-        depth: (H, W) metres.
+        depth: (H, W) metres, 0 = unknown.
         frame: The frame without its outliers.
-        split: How the residual is propagated.
-        field: A field of the frame, used if it is that of this depth.
+        split: The frame and its validation points, which says how the residual is propagated.
+        field: Residual field of some depth at some points, used if it is that of these. None: there
+            is none yet.
     """
     if field is None or not field.is_of(depth, frame.points):
         field = ResidualField(depth, frame.points, frame.rgb)
@@ -235,17 +240,26 @@ def _refined(
     steps: Steps,
     pipeline: Pipeline,
 ) -> Refined:
-    """The refined frame, with what a person should know of it."""
-    own = experts.own.whole
+    """The refined frame, with what a person should know of it.
+
+    Args:
+        frame: The frame with all its points.
+        inliers: The frame without its outliers.
+        experts: The experts.
+        split: The frame and its validation points.
+        steps: What the steps gave.
+        pipeline: The steps of the method.
+    """
+    prediction = experts.own.whole  # of the user's first network
     notes = _notes(frame, inliers, experts, split, steps, pipeline)
     return Refined(
-        before=own.aligned.numpy(),
+        before=prediction.aligned.numpy(),
         depth=steps.depth.numpy(),
         used=inliers.points,
-        losses=own.losses,
-        step=own.step,
-        diverged=own.diverged,
-        alignment=own.alignment,
+        losses=prediction.losses,
+        step=prediction.step,
+        diverged=prediction.diverged,
+        alignment=prediction.alignment,
         propagation=split.propagation,
         notes=tuple(notes),
         validation=_validation(experts, split, steps.shares),
@@ -262,9 +276,18 @@ def _notes(
     steps: Steps,
     pipeline: Pipeline,
 ) -> list[str]:
-    """What a person should know of the refined frame, a line each; warnings last."""
-    own = experts.own
-    notes = list(own.whole.notes)
+    """What a person should know of the refined frame, a line each; warnings last.
+
+    Args:
+        frame: The frame with all its points.
+        inliers: The frame without its outliers.
+        experts: The experts.
+        split: The frame and its validation points.
+        steps: What the steps gave.
+        pipeline: The steps of the method.
+    """
+    first = experts.own
+    notes = list(first.whole.notes)
     # Of the image and the points.
     if frame.registration is not None:
         notes.append(
@@ -278,42 +301,53 @@ def _notes(
         )
     # Of the networks, and of the updates of the user's.
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
-    if own.harm is not None:
-        without, with_updates = own.harm
+    if first.harm is not None:
+        without, with_updates = first.harm
         notes.append(
-            f"{own.name}: these updates of z are not used, as they raise its error at"
+            f"{first.name}: these updates of z are not used, as they raise its error at"
             f" {len(split.points):,} validation points from {without:.4f} to {with_updates:.4f}"
         )
-    elif own.not_updated > 0:
+    elif first.share_of_aligned > 0:
         notes.append(
-            f"{own.name} is strong: with its depth the points predict each other far better than"
-            f" without; {own.not_updated:.0%} of it is taken before the updates of z"
+            f"{first.name} is strong: with its depth the points predict each other far better than"
+            f" without; {first.share_of_aligned:.0%} of it is taken before the updates of z"
         )
-    if pipeline.unused and not own.whole.updates:
+    if pipeline.unused and not first.whole.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
-        notes.append(f"{names}: not used, as z of {own.name} is not updated")
+        notes.append(f"{names}: not used, as z of {first.name} is not updated")
     return [*notes, *experts.warnings]
 
 
 def _stages(
     experts: Experts, frame: Frame, split: ValidatedFrame, steps: Steps
 ) -> dict[str, Tensor]:
-    """The user's network after each step of its own, and the network that takes a prior alone."""
+    """Depths (H, W) metres, 0 = unknown, after each step of the user's first network, by stage.
+
+    Those of the network that takes a prior, without one, are a stage, too.
+
+    Args:
+        experts: The experts.
+        frame: The frame without its outliers.
+        split: The frame and its validation points.
+        steps: What the steps gave.
+    """
 
     def propagated(dense: Tensor) -> Tensor:
-        """Depth (H, W) with its residual propagated; that of the result is known."""
+        """Depth (H, W) with its residual propagated; that of the fused depth is known."""
         if dense is steps.fused:
             return steps.propagated
         return _propagate(dense, frame, split, steps.judged)
 
-    own = experts.own
-    stages = {BEFORE: own.whole.aligned}
-    if own.whole.updates and (own.not_updated < 1 or own.harm is not None):
-        stages[UPDATED] = own.whole.updated
-    if own.of_scanner:
-        stages[PROPAGATED] = own.whole.updated
+    first = experts.own
+    stages = {BEFORE: first.whole.aligned}
+    # Updates without a part in the result are no stage, but for those that do harm, which is shown.
+    if first.whole.updates and (first.share_of_aligned < 1 or first.harm is not None):
+        stages[UPDATED] = first.whole.updated
+    # A completion network on scan lines has its share of the result without propagation.
+    if first.of_scanner:
+        stages[PROPAGATED] = first.whole.updated
     elif split.propagation != "none":
-        stages[PROPAGATED] = propagated(own.dense)
+        stages[PROPAGATED] = propagated(first.dense)
     if experts.alone is not None:
         stages[ALONE] = propagated(experts.alone.dense)
     return stages
@@ -322,11 +356,16 @@ def _stages(
 def _validation(
     experts: Experts, split: ValidatedFrame, shares: Sequence[Share]
 ) -> Validation | None:
-    """The stages and the result at the validation points; None without any.
+    """The stages and the result at the validation points; None without such points.
 
-    Each fifth of these is predicted by weights that were fitted to the others.
+    The result at each fifth of them is fused by weights that were fitted to the others.
+
+    Args:
+        experts: The experts.
+        split: The frame and its validation points.
+        shares: The shares of single networks in the result.
     """
-    own = experts.own
+    first = experts.own
     points = split.points
     if not len(points):
         return None
@@ -335,28 +374,30 @@ def _validation(
     fused = torch.empty(len(points))
     for fold in range(FOLDS):
         weights = fit_weights(experts.every, split, fold_of_point != fold)
-        mean = weighted_mean([(expert.at, weights[expert.name]) for expert in experts.every])
+        mean = weighted_mean(
+            [(expert.at_validation, weights[expert.name]) for expert in experts.every]
+        )
         fused[fold_of_point == fold] = mean[fold_of_point == fold]
-    # All points that were given for it, outliers too.
-    given = split.kept.points
+    # All points but those for validation, outliers too.
+    others = split.kept.points
     if split.kept.outliers is not None:
-        given = given.joined(split.kept.outliers)
+        others = others.joined(split.kept.outliers)
     # The steps of the user's network, `compact` alone, the result and interpolation.
-    predicted = {BEFORE: points.sample(own.kept.aligned)}
-    if own.kept.updates:
-        predicted[UPDATED] = own.updated
-    if own.of_scanner:
-        predicted[PROPAGATED] = own.updated
+    predicted = {BEFORE: points.sample(first.kept.aligned)}
+    if first.kept.updates:
+        predicted[UPDATED] = first.updated_at_validation
+    if first.of_scanner:
+        predicted[PROPAGATED] = first.updated_at_validation
     elif split.propagation != "none":
-        predicted[PROPAGATED] = own.at
+        predicted[PROPAGATED] = first.at_validation
     if experts.alone is not None:
-        predicted[ALONE] = experts.alone.at
-    predicted[AFTER] = with_shares(fused, [(share.at, share.part) for share in shares])
-    predicted[LINEAR] = linear(given, points.xy)
+        predicted[ALONE] = experts.alone.at_validation
+    predicted[AFTER] = with_shares(fused, [(share.at_validation, share.weight) for share in shares])
+    predicted[LINEAR] = linear(others, points.xy)
     return Validation(
         points=points,
-        kept=given,
-        network=own.kept.aligned,
+        kept=others,
+        network=first.kept.aligned,
         weights=split.weights,
         predicted=predicted,
     )
@@ -365,11 +406,17 @@ def _validation(
 def _notes_on_networks(
     experts: Experts, split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[str]:
-    """Which of the user's networks have no part in the result or are not updated, and why."""
+    """Which of the user's networks have no part in the result or are not updated, and why.
+
+    Args:
+        experts: The experts.
+        split: The frame and its validation points.
+        weights: The weights of all experts in the result, by name.
+    """
     notes: list[str] = []
     alone = experts.alone
     for network in experts.of_users:
-        if network.untrusted:
+        if network.lacks_trust:
             notes.append(
                 f"z of {network.name} is not updated: its aligned depth explains too little of the"
                 " points for updates to reach the result; `iterations` updates it all the same"
@@ -382,7 +429,8 @@ def _notes_on_networks(
         if len(split.points) and alone is not None:
             why = (
                 f"at {len(split.points):,} validation points its error is"
-                f" {split.error(network.at):.4f}, that of {alone.name} {split.error(alone.at):.4f}"
+                f" {split.error(network.at_validation):.4f}, that of {alone.name}"
+                f" {split.error(alone.at_validation):.4f}"
             )
         notes.append(f"{network.name} has no part in the result: {why}")
     return notes

@@ -51,7 +51,12 @@ several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points
 
 
 def with_input_range(network: Network, name: str | None) -> Network:
-    """Returns the network with the input range of this name; None leaves its own."""
+    """Returns the network with the input range of a name; None leaves its own.
+
+    Args:
+        network: The network.
+        name: A name of `NORMALISATIONS`: how rgb in 0…1 is scaled before the network gets it.
+    """
     if name is None:
         return network
     definition = replace(network.definition, normalisation=NORMALISATIONS[name])
@@ -63,10 +68,12 @@ def resolve_definition(
 ) -> Network:
     """Returns the network with a definition that leaves nothing open, and notes on the decisions.
 
-    An open input range is the one whose prediction fits the points best, in the mean over the
-    frames.
+    An open input range becomes the one whose prediction fits the points best, in the mean over the
+    frames (`choose_input_range`).
 
     Args:
+        network: The network.
+        frame: The first frame, its image moved to its points.
         more_frames: Function of further frames; called only where the input range is open.
 
     Raises:
@@ -85,34 +92,50 @@ def resolve_definition(
 
 
 def normalisation_name(definition: ModelDefinition) -> str | None:
-    """Returns the name of the rgb range that the network is given; None if it has none."""
-    names = (name for name, how in NORMALISATIONS.items() if how == definition.normalisation)
-    return None if "rgb" not in definition.input_kind else next(names, None)
+    """Returns the name of the rgb range that a network is given; None if that has no name.
+
+    None also for a network that takes no rgb image.
+    """
+    if "rgb" not in definition.input_kind:
+        return None
+    for name, normalisation in NORMALISATIONS.items():
+        if normalisation == definition.normalisation:
+            return name
+    return None
 
 
 def default_layer(network: Network, size: tuple[int, int], point_count: int) -> str | None:
-    """Returns the layer whose output z is updated if no option names one.
+    """Returns the layer whose output z is updated if no option names one; None if there is none.
 
-    It is the definition's own, if it states one. Else it is the last of its layers whose
-    influential field in the depth map is wide enough for so many even points in an image of this
-    size (rows, columns), because that costs least; or the one with the widest field. All fields
-    follow from one pass. None if the definition has no layers.
+    It is the definition's default, if it states one. Else it is the last of the definition's layers
+    that has a wide enough influential field: the part of the depth map that changes when one point
+    changes z. The last one costs least. If none is wide enough it is the widest.
+
+    Args:
+        network: The network.
+        size: (rows, columns) of the image.
+        point_count: Number of points, taken as even over the image. Without any, the definition's
+            first layer is taken.
     """
     definition = network.definition
     frame = FrameMap.fit(definition.size, *size)
     if definition.defaults.layer is not None or len(definition.layers) < 2 or not point_count:
         return definition.default_layer
-    enough = min(wanted_field(frame.network, point_count), *frame.network)
+    # No field is wider than the image as the network sees it.
+    enough_px = min(wanted_field(frame.network, point_count), *frame.network)
 
     def decide() -> list[str]:
+        """The layer, as the only one of a list."""
         with out_of_memory_is_a_device_error(network.device):
             arguments = network.synthetic_arguments(frame)
             fields = fields_of(network, arguments, definition.layers)
-            ordered = _by_preference(definition.layers, fields, enough)
-            first = partial(_first_usable, ordered)
-            return [by_shapes(network.module, arguments, first) or definition.layers[0]]
+            ordered = _by_preference(definition.layers, fields, enough_px)
+            first_usable = partial(_first_usable, ordered)
+            layer = by_shapes(network.module, arguments, first_usable)
+            return [definition.layers[0] if layer is None else layer]
 
-    question = f"layer of {definition.layers} for {enough:.6g} pixels of {frame.network}"
+    # What was decided for this question in an earlier run is not decided again.
+    question = f"layer of {definition.layers} for {enough_px:.6g} pixels of {frame.network}"
     with spent_on("layer"):
         return recalled_layers(network.module, network.definition, question, decide)[0]
 
@@ -120,8 +143,15 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
 def _first_usable(
     layers: Sequence[str], module: nn.Module, arguments: tuple[Tensor, ...]
 ) -> str | None:
-    """The first of the layers that the network can be cut at."""
+    """The first of the layers that a network can be cut at; None if it can be cut at none.
+
+    Args:
+        layers: Names of submodules, as `Split` takes them.
+        module: The network.
+        arguments: Its arguments for a frame.
+    """
     for layer in layers:
+        # `Split` raises ModelError where it cannot cut, and then the next layer is tried.
         with suppress(ModelError), Split(module, layer) as split, torch.no_grad():
             split.rear(split.front(*arguments))
             return layer
@@ -131,42 +161,70 @@ def _first_usable(
 def fields_of(
     network: Network, arguments: tuple[Tensor, ...], layers: Sequence[str]
 ) -> dict[str, Field]:
-    """Returns the influential fields of layers in a frame with these arguments of the network.
+    """Returns how far one point reaches through z at each of some layers (`influential_fields`).
 
-    See `influential_fields`.
+    Args:
+        network: The network.
+        arguments: Arguments of its forward for a frame.
+        layers: Names of the layers.
+
+    Returns:
+        The field of each layer by its name; layers that cannot be cut at are left out.
     """
 
     def measured(module: nn.Module, arguments: tuple[Tensor, ...]) -> dict[str, Field]:
+        """The fields of this network, or of its copy without values."""
         return influential_fields(module, arguments, layers, network.map_of)
 
     return by_shapes(network.module, arguments, measured)
 
 
-def _by_preference(layers: Sequence[str], fields: Mapping[str, Field], enough: float) -> list[str]:
-    """The layers whose field is wide enough, from the last one, then the others, widest first."""
-    # No field is wider than the image. Of equally wide ones, that of the larger patch of z is
-    # taken, and then the last.
-    widths = {
-        name: (min(field.in_output), field.stride * min(field.in_z or (0,)))
-        for name in reversed(layers)
-        if (field := fields.get(name)) is not None
-    }
-    wide = [name for name, (width, _) in widths.items() if width >= enough]
-    others = [name for name in widths if name not in wide]
-    return [*wide, *sorted(others, key=widths.__getitem__, reverse=True)]
+def _by_preference(
+    layers: Sequence[str], fields: Mapping[str, Field], enough_px: float
+) -> list[str]:
+    """The layers whose field is wide enough, from the last one, then the others, widest first.
+
+    Of others that are equally wide, that with the larger patch of z comes first, and then the last.
+
+    Args:
+        layers: Names of the layers, from the image to the depth.
+        fields: How far one point reaches by each layer, in z and in the depth map, by name; layers
+            without such a field are left out.
+        enough_px: Width in pixels of the depth map from which on a field is wide enough.
+    """
+    wide: list[str] = []
+    narrow: dict[str, tuple[int, float]] = {}
+    for name in reversed(layers):
+        if name not in fields:
+            continue
+        field = fields[name]
+        width_px = min(field.in_output)
+        if width_px >= enough_px:
+            wide.append(name)
+        else:
+            patch_px = 0.0 if field.in_z is None else field.stride * min(field.in_z)
+            narrow[name] = (width_px, patch_px)
+    return [*wide, *sorted(narrow, key=narrow.__getitem__, reverse=True)]
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
-    """Returns how wide an influential field should be, in pixels, for so many even points."""
-    spacing = math.sqrt(size[0] * size[1] / point_count)
-    return max(GAPS * spacing, LEAST_FRACTION * min(size))
+    """Returns how wide the influential field of the default layer should be, in pixels.
+
+    Args:
+        size: (height, width) in pixels.
+        point_count: Number of points, even over these pixels.
+    """
+    height, width = size
+    spacing_px = math.sqrt(height * width / point_count)
+    return max(GAPS * spacing_px, LEAST_FRACTION * min(size))
 
 
 def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
     """Returns the name of the layer to cut at.
 
     Args:
-        layer: A name, a fraction 0…1 of the definition's layers, or None for its default.
+        definition: The network's definition, with its layers from the image to the depth.
+        layer: Name, or fraction 0…1 of these layers as text, such as "0.5". None: the default.
 
     Raises:
         UsageError: There is no default, or a fraction is out of range.
@@ -195,10 +253,12 @@ def resolve_settings(
     """Returns settings with nothing open: the user's, else the network's defaults.
 
     Another update rule than the network's starts from the paper's step size, schedule and blur,
-    because those of the network were tuned for its own rule. The output of a network of metres from
-    an image alone is scaled to points in another unit.
+    because those of the network were tuned for its own rule. Where the points are in another unit
+    than metres, metres from an image alone are scaled to them.
 
     Args:
+        definition: The network's definition, with its defaults.
+        settings: Settings that the user gives.
         metric: Whether the points are in metres.
 
     Raises:
@@ -216,18 +276,20 @@ def resolve_settings(
 
 
 def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwork:
-    """Returns a network, where it is cut, and its settings, with nothing left open.
+    """Returns a network of the method with its layer and settings, nothing left open.
 
-    What the user gives replaces the network's own value. What is left open is, but with the
-    paper's method, what serves a result whose residual is propagated: few updates, and none of a
-    network that takes the points but no prior; and a network of metres is aligned too, where the
-    points say that it should be.
+    What the user gives replaces the network's own value. The paper's method takes the rest from the
+    paper. The other methods propagate the residual, and take for the rest what serves that: at most
+    `UPDATES` updates of z, none of a network that takes the points but no prior, and none of a
+    depth map. With them a network of metres from the image alone is aligned where the points say
+    that it should be.
 
     Args:
-        network: The network.
-        frame: The first frame.
+        network: The network, its definition with nothing left open.
+        frame: The first frame, its image moved to its points.
         asked: Settings that the user gives for this network.
     """
+    # The layer, and the settings that every method has.
     layer = asked.layer
     if layer is None and not asked.is_paper:
         layer = default_layer(network, frame.size, len(frame.points))
@@ -238,6 +300,7 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
     definition = network.definition
     if definition.input_kind == "map":  # no network behind z spreads an update
         return OpenNetwork(network, layer, replace(settings, iterations=0))
+    # What serves a result whose residual is propagated.
     takes_points = "sparse" in definition.input_kind
     if asked.iterations is None:
         is_updated = definition.takes_prior or not takes_points
@@ -257,7 +320,12 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
 
 
 def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[Network, str]:
-    """The network with the input range whose prediction fits the points best, and a line on it."""
+    """The network with the input range of `choose_input_range`, and a note on that choice.
+
+    Args:
+        network: The network, whose definition leaves its input range open.
+        frames: Frames with images, by which it is chosen.
+    """
     candidates = {name: with_input_range(network, name) for name in NORMALISATIONS}
     misfits = {
         name: _mean_alignment_error(candidate, frames) for name, candidate in candidates.items()
@@ -266,35 +334,42 @@ def _with_best_input_range(network: Network, frames: Sequence[Frame]) -> tuple[N
     listed = ", ".join(f"{name} {error:.1%}" for name, error in misfits.items())
     if len(frames) > 1:
         listed += f", mean of {len(frames)} frames"
-    unsure = ""
+    doubt = ""
     hint = "`normalise` changes it"
     if rival is not None:
+        doubt = ", unsure"
         hint = f"`normalise` {chosen} confirms it, {rival} is the next likely"
-        unsure = ", unsure"
-    note = f"input: rgb range {chosen!r}{unsure} (error after alignment: {listed}); {hint}"
+    note = f"input: rgb range {chosen!r}{doubt} (error after alignment: {listed}); {hint}"
     return candidates[chosen], note
 
 
 def choose_input_range(misfits: Mapping[str, float]) -> tuple[str, str | None]:
-    """Returns the input range of a network that states none, and a rival where that is unsure.
+    """Returns the name of the input range of a network that states none, and that of a rival.
 
-    The range 0…1 stays unless another one fits far better. Which of them fits a single frame best
-    is mostly chance.
+    The range 0…1, "unit", is chosen unless another one fits far better. Which of them fits a single
+    frame best is mostly chance. The rival is the best of the others; None if the chosen one is
+    clearly better.
 
     Args:
-        misfits: Relative error after alignment by the names of `NORMALISATIONS`.
+        misfits: Relative errors at the points after alignment, by the names of `NORMALISATIONS`.
     """
-    best = min(misfits, key=lambda name: misfits[name])
+    best = min(misfits, key=misfits.__getitem__)
     chosen = best if misfits[best] < _CLEARLY_BETTER * misfits["unit"] else "unit"
-    rival = min((name for name in misfits if name != chosen), key=lambda name: misfits[name])
-    unsure = misfits[chosen] > _CLEARLY_BETTER * misfits[rival]
-    return chosen, rival if unsure else None
+    others = [name for name in misfits if name != chosen]
+    rival = min(others, key=misfits.__getitem__)
+    is_unsure = misfits[chosen] > _CLEARLY_BETTER * misfits[rival]
+    return chosen, rival if is_unsure else None
 
 
 def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
     """The relative error at the points after the best alignment, in the mean over the frames.
 
-    Frames without points in the network's view are left out; infinite where the network fails.
+    A point where the network predicts nothing finite counts as an error of 1. Frames without points
+    that the network sees are left out. Infinite without any other frame, or if the network fails.
+
+    Args:
+        network: The network, with the input range that is tried.
+        frames: Frames with images.
     """
     definition = network.definition
     misfits = list[float]()
@@ -305,8 +380,9 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
                 output = network.module(*prepared.arguments)
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
-            lost = 1 - float(at_points.isfinite().float().mean())  # each counts as quite wrong
-            misfits.append(align_output(definition, at_points, points, "auto")[0].error + lost)
+            lost = 1 - float(at_points.isfinite().float().mean())
+            best_alignment = align_output(definition, at_points, points, "auto")[0]
+            misfits.append(best_alignment.error + lost)
         except NoPointsError:
             continue
         except ModelError:

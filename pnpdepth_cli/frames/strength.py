@@ -29,41 +29,44 @@ USEFUL = 0.75
 
 
 class Judged(NamedTuple):
-    """A frame without its outliers, as one of its networks told them."""
+    """A frame without its outliers, which were told beside the depth of one of its networks."""
 
     network: OpenNetwork
-    """The network that judged."""
+    """The network beside whose depth they were told."""
     inliers: Frame
+    """The frame without them."""
     prediction: Prediction
-    """What that network gives for them."""
+    """What that network gives for the frame without them."""
     field: ResidualField | None = None
     """Residual field of its aligned depth at all points. None: outliers were not sought."""
     constant: ResidualField | None = None
     """Residual field of a constant depth at all points, likewise."""
 
     def by(self, network: OpenNetwork) -> Prediction | None:
-        """Returns what this network gives for the inliers, if it judged."""
+        """Returns what a network gives for the inliers; None if it did not tell the outliers."""
         return self.prediction if network is self.network else None
 
 
 def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
-    """Returns what a network that takes the image alone leaves unexplained, by all points.
+    """Returns the part, mostly 0…1, of the depth of the points that a network leaves unexplained.
 
-    It is the error with which its aligned depth, the residual propagated, predicts each point from
-    the others, over that of a constant depth, whose residual follows position and colour alone. It
-    is 1 on scan lines, where each point has a neighbour on its line, so that it says nothing.
+    The network takes the image alone. The part is the error with which its aligned depth, the
+    residual propagated, predicts each point from the others, over the same error of a constant
+    depth, whose residual follows position and colour alone. It is 1 with fewer than `MIN_POINTS`
+    points, and on scan lines, where each point has a neighbour on its line, so that it says
+    nothing.
 
     The alignment was fitted to all points. So the error of N points is multiplied by
     (N − 1) / (N − 1 − FITTED), as in the unbiased estimate of a variance.
 
     Args:
-        aligned: (H, W) metres, 0 = unknown, the network's depth.
+        aligned: (H, W) metres, 0 = unknown, the network's depth before updates of z.
         split: The frame and its validation points.
-        judged: How its outliers were told.
+        judged: The frame without outliers, and the residual fields by which they were told.
     """
     points = split.whole.points
-    known = int((points.sample(aligned) > 0).sum())
-    if split.has_scan_lines or known < MIN_POINTS or judged.constant is None:
+    known_count = int((points.sample(aligned) > 0).sum())
+    if split.has_scan_lines or known_count < MIN_POINTS or judged.constant is None:
         return 1.0
     field = judged.field
     if field is None or not field.is_of(aligned, points):
@@ -72,7 +75,9 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
 
 
 def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
-    """Returns what a depth leaves unexplained, see `unexplained_by`; 1 with too few points.
+    """Returns the part that a depth leaves unexplained, see `unexplained_by`.
+
+    It is 1 with fewer than `MIN_POINTS` points.
 
     Args:
         field: Residual field of the depth.
@@ -87,25 +92,31 @@ def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
 
 
 def strength_of(unexplained: float) -> float:
-    """Returns 0…1, how strong a network is that leaves so much unexplained."""
+    """Returns 0…1, how strong a network is that leaves this part unexplained (`unexplained_by`).
+
+    0 from `WEAK` on, 1 up to `STRONG`, linear in between.
+    """
     return min(1.0, max(0.0, (WEAK - unexplained) / (WEAK - STRONG)))
 
 
 def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
-    """Returns 0…1, the trust in a network that takes the image alone, by what it explains.
+    """Returns 0…1, the fraction of its prior weights that a network of the image alone gets.
 
-    Its aligned depth explains a fraction of the variance of log depth. The fraction is
-    1 − PRESS / SS, by a line through the other points (Allen, "The relationship between variable
-    selection and data augmentation and a method for prediction", 1974).
+    It rises from 0 to 1 as the fraction of the variance of the points' log depth that the network's
+    log depth explains rises from `USELESS` to `USEFUL`. That fraction is 1 − PRESS / SS: each point
+    is predicted by the line through the other points (Allen, "The relationship between variable
+    selection and data augmentation and a method for prediction", 1974). It is 0 with fewer than
+    `MIN_POINTS` points, and if the network takes far for near.
 
     Args:
         aligned: (H, W) metres, 0 = unknown, the network's depth, z not updated.
         points: The frame's points without outliers.
     """
-    # x is its log depth at the points, y theirs.
-    at = points.sample(aligned).double()
-    x = log_of(at[at > 0])
-    y = log_of(points.depth[at > 0].double())
+    # x is the network's log depth at the points, y theirs, both less their mean below.
+    predicted = points.sample(aligned).double()
+    is_known = predicted > 0
+    x = log_of(predicted[is_known])
+    y = log_of(points.depth[is_known].double())
     count = len(x)
     if count < MIN_POINTS:
         return 0.0
@@ -114,8 +125,10 @@ def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
     slope = (x @ y) / (x @ x).clamp_min(1e-12)
     if slope <= 0:
         return 0.0  # it says that far is near
-    # Errors at each point of a line through the others, and of their mean.
-    left_out = (y - slope * x) / (1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12))
+    # The error at each point of the line through the others is that of the line through all, over
+    # 1 − leverage; so is that of the others' mean.
+    leverage_left = 1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12)
+    errors = (y - slope * x) / leverage_left
     total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
-    explained = float(1 - left_out.square().sum() / total)
+    explained = float(1 - errors.square().sum() / total)
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))

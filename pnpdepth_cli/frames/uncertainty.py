@@ -66,13 +66,15 @@ _TAIL = 0.75
 _TYPICAL = 1.75
 """Typical factor with 100 points."""
 _PER_POINT = -0.18
-"""Its power of the number of points."""
+"""Power of the number of points, over 100, by which the typical factor is multiplied."""
 _FEWEST_POINTS = 20
-"""Fewer points change nothing of the typical factor."""
+"""With fewer points the typical factor is that of so many."""
 _MOST_POINTS = 500
-"""More points change nothing of it."""
+"""With more points the typical factor is that of so many."""
 _TYPICAL_WEIGHT = 20
 """Validation points that the typical factor counts as."""
+_LEAST_RATIO = 1e-12
+"""Residual over sigma before its logarithm is taken; a residual can be 0."""
 
 # Where depth is valid.
 _BEYOND_POINTS = 1.5
@@ -86,8 +88,8 @@ _SAMPLED = 4000
 
 # What is beyond the range of a sensor.
 _END = 0.85
-"""Fraction of the farthest depth from which on a point is at the end; the band before is as deep.
-"""
+"""Fraction of the farthest depth from which on a point is at the end of the range. The band before
+it is as deep."""
 _SHARP = 0.5
 """Least points at the end over those in the band before, if the points end sharply."""
 _LEAST_AT_END = 0.02
@@ -102,10 +104,10 @@ _GAP_LINES = 1.2
 _REACHED = 0.8
 """Fraction of that distance around the middle of a gap that belongs to the gap."""
 _LEAST_GAP = 0.01
-"""Least fraction of the image in the middle of gaps."""
+"""Least fraction of the image's pixels that are so far from any point."""
 _LARGE_GAPS = 0.05
-"""The same of gaps that tell without a sharp end. Of 12 rooms with all their depth two have as
-large gaps, with no point at the end beside them."""
+"""The same fraction, from which on gaps tell without a sharp end. Of 12 rooms with all their depth
+two have as large gaps, with no point at the end beside them."""
 _AT_BORDER = 0.25
 """Least fraction of the points beside the gaps that are at the end."""
 
@@ -120,9 +122,12 @@ _OF_MAP = (
 
 
 def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
-    """Returns a refined frame with its standard deviation, calibrated by its check.
+    """Returns a refined frame with the standard deviation of its depth, and where that is valid.
+
+    The deviation is calibrated by the frame's validation points. Notes say what it does not cover.
 
     Args:
+        frame: The refined frame.
         of_matches: Whether its points were matched in images, as those of COLMAP.
     """
     points = frame.used
@@ -137,7 +142,8 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         residual, residual_sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
     of_points = calibration(residual, residual_sigma, len(points)) * shape
-    # What a sensor's points have in common, and what they do not reach, comes on top.
+    # What a sensor's points have in common, and what they do not reach, comes on top. Until the
+    # product with depth, all are fractions of the depth, as deviations of log depth are.
     is_map = is_dense(points) and scan_pattern(points.xy, points.size) is None
     of_sensor = torch.tensor(SENSOR_ERROR if is_map else 0.0)
     beyond = beyond_range(points)
@@ -166,7 +172,10 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
 
 
 def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
-    """Residual of log depth and uncalibrated standard deviation, (M,), at validation points."""
+    """Log measured − log predicted depth, and its uncalibrated standard deviation, (K,) each.
+
+    At the K validation points that have a prediction and are no outliers.
+    """
     predicted = validation.predicted[AFTER]
     points = validation.points
     sigma = relative_shape(validation.kept, validation.network, predicted, points.xy)
@@ -177,18 +186,23 @@ def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
 def relative_shape(
     points: SparsePoints, network: Tensor, depth: Tensor, xy: Tensor | None = None
 ) -> Tensor:
-    """Returns the uncalibrated standard deviation (H, W), or (M,), of log depth.
+    """Returns the standard deviation of log depth up to a factor, which `calibration` finds.
 
     Args:
         points: The points that the depth was fitted to.
-        network: (H, W) metres, the network's own depth, aligned with the points.
-        depth: (H, W), or (M,), metres.
+        network: (H, W) metres, 0 = unknown: the network's own depth, aligned with the points.
+        depth: (H, W), or (M,) with `xy`, metres, 0 = unknown: the depth whose deviation it is.
         xy: (M, 2) pixel coordinates of `depth`. None: every pixel.
+
+    Returns:
+        (H, W), or (M,) as `depth`.
     """
     # How far the network's own log depth ranges over a window, at every pixel.
-    known = network > 0
-    middle = network[known].median() if bool(known.any()) else network.new_tensor(1.0)
-    log_network = torch.where(known, network, middle).log()[None, None]
+    is_known = network > 0
+    filled = network.new_tensor(1.0)  # where unknown, so that its logarithm is finite
+    if bool(is_known.any()):
+        filled = network[is_known].median()
+    log_network = torch.where(is_known, network, filled).log()[None, None]
     half = _WINDOW_PX // 2
     highest = F.max_pool2d(log_network, _WINDOW_PX, 1, half)
     lowest = -F.max_pool2d(-log_network, _WINDOW_PX, 1, half)
@@ -199,18 +213,18 @@ def relative_shape(
         network_range = ranges.flatten()
     else:
         queries = xy.double()
-        there = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
-        network_range = there.sample(ranges[0, 0])
+        positions = SparsePoints(xy=xy, depth=xy.new_ones(len(xy)), size=points.size)
+        network_range = positions.sample(ranges[0, 0])
     # Log depth of the nearest points.
-    _, near = nearest_points(points, queries, min(_AMONG, len(points)))
-    near_depths = points.depth.double().log()[near.reshape(len(queries), -1)]
-    low, high = near_depths.aminmax(dim=1)
+    _, numbers = nearest_points(points, queries, min(_AMONG, len(points)))
+    log_nearest = points.depth.double().log()[numbers.reshape(len(queries), -1)]
+    low, high = log_nearest.aminmax(dim=1)
     # The four differences of log depth, as in the module's list.
     log_depth = depth.clamp_min(_LEAST_DEPTH).log().double().flatten()
     log_linear = linear(points, xy).clamp_min(_LEAST_DEPTH).log().double().flatten()
     differences = (
         (log_linear - log_depth).abs(),
-        (near_depths[:, :_MEAN_OF].mean(dim=1) - log_depth).abs(),
+        (log_nearest[:, :_MEAN_OF].mean(dim=1) - log_depth).abs(),
         high - low,
         network_range.double(),
     )
@@ -223,13 +237,13 @@ def relative_shape(
 
 
 def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
-    """Returns the factor of sigma that brings residuals within ± one and ± two sigma.
+    """Returns the factor of sigma by which about 68 % of residuals lie within ± one sigma.
 
     The factor is the weighted geometric mean of two: with one, 68 % lie within ± one sigma, with
     the other, 95 % within ± two. They agree for normal errors. Ranks are those of split conformal
     prediction (Lei et al., "Distribution-free predictive inference for regression", 2018). Few
     residuals give an uncertain factor, so it is averaged with the typical one for that number of
-    points.
+    points, which is the factor without any residual.
 
     Args:
         residual: (M,) true − predicted at points that neither refinement nor propagation used.
@@ -243,11 +257,12 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     if not len(ratio):
         return typical
     # How many σ hold 68 % of the residuals, which should be one, and 95 %, which should be two.
-    ranks = [min(math.ceil(fraction * (len(ratio) + 1)), len(ratio)) - 1 for fraction in _WITHIN]
-    of_68, of_95 = (max(float(ratio[rank]), 1e-12) for rank in ranks)
+    count = len(ratio)
+    ranks = [min(math.ceil(fraction * (count + 1)), count) - 1 for fraction in _WITHIN]
+    of_68, of_95 = (max(float(ratio[rank]), _LEAST_RATIO) for rank in ranks)
     # Means of logarithms: of the two, and with the typical factor.
     of_residuals = (1 - _TAIL) * math.log(of_68) + _TAIL * math.log(of_95 / 2)
-    weight = len(ratio) / (len(ratio) + _TYPICAL_WEIGHT)
+    weight = count / (count + _TYPICAL_WEIGHT)
     low, high = CALIBRATION_RANGE
     factor = math.exp(weight * of_residuals + (1 - weight) * math.log(typical))
     return min(max(factor, low), high)
@@ -261,38 +276,41 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     lines, except at pixels about as near to a point as the pixels inside the hull are.
 
     Args:
-        depth: (H, W) metres.
-        sigma: (H, W) metres.
+        points: The points that the depth was fitted to.
+        depth: (H, W) metres, 0 = unknown.
+        sigma: (H, W) metres, standard deviation of the depth.
     """
     supported = (depth > 0) & (depth <= _BEYOND_POINTS * float(points.depth.max()))
     valid = supported & (sigma <= VALID_SIGMA * depth)
-    # Inside the hull, and outside of it as near to a point as pixels inside are.
-    inside = in_hull(points)
-    outside = torch.nonzero(~inside).flip(1)
-    sample = torch.nonzero(inside & ~beyond_range(points)).flip(1)
-    if len(outside) and len(sample):
-        sample = sample[:: max(1, len(sample) // _SAMPLED)]
+    # Pixels inside the hull, and those outside that are as near to a point. `flip` makes x and y of
+    # rows and columns.
+    is_near = in_hull(points)
+    outside = torch.nonzero(~is_near).flip(1)
+    inside = torch.nonzero(is_near & ~beyond_range(points)).flip(1)
+    if len(outside) and len(inside):
+        sample = inside[:: max(1, len(inside) // _SAMPLED)]
         inside_px, _ = nearest_points(points, sample.double(), 1)
         outside_px, _ = nearest_points(points, outside.double(), 1)
         typical_px = float(inside_px.quantile(_TYPICAL_QUANTILE))
-        inside[~inside] = outside_px.flatten() <= _BEYOND_HULL * typical_px
-    return valid & inside
+        is_near[~is_near] = outside_px.flatten() <= _BEYOND_HULL * typical_px
+    return valid & is_near
 
 
 def beyond_range(points: SparsePoints) -> Tensor:
     """Returns (H, W) true where a sensor of limited range had no return; nowhere for others.
 
-    That is in gaps among and beside the points, if many points beside the gaps are at the end of
-    their range. Points of a scan, and points with small gaps, must also end sharply there: a scan
-    has no returns from the sky, and surfaces without return are small.
+    That is in gaps among and beside the points, if many points beside the gaps are near the depth
+    of the farthest point. Points of a scan, and points with small gaps, must also be many there and
+    few before: a scan has no returns from the sky, and surfaces without return are small.
     """
     from scipy import ndimage
 
     nowhere = torch.zeros(points.size, dtype=torch.bool)
+    # Many points are at the end of the range.
     depth = points.depth.double()
     farthest = float(depth.max())
-    last = depth >= _END * farthest
-    at_end = int(last.sum())
+    is_at_end = depth >= _END * farthest
+    at_end = int(is_at_end.sum())
     if at_end < max(_LEAST_AT_END * len(points), _FEWEST_AT_END):
         return nowhere
     # The gaps: pixels too far from any point for their spacing.
@@ -303,19 +321,21 @@ def beyond_range(points: SparsePoints) -> Tensor:
         _, across_px = pattern
         reach_px = max(reach_px, _GAP_LINES * across_px)
     distance_px, nearest = nearest_points(points, pixels_of(points.size), 1)
-    core = (distance_px.flatten() > reach_px).reshape(points.size)
-    in_gaps = float(core.double().mean())
+    is_gap = (distance_px.flatten() > reach_px).reshape(points.size)
+    in_gaps = float(is_gap.double().mean())
     if in_gaps < _LEAST_GAP:
         return nowhere
-    # Points end sharply where those before the end are not far more: a scene thins out.
-    before = (depth >= (2 * _END - 1) * farthest) & ~last
-    is_sharp = at_end >= _SHARP * int(before.sum())
-    if not is_sharp and (pattern is not None or in_gaps < _LARGE_GAPS):
+    # Points end sharply where those of the band before the end, which is as deep, are not far more:
+    # a scene thins out.
+    is_before = (depth >= (2 * _END - 1) * farthest) & ~is_at_end
+    is_sharp = at_end >= _SHARP * int(is_before.sum())
+    must_be_sharp = pattern is not None or in_gaps < _LARGE_GAPS
+    if must_be_sharp and not is_sharp:
         return nowhere
-    # At their border points must end there.
-    beside = torch.unique(nearest.flatten()[core.flatten()])
-    if float(last[beside].double().mean()) < _AT_BORDER:
+    # Of the points beside the gaps, enough are at the end.
+    beside = torch.unique(nearest.flatten()[is_gap.flatten()])
+    if float(is_at_end[beside].double().mean()) < _AT_BORDER:
         return nowhere
-    # Around their middle, up to near the points.
-    around = ndimage.distance_transform_edt(~core.numpy()) <= _REACHED * reach_px
+    # The gaps reach from there to near the points.
+    around = ndimage.distance_transform_edt(~is_gap.numpy()) <= _REACHED * reach_px
     return torch.from_numpy(around)

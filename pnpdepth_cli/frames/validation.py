@@ -20,14 +20,18 @@ MIN_POINTS = 5
 """With fewer points none is for validation: a fold would have less than one."""
 MOST_VALIDATION_POINTS = 1000
 """Of more validation points, so many at random are predicted. It bounds the time of a LiDAR's."""
+_LEAST_DEPTH = 1e-6
+"""Metres; depth is at least this before its logarithm is taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ValidatedFrame(ValidationPoints):
-    """A frame with all its inliers, and without its validation points."""
+    """A frame with all its inliers, the same without its validation points, and these points."""
 
     whole: Frame
+    """The frame with all its inliers."""
     kept: Frame
+    """The frame without its validation points; `whole` if there are none."""
     has_scan_lines: bool
     """Whether the points are those of a scanner."""
     propagation: str
@@ -35,25 +39,29 @@ class ValidatedFrame(ValidationPoints):
     hole: Tensor | None = None
     """(M,) number of the hole of a depth map that a validation point is in. None: in none."""
 
-    def gain(self, at: Tensor, other: Tensor) -> float:
-        """Returns by how many standard errors one prediction (M,) is better than another.
+    def gain(self, predicted: Tensor, rival: Tensor) -> float:
+        """Returns by how many standard errors one prediction is better than another.
 
-        In log depth; negative where it is worse. Points in one hole err together, so a hole counts
-        as one of them.
+        By absolute errors of log depth; negative where it is worse. Points in one hole of a depth
+        map err together, so a hole counts as one point.
+
+        Args:
+            predicted: (M,) metres, 0 = unknown: the prediction at the validation points.
+            rival: (M,) metres, 0 = unknown: the prediction that it is compared with.
         """
-        # How much nearer to the truth it is at each point, and what the point counts.
+        # How much nearer to the truth it is at each point, and what fraction the point counts.
         truth = log_of(self.points.depth)
-        share = self.weights / self.weights.sum()
-        gain = (log_of(other) - truth).abs() - (log_of(at) - truth).abs()
+        fractions = self.weights / self.weights.sum()
+        gains = (log_of(rival) - truth).abs() - (log_of(predicted) - truth).abs()
         # Means of holes in place of points.
         if self.hole is not None:
-            _, number = torch.unique(self.hole, return_inverse=True)
-            total = torch.bincount(number, share)
-            gain = (torch.bincount(number, share * gain) / total)[total > 0]
-            share = torch.full_like(gain, 1 / len(gain))
+            _, hole_of_point = torch.unique(self.hole, return_inverse=True)
+            of_hole = torch.bincount(hole_of_point, fractions)
+            gains = (torch.bincount(hole_of_point, fractions * gains) / of_hole)[of_hole > 0]
+            fractions = torch.full_like(gains, 1 / len(gains))
         # The mean over its standard error.
-        mean = (share * gain).sum()
-        standard_error = (share.square() * (gain - mean).square()).sum().sqrt()
+        mean = (fractions * gains).sum()
+        standard_error = (fractions.square() * (gains - mean).square()).sum().sqrt()
         return float(mean / standard_error.clamp_min(1e-12))
 
 
@@ -70,12 +78,12 @@ def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
     has_scan_lines = scan_pattern(points.xy, points.size) is not None
     if propagation is None:
         propagation = "local" if has_scan_lines else "gp"
-    none = points.select(slice(0))
+    no_points = points.select(slice(0))
     return ValidatedFrame(
         whole=frame,
         kept=frame,
-        points=none,
-        weights=none.depth,
+        points=no_points,
+        weights=no_points.depth,
         has_scan_lines=has_scan_lines,
         propagation=propagation,
     )
@@ -84,43 +92,44 @@ def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
 def split_frame(
     whole: ValidatedFrame, judged: Tensor, networks: Sequence[OpenNetwork], *, seed: int
 ) -> ValidatedFrame:
-    """Returns the frame with and without its validation points.
+    """Returns the frame with and without its validation points, and these points.
 
-    A frame of few points has none, nor has one whose other points a network does not see.
+    A frame of fewer than `MIN_POINTS` points has none, nor has one whose other points a network
+    does not see.
 
     Args:
-        whole: The frame with all its points.
-        judged: (H, W) metres, a prediction beside which neighbours should agree. Outliers among the
-            validation points would decide the weights.
+        whole: The frame with all its points, none of them for validation yet.
+        judged: (H, W) metres, 0 = unknown, a prediction. Validation points whose residual beside it
+            differs from their neighbours' count less: outliers would decide the weights.
         networks: The networks that will predict.
         seed: Random seed of the validation points.
     """
     points = whole.whole.points
     if len(points) < MIN_POINTS:
         return whole
-    # Of a depth map those in copies of its holes, else a fold.
+    # Of a depth map with holes, the points that copies of its holes cover; else a fold.
     hole = None
     if is_dense(points) and not whole.has_scan_lines:
         hole = under_holes(points, FOLDS, seed=seed)
-    chosen = (spatial_folds(points, FOLDS, seed=seed) == 0) if hole is None else (hole > 0)
-    kept = replace(whole.whole, points=points.select(~chosen))
-    if not bool(chosen.any()) or not all(network.sees(kept) for network in networks):
+    is_chosen = (spatial_folds(points, FOLDS, seed=seed) == 0) if hole is None else (hole > 0)
+    kept = replace(whole.whole, points=points.select(~is_chosen))
+    if not bool(is_chosen.any()) or not all(network.sees(kept) for network in networks):
         return whole
     # Of many validation points some are drawn; all of them are kept from the experts.
-    (numbers,) = chosen.nonzero(as_tuple=True)
-    drawn = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
-    numbers = numbers[drawn[:MOST_VALIDATION_POINTS]]
+    (numbers,) = is_chosen.nonzero(as_tuple=True)
+    order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
+    numbers = numbers[order[:MOST_VALIDATION_POINTS]]
     validation = points.select(numbers)
     hole = None if hole is None else hole[numbers]
     # Each counts as much as it is consistent with its neighbours.
-    at = validation.sample(judged)
-    residual = validation.depth.double().log() - at.clamp_min(1e-6).double().log()
-    weights = torch.where(at > 0, inlier_weights(validation, residual), 0.0).float()
+    predicted = validation.sample(judged)
+    residual = validation.depth.double().log() - predicted.clamp_min(_LEAST_DEPTH).double().log()
+    weights = torch.where(predicted > 0, inlier_weights(validation, residual), 0.0).float()
     if not bool(weights.any()):
         weights = torch.ones_like(weights)
     return replace(whole, kept=kept, points=validation, weights=weights, hole=hole)
 
 
 def log_of(depth: Tensor) -> Tensor:
-    """Returns the logarithm of depth in metres; unknown depth is that of a micrometre."""
-    return depth.clamp_min(1e-6).log()
+    """Returns the logarithm of depth in metres; unknown depth (0) counts as a micrometre."""
+    return depth.clamp_min(_LEAST_DEPTH).log()

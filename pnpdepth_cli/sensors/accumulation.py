@@ -44,12 +44,12 @@ _CLOSE = (0.55, 0.37)
 """Distance across and down within which a measured point contradicts, in mean spacings; chosen on
 the same frames. Down it is less, as the next scan line of a LiDAR lies at another depth."""
 _COMPARED = 4  # nearest measured points that may agree with a moved one
-_AGREEING = 2  # that agree, of those, where the nearest one does not
+_AGREEING = 2  # of these must agree, where the nearest one does not
 _CONTRADICTING = 12  # nearest measured points, of which none may contradict
 
 # The registration of a scan to the planes of the frame's own.
 _MIN_PLANES = 200  # pairs of a point and a plane; with fewer the motion is not corrected
-_STEPS = 8
+_STEPS = 8  # of the correction
 _NEIGHBOURS = 8  # points that a plane is fitted to,
 _NEAR = 0.1  # whose depth differs by this fraction at most,
 _FLAT = 0.02  # and whose smallest variance is below this fraction of the next
@@ -60,117 +60,151 @@ _NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
 # The motion of images, estimated where no pose is known.
 _MIN_INLIERS = 30  # matches that agree with it; fewer support none
 _MIN_FRACTION = 0.25  # of the matches that agree with it
-_KEYPOINTS = 3000
+_KEYPOINTS = 3000  # of an image, at most
 _RATIO = 0.8  # of the distances to the nearest and the next descriptor, as Lowe has it
 _ITERATIONS = 1000  # of RANSAC
 _CONFIDENCE = 0.9999  # that RANSAC tried a set of inliers
-_REPROJECTION_PX = 2.0
-_JUMP = 1.1  # ratio of depths of the points around a keypoint
+_REPROJECTION_PX = 2.0  # distance of a match that agrees, at most
+_JUMP = 1.1  # ratio of depths of the points around a keypoint, from which on it has none
+_AROUND = 4  # points that a keypoint has its depth from
 _LEAST_DISTANCE_PX = 1e-3  # between a keypoint and a point, so that its weight is finite
 
 
 Scan = tuple[Points, Floats]
-"""The points of another frame in its image, and (3, 4) the motion from its camera to this one."""
+"""The points of another frame in pixels of its image, and its motion (3, 4) in metres.
+
+The motion leads from coordinates of the other frame's camera to those of this frame's: x_here =
+motion[:, :3] · x_there + motion[:, 3]."""
 Keypoints = tuple[Floats, NDArray[np.float32]]
 """(K, 2) pixel coordinates and (K, 128) descriptors of SIFT."""
 
 
 def _spacing_px(points: Points) -> float:
-    """Side of the square that each point has in the mean, in pixels."""
+    """The mean spacing of points in pixels: the side of the square that each has to itself."""
     return float(np.sqrt(points.size[0] * points.size[1] / len(points)))
 
 
 def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera: Camera) -> Points:
-    """Returns the frame's own points followed by those of its neighbours that agree with them.
+    """Returns a frame's own points followed by those of neighbouring frames that agree with them.
 
-    The neighbours are by the number of frames, at least 1, that are between them and this one.
+    Args:
+        points: The frame's own points.
+        neighbours: Scans of other frames by how many frames they are before or after this one, from
+            1 on.
+        camera: The camera of all frames.
     """
-    result = points
+    joined = points
     for apart, scans in sorted(neighbours.items()):
-        # The points of the neighbours that are so many frames away, where this frame has them.
+        # The points of these neighbours in this frame's camera, their motions corrected.
         moved = []
         for neighbour, motion in scans:
             xyz = unproject(camera, neighbour.xy, neighbour.depth)
             refined = refine_motion(points, xyz, motion, camera)
             moved.append(xyz @ refined[:, :3].T + refined[:, 3])
-        # Those join that agree with measured points, where none is known so far.
+        # Those join that agree with measured points, if no point so far is within `apart` pixels.
         xyz, xy = points_in_image(np.concatenate(moved), camera, points.size)
         agrees = _agrees(xy, xyz[:, 2], points)
         xy = xy[agrees]
         depth = xyz[agrees, 2]
-        free = cKDTree(result.xy).query(xy)[0] >= apart
-        result = replace(
-            result,
-            xy=np.concatenate([result.xy, xy[free].astype(np.float32)]),
-            depth=np.concatenate([result.depth, depth[free].astype(np.float32)]),
+        distance_px, _ = cKDTree(joined.xy).query(xy)
+        is_free = distance_px >= apart
+        joined = replace(
+            joined,
+            xy=np.concatenate([joined.xy, xy[is_free].astype(np.float32)]),
+            depth=np.concatenate([joined.depth, depth[is_free].astype(np.float32)]),
         )
-    return result
+    return joined
 
 
 def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
-    """(M,) true where a moved point agrees with the measured points around it."""
-    near = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
-    difference = np.abs(np.log(depth[:, None] / measured.depth[near]))
+    """(M,) true where a moved point agrees with the measured points around it.
+
+    Args:
+        xy: (M, 2) pixel coordinates of the moved points.
+        depth: (M,) their depths, metres.
+        measured: The frame's own points.
+    """
+    nearest = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
+    difference = np.abs(np.log(depth[:, None] / measured.depth[nearest]))
     # The nearest one agrees with it, or several of the nearest do.
-    alike = difference[:, :_COMPARED] <= _TOLERANCE
-    supported = alike[:, 0] | (alike.sum(axis=1) >= _AGREEING)
+    is_alike = difference[:, :_COMPARED] <= _TOLERANCE
+    is_supported = is_alike[:, 0] | (is_alike.sum(axis=1) >= _AGREEING)
     # None that is close in the image has quite another depth.
-    offset = np.abs(measured.xy[near] - xy[:, None]) / _spacing_px(measured)
+    offset = np.abs(measured.xy[nearest] - xy[:, None]) / _spacing_px(measured)
     is_close = (offset <= _CLOSE).all(axis=2)
-    contradicted = (is_close & (difference > _CONTRADICTION)).any(axis=1)
-    agrees: Mask = supported & ~contradicted
+    is_contradicted = (is_close & (difference > _CONTRADICTION)).any(axis=1)
+    agrees: Mask = is_supported & ~is_contradicted
     return agrees
 
 
 def _nearest(tree: cKDTree, xy: NDArray[np.floating], count: int) -> NDArray[np.intp]:
-    """(M, K) numbers of the measured points nearest to pixels: `count`, or all if there are fewer.
+    """(M, K) numbers of the points nearest to each of M pixels, the nearest first.
 
-    There may be no pixels, as of a neighbour that sees nothing of the frame's view.
+    K is `count`, or the number of points if there are fewer. There may be no pixels, as of a
+    neighbour that sees nothing of the frame's view.
+
+    Args:
+        tree: Tree of the points' pixel coordinates.
+        xy: (M, 2) pixel coordinates.
+        count: Number of points that are wanted.
     """
     ranks = np.arange(1, min(count, tree.n) + 1)  # a list of ranks gives a row for each pixel
-    _, near = tree.query(xy, k=ranks)
-    return np.asarray(near, np.intp)
+    _, numbers = tree.query(xy, k=ranks)
+    return np.asarray(numbers, np.intp)
 
 
 def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
     """Unit normals (N, 3) of the planes through the neighbours of each point, and which are flat.
 
-    The points are `xyz` (N, 3) in the camera's coordinates; the tree is of their pixels.
+    A normal's sign is either of the two. The mask (N,) is true where the neighbours lie in a plane.
+
+    Args:
+        points: N points.
+        xyz: (N, 3) the same points in the camera's coordinates, metres.
+        tree: Tree of their pixel coordinates.
     """
-    near = _nearest(tree, points.xy, _NEIGHBOURS)
+    neighbours = _nearest(tree, points.xy, _NEIGHBOURS)
     # The normal is the direction in which the neighbours vary least.
-    around = xyz[near] - xyz[near].mean(axis=1, keepdims=True)
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
-    jump = np.abs(np.log(points.depth[near] / points.depth[:, None])).max(axis=1)
-    flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
-    return axes[:, :, 0], flat
+    around = xyz[neighbours] - xyz[neighbours].mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # rising variances
+    jump = np.abs(np.log(points.depth[neighbours] / points.depth[:, None])).max(axis=1)
+    is_flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
+    return axes[:, :, 0], is_flat
 
 
 def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
-    """Returns the motion (3, 4) that puts points on measured surfaces; the given one if that fails.
+    """Returns the motion (3, 4) corrected so that another frame's points lie on measured surfaces.
 
-    The points (M, 3) are in the other camera's coordinates. The motion leads from there to the
-    camera that measured the surfaces.
+    It is the given one if too few points are near to a surface.
+
+    Args:
+        measured: The points of the frame, which measured the surfaces.
+        xyz: (M, 3) points of the other frame in its camera's coordinates, metres.
+        motion: (3, 4) from there to the camera of the frame, metres.
+        camera: The camera of both frames.
     """
-    reach = _REACH * _spacing_px(measured)
+    # The planes of the measured points.
+    reach_px = _REACH * _spacing_px(measured)
     tree = cKDTree(measured.xy)
     surface = unproject(camera, measured.xy, measured.depth)
-    normals, flat = _planes(measured, surface, tree)
+    normals, is_flat = _planes(measured, surface, tree)
     refined = motion
     for _ in range(_STEPS):
-        # Pairs of a moved point and a plane, and how far apart they are.
+        # Pairs of a moved point and the plane at the measured point nearest to it in the image, and
+        # how far apart they are, as a fraction of the depth.
         moved = xyz @ refined[:, :3].T + refined[:, 3]
         moved, xy = points_in_image(moved, camera, measured.size)
-        distance_px, index = tree.query(xy, distance_upper_bound=reach)
-        near = np.isfinite(distance_px)
-        near[near] &= flat[index[near]]
-        moved, index = moved[near], index[near]
+        distance_px, index = tree.query(xy, distance_upper_bound=reach_px)
+        is_paired = np.isfinite(distance_px)
+        is_paired[is_paired] &= is_flat[index[is_paired]]
+        moved, index = moved[is_paired], index[is_paired]
         if len(index) < _MIN_PLANES:
             return motion
         normal = normals[index]
         depth = surface[index, 2]
         distance = np.einsum("ij,ij->i", moved - surface[index], normal) / depth
-        # A step of weighted least squares towards the planes.
+        # A step of least squares towards the planes, with the weights of Geman and McClure. `slope`
+        # is the derivative of the distance by a small rotation vector and translation.
         typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
         weight = (1 + (distance / (2 * typical)) ** 2) ** -2
         slope = np.column_stack([np.cross(moved, normal), normal]) / depth[:, None]
@@ -182,7 +216,7 @@ def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera)
 
 
 def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
-    """Returns the keypoints of an image (H, W, 3) in 0…1."""
+    """Returns the SIFT keypoints of an image (H, W, 3) in 0…1; there may be none."""
     grey = cv2.cvtColor((rgb * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     # OpenCV's annotations lack SIFT
     keypoints, descriptors = cv2.SIFT_create(nfeatures=_KEYPOINTS).detectAndCompute(grey, None)  # type: ignore[attr-defined, unused-ignore]
@@ -195,19 +229,26 @@ def keypoints_of(rgb: NDArray[np.float32]) -> Keypoints:
 def motion_of_images(
     here: Keypoints, there: Keypoints, points: Points, camera: Camera
 ) -> tuple[Floats | None, str]:
-    """Returns the motion from the other frame's camera to this one's, from matched keypoints.
+    """Returns the motion from another frame's camera to this one's, from matched keypoints.
 
-    The points are the sparse depth of the other frame; both have the same camera. The motion is
-    (3, 4) in metres, and None if it is refused. The text says what supports it, or why it is.
+    Args:
+        here: Keypoints of this frame's image.
+        there: Keypoints of the other frame's image.
+        points: Sparse depth of the other frame.
+        camera: The camera of both frames.
+
+    Returns:
+        The motion (3, 4) in metres, None if it is refused; and a text that says what supports it,
+        or why it is refused.
     """
     # Keypoints of the other frame, which have its depth, and the rays on which this one sees them.
     xy_there, xy_here = _matches(here, there)
-    depth, known = _depth_at(points, xy_there)
-    xyz = unproject(camera, xy_there[known], depth[known])
-    rays = rays_of(camera, xy_here[known])
+    depth, is_known = _depth_at(points, xy_there)
+    xyz = unproject(camera, xy_there[is_known], depth[is_known])
+    rays = rays_of(camera, xy_here[is_known])
     if len(xyz) < _MIN_INLIERS:
         return None, f"{len(xyz)} matches with depth, at least {_MIN_INLIERS} needed"
-    # The motion with most matches; rays are pixels of a camera of focal length 1.
+    # The motion that most matches agree with; rays are pixels of a camera of focal length 1.
     solved, rotation, translation, index = cv2.solvePnPRansac(
         xyz,
         rays,
@@ -236,7 +277,14 @@ def motion_of_images(
 
 
 def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
-    """(M, 2) keypoints of the other image, and (M, 2) their partners in this one."""
+    """(M, 2) pixel coordinates of keypoints of the other image, and (M, 2) of their partners here.
+
+    A keypoint is matched if its descriptor's nearest one here is clearly nearer than the next.
+
+    Args:
+        here: Keypoints of this frame's image.
+        there: Keypoints of the other frame's image.
+    """
     xy_here, descriptors_here = here
     xy_there, descriptors_there = there
     if min(len(xy_here), len(xy_there)) < 2:
@@ -249,12 +297,20 @@ def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
 
 
 def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
-    """Depth (M,) at pixels, a mean of the inverses of points around, and where it is known."""
+    """Depth (M,) at pixels (M, 2), and (M,) where it is known: on one surface, beside a point.
+
+    Depth is the inverse of the mean inverse depth of the nearest points, weighted by nearness.
+
+    Args:
+        points: The points.
+        xy: (M, 2) pixel coordinates.
+    """
     if len(points) < _MIN_INLIERS or not len(xy):
         return np.zeros(len(xy)), np.zeros(len(xy), bool)
-    distance, near = cKDTree(points.xy).query(xy, k=4)
-    around = points.depth[near].astype(np.float64)
-    smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
-    weights = 1 / np.maximum(distance, _LEAST_DISTANCE_PX)
+    distance_px, numbers = cKDTree(points.xy).query(xy, k=_AROUND)
+    around = points.depth[numbers].astype(np.float64)
+    is_smooth = around.max(axis=1) < _JUMP * around.min(axis=1)
+    is_near = distance_px[:, 0] < _REACH * _spacing_px(points)
+    weights = 1 / np.maximum(distance_px, _LEAST_DISTANCE_PX)
     depth = weights.sum(axis=1) / (weights / around).sum(axis=1)
-    return depth, smooth & (distance[:, 0] < _REACH * _spacing_px(points))
+    return depth, is_smooth & is_near

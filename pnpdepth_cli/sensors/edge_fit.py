@@ -24,15 +24,15 @@ from pnpdepth_cli.sensors.projection import points_in_image
 _LONGEST_PX = 1280
 """Longer side of the image, to which it is reduced. The next five are pixels of that."""
 _BLUR = 1.0
-"""Standard deviation by which noise is smoothed."""
+"""Standard deviation of the blur that smooths noise."""
 _SURROUNDINGS = 16.0
-"""Standard deviation in which an edge is compared with others."""
+"""Standard deviation of the surroundings that an edge is compared with."""
 _BAND = 12.0
 """Standard deviation beyond which the strength of edges says nothing of a place."""
 _COARSER = 4
-"""Times, in which blurs by more pixels than these are made."""
+"""Factor by which an image is reduced before a blur by more pixels than that."""
 _REACH = 1.0
-"""Standard deviation of an edge; jumps are no better known."""
+"""Standard deviation of the blur of an edge; jumps are no better known."""
 _DARK = 0.004
 """Gradient of noise, of the range 0…1 of an image."""
 _NEIGHBOURS = 12
@@ -40,38 +40,40 @@ _NEIGHBOURS = 12
 _JUMP = 1.3
 """Ratio of depths across a jump of weight 1."""
 _LEAST_WEIGHT = 0.15
-"""Of a jump that counts; below are slopes, such as a road."""
+"""Weight of a jump that counts; below are slopes, such as a road."""
 _TO_THE_FAR_SIDE = 0.3
-"""Of the way, where the edge is: beams are wide, and the near side returns."""
+"""Fraction of the way to the far neighbour where the edge is: beams are wide, and the near side
+returns."""
 _LEAST_DEPTH_M = 0.1
-"""Before the camera, at which a pixel is known."""
+"""Depth before the camera from which on a point has a pixel."""
 _LEAST_JUMPS = 30
-"""Points; fewer tell too little."""
+"""Points at jumps of weight 1; fewer tell too little."""
 
 
 class Jumps(NamedTuple):
     """Where depth jumps from a beam of a scan to a neighbour's, in a camera's coordinates."""
 
-    xyz: Floats  # (N, 3) between the two, at the depth of the nearer
-    beyond: Floats  # (N, 3) a pixel farther towards the other
-    weights: Floats  # (N,), their squares add up to 1
-    clear: int  # number of those that are at least `_JUMP`
+    xyz: Floats  # (N, 3) metres, between the two beams, at the depth of the nearer
+    beyond: Floats  # (N, 3) metres, a pixel farther towards the other beam
+    weights: Floats  # (N,) how large each jump is; their squares add up to 1
+    clear: int  # number of jumps by a ratio of at least `_JUMP`
 
-    def largest(self, share: float) -> Jumps:
-        """Returns those of at least this share of the largest weight."""
-        which = self.weights >= share * self.weights.max()
+    def largest(self, fraction: float) -> Jumps:
+        """Returns the jumps whose weight is at least a fraction of the largest weight."""
+        is_large = self.weights >= fraction * self.weights.max()
         return self._replace(
-            xyz=self.xyz[which], beyond=self.beyond[which], weights=self.weights[which]
+            xyz=self.xyz[is_large], beyond=self.beyond[is_large], weights=self.weights[is_large]
         )
 
     def moved(self, motion: Extrinsics) -> Jumps:
-        """Returns the jumps in other coordinates."""
+        """Returns the jumps in the coordinates that a motion leads to."""
         return self._replace(xyz=motion.apply(self.xyz), beyond=motion.apply(self.beyond))
 
     def projected(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Returns pixels (M, 2) of those before the camera, and weights (M, 3) for an `EdgeMap`.
+        """Returns pixels (M, 2) and weights (M, 3), for an `EdgeMap`, of jumps before the camera.
 
-        The weights are products of a jump's direction in the image: x·x, y·y, x·y.
+        A jump's weights are its own weight times x·x, y·y and x·y of its direction (x, y) in the
+        image, a unit vector.
         """
         ahead = (self.xyz[:, 2] > _LEAST_DEPTH_M) & (self.beyond[:, 2] > _LEAST_DEPTH_M)
         xy = pixels_of(camera, self.xyz[ahead])
@@ -85,13 +87,19 @@ class Jumps(NamedTuple):
 class EdgeMap(NamedTuple):
     """Edges of an image at a reduced size."""
 
-    strength: NDArray[np.float32]  # (h, w, 3), across x, across y, and their product; of mean 0
-    scale: float  # of the reduced image
+    strength: NDArray[np.float32]
+    """(h, w, 3), strength of edges across x, across y, and the mixed product; their mean over the
+    surroundings is taken off."""
+    scale: float  # size of the reduced image over that of the image
 
     def score(self, xy: Floats, weights: Floats) -> float:
-        """Returns the correlation of weights (N, 3) at pixels (N, 2) with the edges there.
+        """Returns the sum of weights times the strength of the edges at their pixels.
 
         Outside the image the strength is 0.
+
+        Args:
+            xy: (N, 2) pixel coordinates of the image at full size.
+            weights: (N, 3), as of `Jumps.projected`.
         """
         height, width = self.strength.shape[:2]
         x, y = self._reduced(xy)
@@ -100,22 +108,26 @@ class EdgeMap(NamedTuple):
         return float(np.vdot(strength, weights.take(inside, axis=0)))
 
     def shifted(self, xy: Floats, weights: Floats, reach_px: tuple[float, float]) -> Floats:
-        """Returns the correlation at all shifts up to `reach_px` down and right, 0 in the middle.
+        """Returns the score at all shifts of the pixels, (2·down + 1, 2·right + 1).
+
+        `down` and `right` are the reach in pixels of the reduced image. The element in the middle
+        is the score without a shift.
 
         Args:
-            xy: (N, 2) pixels of the image.
-            weights: (N, 3).
-            reach_px: Pixels of the image.
+            xy: (N, 2) pixel coordinates of the image at full size.
+            weights: (N, 3), as of `Jumps.projected`.
+            reach_px: Largest shift to each side, down and right, in pixels of the full image.
         """
         height, width = self.strength.shape[:2]
         down = max(1, round(reach_px[0] * self.scale))
         right = max(1, round(reach_px[1] * self.scale))
+        # The weights are drawn into an image, which is correlated with the edges.
         x, y = self._reduced(xy)
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        place = (y * width + x)[inside]
+        pixel = (y * width + x)[inside]
         total = np.zeros((2 * down + 1, 2 * right + 1))
         for channel in range(3):
-            drawn = np.bincount(place, weights[inside, channel], height * width)
+            drawn = np.bincount(pixel, weights[inside, channel], height * width)
             template = drawn.reshape(height, width).astype(np.float32)
             strength = cv2.copyMakeBorder(
                 self.strength[:, :, channel],
@@ -130,7 +142,8 @@ class EdgeMap(NamedTuple):
         return total
 
     def _reduced(self, xy: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Columns and rows of the reduced image, of pixels (N, 2)."""
+        """Columns (N,) and rows (N,) in the reduced image of pixels (N, 2) of the full one."""
+        # The centre of a pixel is half a pixel from the image's edge, about which it was reduced.
         x, y = np.floor((np.asarray(xy, np.float64) + 0.5) * self.scale).astype(np.intp).T
         return x, y
 
@@ -143,7 +156,7 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
     small = cv2.GaussianBlur(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
     across_x = cv2.Sobel(small, cv2.CV_32F, 1, 0, scale=0.125)
     across_y = cv2.Sobel(small, cv2.CV_32F, 0, 1, scale=0.125)
-    # The strength of edges is relative to their surroundings.
+    # The products of the gradient with itself, summed over the colours: x·x, y·y, 2·x·y.
     products = np.dstack(
         [
             np.square(across_x).sum(axis=2),
@@ -151,21 +164,25 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
             2 * (across_x * across_y).sum(axis=2),
         ]
     )
-    squared = products[:, :, 0] + products[:, :, 1] + 1e-12
+    # The strength of edges is relative to their surroundings.
+    squared = products[:, :, 0] + products[:, :, 1] + 1e-12  # so that it can be divided by
     strength = np.sqrt(squared)
     relative = np.sqrt(strength / (_widely_blurred(strength, _SURROUNDINGS) + _DARK))
-    # Each direction has its share: with the weights of `Jumps.projected`, it is the squared cosine
-    # of the angle between the two.
-    shares = products * (relative / squared)[:, :, None]
-    sharp = cv2.GaussianBlur(shares, (0, 0), _REACH)
-    return EdgeMap(np.asarray(sharp - _widely_blurred(shares, _BAND)), scale)
+    # Each direction has its part: times the weights of `Jumps.projected`, the sum is the strength
+    # times the squared cosine of the angle between gradient and jump.
+    by_direction = products * (relative / squared)[:, :, None]
+    sharp = cv2.GaussianBlur(by_direction, (0, 0), _REACH)
+    return EdgeMap(np.asarray(sharp - _widely_blurred(by_direction, _BAND)), scale)
 
 
-def _widely_blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
-    """The image blurred by many pixels, which needs a fraction of the resolution."""
-    height, width = values.shape[:2]
+def _widely_blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """The image (h, w) or (h, w, channels) blurred by a Gaussian of many pixels.
+
+    That needs a fraction of the resolution only.
+    """
+    height, width = image.shape[:2]
     small = max(1, round(width / _COARSER)), max(1, round(height / _COARSER))
-    reduced = cv2.resize(values, small, interpolation=cv2.INTER_AREA)
+    reduced = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(reduced, (0, 0), sigma_px / _COARSER)
     return np.asarray(cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR))
 
@@ -173,18 +190,18 @@ def _widely_blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.
 def jumps_of(
     scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
 ) -> Jumps | None:
-    """Returns where depth jumps in a scan (N, 3); None where jumps are too few to tell anything.
+    """Returns where depth jumps in a scan, in the camera's coordinates; None where few jumps are.
 
-    Neighbours are those that the scanner sees: from elsewhere, near and far beams mix, and where
-    the camera is taken to be must not change what a jump is.
+    Points are neighbours if they are so for the scanner: from elsewhere, near and far beams mix,
+    and where the camera is taken to be must not change what a jump is.
 
     Args:
-        scan: In the scanner's coordinates.
-        camera: Points outside its image (H, W) are left out.
-        scanner: Its pose.
-        size: (H, W).
+        scan: (N, 3) points in the scanner's coordinates, metres.
+        camera: The camera of the image; points outside the image are left out.
+        scanner: The scanner's pose beside the camera.
+        size: (H, W) of the image.
     """
-    # Pixels of a camera at the scanner's place.
+    # Pixels of a camera at the scanner's place, which has the camera's axes and focal length.
     seen, _ = points_in_image(scanner.apply(scan), camera, size)
     seen = seen - scanner.translation
     seen = seen[seen[:, 2] > _LEAST_DEPTH_M]
@@ -202,24 +219,26 @@ def jumps_of(
     clear = int(np.count_nonzero(largest >= 1))
     if clear < _LEAST_JUMPS:
         return None
-    near = largest >= _LEAST_WEIGHT
-    distances, neighbours = distances[near], neighbours[near]
-    weights, largest = weights[near], largest[near]
-    # Its direction is the mean one to the neighbours that are as far; the edge is before them.
+    is_jump = largest >= _LEAST_WEIGHT
+    distances, neighbours = distances[is_jump], neighbours[is_jump]
+    weights, largest = weights[is_jump], largest[is_jump]
+    # Its direction is the mean one to the neighbours whose jump is at least half as large; the edge
+    # is before the nearest of them.
     weights[weights < largest[:, None] / 2] = 0
-    steps = xy[neighbours] - xy[near][:, None]
+    steps = xy[neighbours] - xy[is_jump][:, None]
     directions = (steps * (weights / np.maximum(distances, 1e-6))[:, :, None]).sum(axis=1)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     nearest_far = np.where(weights > 0, distances, np.inf).argmin(axis=1)
     step = steps[np.arange(len(steps)), nearest_far]
-    between = xy[near] + _TO_THE_FAR_SIDE * step
-    ends = [
-        np.column_stack([pixels / focal_px, np.ones(len(pixels))]) * depth[near, None]
+    # Two points at the depth of the nearer beam: on the edge, and a pixel beyond it.
+    between = xy[is_jump] + _TO_THE_FAR_SIDE * step
+    on_edge, beyond = (
+        np.column_stack([pixels / focal_px, np.ones(len(pixels))]) * depth[is_jump, None]
         for pixels in (between, between + directions)
-    ]
+    )
     return Jumps(
-        xyz=ends[0] + scanner.translation,
-        beyond=ends[1] + scanner.translation,
+        xyz=on_edge + scanner.translation,
+        beyond=beyond + scanner.translation,
         weights=largest / np.linalg.norm(largest),
         clear=clear,
     )

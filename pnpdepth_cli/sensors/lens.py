@@ -29,7 +29,7 @@ _SAMPLES = 8192
 _NEWTON_STEPS = 12
 _NEWTON_DIFFERENCE = 1e-7  # step of the central differences
 _NEWTON_END = 1e-9  # a smaller step leaves an error that is smaller than rounding
-_SHOWN_ERROR = 1e-6  # largest error of a direction that was found
+_SHOWN_ERROR = 1e-6  # largest distance of where the lens shows a direction from the point
 
 
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
@@ -44,7 +44,7 @@ def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
 
 
 def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
-    """Returns the directions at (N, 2) pixels, (N, 2) x / z and y / z of the camera's coordinates.
+    """Returns the directions seen at (N, 2) pixels: (N, 2) x / z and y / z in camera coordinates.
 
     NaN where the lens shows nothing.
     """
@@ -54,9 +54,14 @@ def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
 
 
 def rays_of_image(camera: Camera, size: Size) -> Floats:
-    """Returns the directions at the pixels of an image, (H, W, 2) x / z and y / z; read only.
+    """Returns the directions at all pixels of an image, (H, W, 2) x / z and y / z; read only.
 
-    Those of the last camera are kept, as the frames of a sequence mostly have one.
+    Those of the last camera are kept, as the frames of a sequence mostly have one. NaN where the
+    lens shows nothing.
+
+    Args:
+        camera: The camera, in pixels of the image.
+        size: (H, W) of the image.
     """
     intrinsics = tuple(camera.intrinsics.ravel().tolist())
     return _rays_of_image(intrinsics, camera.lens, camera.distortion, size)
@@ -66,7 +71,16 @@ def rays_of_image(camera: Camera, size: Size) -> Floats:
 def _rays_of_image(
     intrinsics: tuple[float, ...], lens: str, distortion: Coefficients, size: Size
 ) -> Floats:
-    """The rays of a camera that is given by what can be a key."""
+    """The directions at all pixels of an image, (H, W, 2) x / z and y / z, read only.
+
+    The camera is given by hashable values, by which the cache finds them.
+
+    Args:
+        intrinsics: The nine numbers of the matrix, row after row.
+        lens: Name of `choices.LENSES`.
+        distortion: Coefficients of the lens.
+        size: (H, W) of the image.
+    """
     camera = Camera(intrinsics=np.reshape(intrinsics, (3, 3)), lens=lens, distortion=distortion)
     height, width = size
     columns = np.arange(width)
@@ -78,16 +92,24 @@ def _rays_of_image(
 
 
 def unproject(camera: Camera, xy: NDArray[np.floating], depth: NDArray[np.floating]) -> Floats:
-    """Returns the (N, 3) points in the camera's coordinates at (N, 2) pixels of (N,) depth z."""
+    """Returns the points (N, 3) in the camera's coordinates at pixels (N, 2) of depth z (N,).
+
+    They are in the unit of the depth; NaN where the lens shows nothing.
+    """
     rays = np.column_stack([rays_of(camera, xy), np.ones(len(xy))])
     return rays * np.asarray(depth, np.float64)[:, None]
 
 
 def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """Returns (N, 2) points on the image plane, z = 1, as the lens shows them.
+    """Returns where on the image plane, z = 1, a lens shows directions; (N, 2).
 
     NaN beyond the angle at which the distortion turns back on itself: there the model would show
     directions from outside the field of view inside it.
+
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
     """
     with np.errstate(all="ignore"):
         shown = _distort_anywhere(plane, lens, coefficients)
@@ -96,39 +118,58 @@ def distort(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
 
 
 def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """Returns the (N, 2) directions that the lens shows at points on the image plane.
+    """Returns the directions, (N, 2) x / z and y / z, that a lens shows at points of its image.
 
-    Newton's method from the inverse of the radial part; NaN where the lens shows nothing.
+    It is the inverse of `distort`, by Newton's method; NaN where the lens shows nothing.
+
+    Args:
+        shown: (N, 2) points on the image plane, z = 1.
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
     """
+    # The curve of the radial part, up to where it turns back.
     radius, shown_radius = _radial_curve(lens, coefficients)
     rising = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
-    distance = np.hypot(shown[:, 0], shown[:, 1])
+    shown_distance = np.hypot(shown[:, 0], shown[:, 1])
     with np.errstate(all="ignore"):
-        # The start, of a lens without its tangential parts.
-        inverse = np.interp(distance, shown_radius[:rising], radius[:rising])
-        plane = shown * np.where(distance > 0, inverse / distance, 1.0)[:, None]
+        # The start is the inverse of that curve.
+        distance = np.interp(shown_distance, shown_radius[:rising], radius[:rising])
+        scale = np.where(shown_distance > 0, distance / shown_distance, 1.0)
+        plane = shown * scale[:, None]
         # Steps of those directions that still move.
         moving = np.arange(len(plane))
         for _ in range(_NEWTON_STEPS):
             step = _newton_step(plane[moving], shown[moving], lens, coefficients)
             plane[moving] -= step
             moving = moving[np.abs(step).max(axis=1) > _NEWTON_END]
-        # A direction that the lens does not show there is none.
+        # Where no direction is shown at the point, the steps end elsewhere, or at NaN.
         error = np.hypot(*(distort(plane, lens, coefficients) - shown).T)
         plane[~(error < _SHOWN_ERROR)] = np.nan
     return plane
 
 
 def largest_radius(lens: str, coefficients: Coefficients) -> float:
-    """Returns the tangent of the angle to the axis up to which the distortion is monotonic."""
+    """Returns the distance from the axis on the plane z = 1 up to which a lens shows rays in order.
+
+    Farther out its distortion turns back, and shows rays nearer to the axis again. Infinite if it
+    does not turn back within the widest angle that is looked at.
+    """
     radius, shown_radius = _radial_curve(lens, coefficients)
     turning = np.flatnonzero(~(np.diff(shown_radius) > 0))
     return float(radius[turning[0]]) if turning.size else np.inf
 
 
 def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """How far (N, 2) the directions are from those shown there, by central differences."""
-    # The derivatives [[a, b], [c, d]] of what is shown, a column for each axis of the plane.
+    """(N, 2) the step of Newton's method, which is subtracted from directions.
+
+    Args:
+        plane: (N, 2) directions so far, on the plane z = 1.
+        shown: (N, 2) where the lens shows the directions that are sought.
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
+    """
+    # The derivatives [[a, b], [c, d]] of what is shown, a column for each axis of the plane, by
+    # central differences.
     columns = []
     for axis in np.eye(2) * _NEWTON_DIFFERENCE:
         ahead = _distort_anywhere(plane + axis, lens, coefficients)
@@ -136,29 +177,46 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
         columns.append((ahead - behind) / (2 * _NEWTON_DIFFERENCE))
     a, c = columns[0].T
     b, d = columns[1].T
-    # Their inverse, applied to the error.
+    # Their inverse, [[d, −b], [−c, a]] over the determinant, applied to the error.
     x, y = (_distort_anywhere(plane, lens, coefficients) - shown).T
-    return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)[:, None])
+    determinant = a * d - b * c
+    return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / determinant[:, None])
 
 
 @functools.lru_cache(maxsize=64)
 def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats]:
-    """Radii on the plane of rays ever farther from the axis, and where the lens shows them.
+    """Rising distances from the axis on the plane z = 1, and at which distance a lens shows each.
 
-    Its tangential parts, which are small, are left out.
+    The tangential parts of the lens, which are small, are left out.
+
+    Args:
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
+
+    Returns:
+        Two arrays of `_SAMPLES` distances; the second may fall where the lens turns back.
     """
     if lens == "fisheye":
         radius = np.tan(np.linspace(0, _WIDEST_ANGLE_RAD, _SAMPLES))
     else:
         radius = np.linspace(0, _WIDEST_PLANE, _SAMPLES)
-        coefficients = tuple(c if i in _RADIAL else 0.0 for i, c in enumerate(coefficients))
+        coefficients = tuple(
+            coefficient if number in _RADIAL else 0.0
+            for number, coefficient in enumerate(coefficients)
+        )
     with np.errstate(all="ignore"):
         shown = _distort_anywhere(np.column_stack([radius, 0 * radius]), lens, coefficients)
     return radius, shown[:, 0]
 
 
 def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """The points (N, 2) by the lens model, also beyond where it turns back."""
+    """(N, 2) where a lens model shows directions on the image plane, also where it turns back.
+
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
+    """
     if not len(plane):  # which OpenCV refuses
         return plane.copy()
     if lens == "fisheye":
@@ -167,7 +225,13 @@ def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> F
 
 
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
-    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]."""
+    """(N, 2) where a radial-tangential lens shows directions on the image plane.
+
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]; those that
+            are not given are 0.
+    """
     padded = (*coefficients, *[0.0] * 14)[:14]
     if any(padded[12:]):  # the sensor is tilted; OpenCV takes 6 times as long
         points = np.column_stack([plane, np.ones(len(plane))])
@@ -187,6 +251,12 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
 
 
 def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
-    """OpenCV's equidistant k1 k2 k3 k4; without them the angle is the distance to the centre."""
+    """(N, 2) where a fisheye lens shows directions on the image plane.
+
+    Args:
+        plane: (N, 2) x / z and y / z of the directions.
+        coefficients: OpenCV's k1 k2 k3 k4; those that are not given are 0. With all 0 the distance
+            to the centre is the angle to the axis in radians.
+    """
     padded = np.array((*coefficients, *[0.0] * 4)[:4])
     return np.asarray(cv2.fisheye.distortPoints(plane[:, None], np.eye(3), padded)[:, 0])

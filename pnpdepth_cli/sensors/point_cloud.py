@@ -19,8 +19,9 @@ from pnpdepth_cli.sensors.lens import pixels_of, rays_of_image
 from pnpdepth_cli.sensors.projection import Mask, pixel_index
 
 _EDGE = 0.05
-"""Jump of depth: of depth maps of indoor and street scenes, it cuts silhouettes and keeps floors
-down to a grazing angle of about 5 degrees."""
+"""Second difference of inverse depth, over the inverse depth, from which on depth jumps. On depth
+maps of indoor and street scenes, it cuts silhouettes and keeps floors down to a grazing angle of
+about 5 degrees."""
 
 _NEIGHBOURS = 8  # views that a view is compared with at most
 _WIDEST_DEG = 60.0  # widest angle between the axes of two cameras that see the same surfaces
@@ -39,7 +40,10 @@ class PointCloud(NamedTuple):
     rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
     def transform(self, pose: Floats) -> PointCloud:
-        """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to."""
+        """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to.
+
+        Such as from a camera to the world, by the camera's pose.
+        """
         xyz = _apply(self.xyz, pose[:3])
         normals = self.normals @ pose[:3, :3].T
         return PointCloud(xyz.astype(np.float32), normals.astype(np.float32), self.rgb)
@@ -55,14 +59,14 @@ def cloud_from_depth(
 ) -> Iterator[PointCloud]:
     """Yields the points of a depth map in the camera's coordinates, some rows of pixels at a time.
 
-    Pixels beside a jump of depth are left out.
+    Pixels beside a jump of depth are left out. The cloud is in the unit of the depth.
 
     Args:
         depth: (H, W), 0 = unknown.
         camera: Intrinsics and distortion of the image that the depth belongs to.
-        rgb: (H, W, 3) 0…1.
+        rgb: (H, W, 3) in 0…1, the colours. None: the cloud has none.
     """
-    known = kept_pixels(depth)
+    is_kept = kept_pixels(depth)
     height, width = depth.shape
     rays = rays_of_image(camera, (height, width))
     rows = max(1, _STRIP_PIXELS // width)
@@ -70,11 +74,11 @@ def cloud_from_depth(
         # A strip of rows, and one more on each side, as normals take neighbours.
         strip = slice(top, top + rows)
         around = slice(max(0, top - 1), strip.stop + 1)
-        points = _points(depth[around], known[around], rays[around])
-        normals = _normals(points, known[around])
+        points = _points(depth[around], is_kept[around], rays[around])
+        normals = _normals(points, is_kept[around])
         # What of these belongs to the strip.
         inner = slice(top - around.start, strip.stop - around.start)
-        kept = known[strip]
+        kept = is_kept[strip]
         colours: NDArray[np.uint8] | None = None
         if rgb is not None:
             colours = np.rint(np.clip(rgb[strip][kept], 0, 1) * 255).astype(np.uint8)
@@ -86,14 +90,22 @@ def cloud_from_depth(
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None) -> Mask:
-    """Returns (H, W) true for the pixels of `keep` of which `cloud_from_depth` makes points."""
-    known = _known_pixels(depth)
+    """Returns (H, W) true for the pixels of which `cloud_from_depth` makes points.
+
+    These have a known depth, and none of them is beside a jump of depth.
+
+    Args:
+        depth: (H, W); not finite, or <= 0, is unknown.
+        keep: (H, W) true for pixels that may be kept. None: all.
+    """
+    is_known = _known_pixels(depth)
     if keep is not None:
-        known &= keep
-    return known & ~depth_edges(np.where(known, depth, 0))
+        is_known &= keep
+    return is_known & ~depth_edges(np.where(is_known, depth, 0))
 
 
 def _known_pixels(depth: NDArray[np.float32]) -> Mask:
+    """(H, W) true where depth is finite and above 0."""
     return np.asarray((depth > 0) & np.isfinite(depth))
 
 
@@ -101,18 +113,22 @@ def depth_edges(depth: NDArray[np.float32]) -> Mask:
     """Returns (H, W) true for pixels beside a jump of depth, on both of its sides.
 
     A jump is a second difference of inverse depth that is large beside the inverse depth. A plane
-    has none, whatever its slope: inverse depth is linear in the pixel coordinates.
+    has none, whatever its slope: inverse depth is linear in the pixel coordinates. Unknown depth
+    makes no jump.
+
+    Args:
+        depth: (H, W), 0 = unknown.
     """
-    known = depth > 0
-    inverse = np.where(known, 1 / np.where(known, depth, 1), np.nan)
-    result = np.zeros(depth.shape, bool)
+    is_known = depth > 0
+    inverse = np.where(is_known, 1 / np.where(is_known, depth, 1), np.nan)
+    is_edge = np.zeros(depth.shape, bool)
     for axis in (0, 1):
-        values = np.moveaxis(inverse, axis, 0)
-        middle = values[1:-1]
-        bend = np.abs(values[2:] - 2 * middle + values[:-2])
-        jump = bend > _EDGE * middle  # false beside unknown pixels
-        np.moveaxis(result, axis, 0)[1:-1] |= jump
-    return result
+        along_axis = np.moveaxis(inverse, axis, 0)
+        middle = along_axis[1:-1]
+        bend = np.abs(along_axis[2:] - 2 * middle + along_axis[:-2])
+        is_jump = bend > _EDGE * middle  # false beside unknown pixels, which are NaN
+        np.moveaxis(is_edge, axis, 0)[1:-1] |= is_jump  # a view: writes into `is_edge`
+    return is_edge
 
 
 def depth_normals(depth: NDArray[np.float32], camera: Camera) -> Floats:
@@ -126,41 +142,66 @@ def points_of_depth(depth: NDArray[np.float32], camera: Camera) -> Floats:
     return _points(depth, _known_pixels(depth), rays)
 
 
-def _points(depth: NDArray[np.float32], known: Mask, rays: Floats) -> Floats:
-    """(H, W, 3) points in the camera's coordinates on rays (H, W, 2), 0 where depth is unknown."""
-    z = depth[known].astype(np.float64)
+def _points(depth: NDArray[np.float32], is_known: Mask, rays: Floats) -> Floats:
+    """(H, W, 3) points in the camera's coordinates, 0 where depth is unknown.
+
+    Args:
+        depth: (H, W).
+        is_known: (H, W) true where it is known.
+        rays: (H, W, 2) x / z and y / z of the directions of the pixels.
+    """
+    z = depth[is_known].astype(np.float64)
     points = np.zeros((*depth.shape, 3))
-    points[known] = np.column_stack([rays[known] * z[:, None], z])
+    points[is_known] = np.column_stack([rays[is_known] * z[:, None], z])
     return points
 
 
-def _normals(points: Floats, known: Mask) -> Floats:
-    """Unit normals (H, W, 3) towards the camera from the differences of neighbours."""
-    across = _difference(points, known, 1)
-    normals = np.cross(_difference(points, known, 0), across)
+def _normals(points: Floats, is_known: Mask) -> Floats:
+    """Unit normals (H, W, 3) towards the camera, from the differences of neighbouring pixels.
+
+    0 where a pixel has no known neighbour in one of the two directions.
+
+    Args:
+        points: (H, W, 3) points in the camera's coordinates, 0 where unknown.
+        is_known: (H, W) true where a point is known.
+    """
+    down = _difference(points, is_known, 0)
+    across = _difference(points, is_known, 1)
+    normals = np.cross(down, across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     normals /= np.where(length > 0, length, 1)
-    away = (normals * points).sum(axis=2, keepdims=True) > 0
-    return np.where(away, -normals, normals)
+    # The camera is the origin: a normal along a point's ray points away from it, and is reversed.
+    is_away = (normals * points).sum(axis=2, keepdims=True) > 0
+    return np.where(is_away, -normals, normals)
 
 
-def _difference(points: Floats, known: Mask, axis: int) -> Floats:
-    """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none."""
+def _difference(points: Floats, is_known: Mask, axis: int) -> Floats:
+    """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none.
+
+    Args:
+        points: (H, W, 3) points, 0 where unknown.
+        is_known: (H, W) true where a point is known.
+        axis: 0 for the neighbours above and below, 1 for those on the left and right.
+    """
     points = np.moveaxis(points, axis, 0)
-    known = np.moveaxis(known, axis, 0)
+    is_known = np.moveaxis(is_known, axis, 0)
     # A point without a known neighbour on a side stands for it, so that the difference is smaller.
     before = points.copy()
     after = points.copy()
-    both = known[1:] & known[:-1]
+    both = is_known[1:] & is_known[:-1]
     before[1:][both] = points[:-1][both]
     after[:-1][both] = points[1:][both]
     return np.moveaxis(after - before, 0, axis)
 
 
 def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
-    """Returns one point per occupied cube of this side, the mean of all points of clouds in it.
+    """Returns one point for each occupied cube of space, the mean of all points of clouds in it.
 
     Points are sorted by cube; they have colours if all clouds do.
+
+    Args:
+        clouds: Clouds in one coordinate system; one at a time is in memory.
+        side: Side of a cube, in the unit of the clouds.
     """
     cubes = np.zeros((0, 3), np.int64)
     sums = np.zeros((0, 10))  # of each cube: x y z, red green blue, the normal's, and how many
@@ -170,13 +211,13 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
         rgb = np.zeros(cloud.xyz.shape) if cloud.rgb is None else cloud.rgb
         ones = np.ones((len(cloud.xyz), 1))
         # The sums so far are added up again with the points of this cloud.
-        values = np.concatenate([sums, np.hstack([cloud.xyz, rgb, cloud.normals, ones])])
+        summands = np.concatenate([sums, np.hstack([cloud.xyz, rgb, cloud.normals, ones])])
         cube_of_point = np.floor(cloud.xyz / side).astype(np.int64)
         cubes, index = np.unique(
             np.concatenate([cubes, cube_of_point]), axis=0, return_inverse=True
         )
         sums = np.zeros((len(cubes), 10))
-        np.add.at(sums, index.reshape(-1), values)
+        np.add.at(sums, index.reshape(-1), summands)
     # Means; those of normals are made unit vectors.
     xyz, rgb, normals = np.split(sums[:, :9] / sums[:, 9:], 3, axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -188,46 +229,66 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
 
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:
-    """Returns the views, of poses (N, 3, 4), nearest to one that look about the same way."""
+    """Returns the numbers of the views nearest to one that look about the same way.
+
+    Args:
+        poses: (N, 3, 4) poses of the views' cameras in the world.
+        index: Number of the one, which is not among them.
+    """
     distance = np.linalg.norm(poses[:, :, 3] - poses[index, :, 3], axis=1)
-    alike = poses[:, :, 2] @ poses[index, :, 2] > np.cos(np.radians(_WIDEST_DEG))
-    alike[index] = False
-    nearest = np.argsort(np.where(alike, distance, np.inf), kind="stable")
-    count = min(_NEIGHBOURS, np.count_nonzero(alike))
+    # The third column of a pose is the direction in which its camera looks.
+    is_alike = poses[:, :, 2] @ poses[index, :, 2] > np.cos(np.radians(_WIDEST_DEG))
+    is_alike[index] = False
+    nearest = np.argsort(np.where(is_alike, distance, np.inf), kind="stable")
+    count = min(_NEIGHBOURS, np.count_nonzero(is_alike))
     return [int(view) for view in nearest[:count]]
 
 
 def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDArray[np.float32]:
-    """Returns the mean depth of the views that agree with one, 0 where they are fewer.
+    """Returns (H, W) the mean depth of the views that agree with one, 0 where they are too few.
 
-    `min_views` have to agree, this one included.
+    Args:
+        here: The view.
+        others: Views that it is compared with.
+        min_views: How many views have to agree, this one included.
     """
     points, camera, pose = here
-    known = points[:, :, 2] > 0
-    rows, columns = np.nonzero(known)
+    is_known = points[:, :, 2] > 0
+    rows, columns = np.nonzero(is_known)
     xy = np.column_stack([columns, rows])
-    depth = points[known][:, 2].astype(float)
-    world = _apply(points[known], pose)
-    # Depths that agree are added up, this view's own first.
+    depth = points[is_known][:, 2].astype(float)
+    in_world = _apply(points[is_known], pose)
+    # Depths that agree are added up, this view's own first. A view agrees where what it has comes
+    # back to nearly the same pixel with nearly the same depth.
     total = depth.copy()
     count = np.ones(len(depth))
     for view in others:
-        index, back = _project_back(world, pose, view)
+        index, back = _project_back(in_world, pose, view)
         away_px = np.linalg.norm(pixels_of(camera, back) - xy[index], axis=1)
-        same_depth = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
-        agrees = (away_px <= _RETURN_PX) & same_depth
+        is_same_depth = np.abs(back[:, 2] - depth[index]) <= _RETURN_DEPTH * depth[index]
+        agrees = (away_px <= _RETURN_PX) & is_same_depth
         total[index[agrees]] += back[agrees, 2]
         count[index[agrees]] += 1
-    result = np.zeros(known.shape, np.float32)
-    result[known] = np.where(count >= min_views, total / count, 0)
-    return result
+    mean_depth = np.zeros(is_known.shape, np.float32)
+    mean_depth[is_known] = np.where(count >= min_views, total / count, 0)
+    return mean_depth
 
 
-def _project_back(world: Floats, here: Floats, other: View) -> tuple[NDArray[np.intp], Floats]:
-    """Indices of points that another view has depth of, and its points there, seen from a pose."""
+def _project_back(in_world: Floats, here: Floats, other: View) -> tuple[NDArray[np.intp], Floats]:
+    """What another view has at the pixels where it sees some points, in coordinates of one camera.
+
+    Args:
+        in_world: (N, 3) the points in the world.
+        here: (3, 4) pose of the one camera in the world.
+        other: The other view.
+
+    Returns:
+        (M,) the numbers of the points where it has depth that lies before the one camera; and
+        (M, 3) the points of its depth map there, in that camera's coordinates.
+    """
     points, camera, pose = other
     # Where the other view sees the points.
-    seen = _apply_inverse(world, pose)
+    seen = _apply_inverse(in_world, pose)
     index = np.flatnonzero(seen[:, 2] > 0)
     xy = pixels_of(camera, seen[index])
     size = (points.shape[0], points.shape[1])

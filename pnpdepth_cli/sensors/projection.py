@@ -39,7 +39,7 @@ _MARGIN_DEG = 0.24
 between scan lines, as foreground is measured only on them."""
 
 _STRETCH = 1.5  # multiple of half the parallax that is added to the margin
-_REACH_DEG = 0.8  # to each side, in which foreground is searched
+_REACH_DEG = 0.8  # angle to each side in which foreground is searched
 
 MIN_POINTS = 1000
 """Maps with fewer points are not filtered: each point matters."""
@@ -61,37 +61,67 @@ def as_depth_image(points: Points) -> NDArray[np.float32]:
 
 
 def pixel_index(xy: NDArray[np.floating], size: Size) -> NDArray[np.intp]:
-    """Returns the (N,) row-major indices of the pixels of points inside the image."""
+    """Returns the row-major indices (N,) of the pixels that points lie in.
+
+    Args:
+        xy: (N, 2) pixel coordinates inside the image.
+        size: (H, W) of the image.
+    """
     column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
     index: NDArray[np.intp] = row * size[1] + column
     return index
 
 
 class DropCounter:
-    """How many rows of an array each step dropped."""
+    """How many points each step of a projection dropped."""
 
     def __init__(self) -> None:
         self.dropped: dict[str, int] = {}
+        """Numbers of points by the reason, in the order of the steps."""
 
     def keep(self, mask: Mask, otherwise: str) -> Mask:
-        """Counts the rows where `mask` is false as dropped, with the reason; returns the mask."""
+        """Returns the mask itself, and counts the points where it is false as dropped.
+
+        Args:
+            mask: (N,) true for points that are kept.
+            otherwise: Reason why the others are dropped, such as "behind the camera".
+        """
         self.dropped[otherwise] = int(len(mask) - np.count_nonzero(mask))
         return mask
 
     def keep_seen(self, xyz: Floats, camera: Camera, size: Size) -> tuple[Floats, Floats]:
-        """Keeps the points that are the nearest of their pixel; returns them, and their pixels."""
+        """Returns the points that are the nearest of their pixel, and their pixel coordinates.
+
+        The others, and points outside the image, are counted as dropped.
+
+        Args:
+            xyz: (N, 3) points in the camera's coordinates, z > 0.
+            camera: The camera of the image.
+            size: (H, W) of the image.
+
+        Returns:
+            (M, 3) the points, and (M, 2) their pixel coordinates.
+        """
         xy = pixels_of(camera, xyz)
         inside = self.keep(in_frame(xy, size), "outside the image")
         xyz, xy = xyz[inside], xy[inside]
+        # Sorted by pixel, then by depth, the first point of each pixel is the nearest.
         pixel = pixel_index(xy, size)
         order = np.lexsort((xyz[:, 2], pixel))
-        nearest = np.zeros(len(xy), bool)
-        nearest[order[np.diff(pixel[order], prepend=-1) > 0]] = True  # the first of equal ones
-        self.keep(nearest, "behind another in their pixel")
-        return xyz[nearest], xy[nearest]
+        is_first = np.diff(pixel[order], prepend=-1) > 0
+        is_nearest = np.zeros(len(xy), bool)
+        is_nearest[order[is_first]] = True
+        self.keep(is_nearest, "behind another in their pixel")
+        return xyz[is_nearest], xy[is_nearest]
 
     def points(self, xyz: Floats, xy: Floats, size: Size) -> Points:
-        """Returns what is left, `xyz` in the camera's coordinates, as points of an image (H, W)."""
+        """Returns the points that are left as sparse depth, with the counts of those dropped.
+
+        Args:
+            xyz: (N, 3) points in the camera's coordinates, metres.
+            xy: (N, 2) their pixel coordinates.
+            size: (H, W) of the image.
+        """
         return Points(
             xy=xy.astype(np.float32),
             depth=xyz[:, 2].astype(np.float32),
@@ -104,7 +134,11 @@ class DropCounter:
 
 
 def describe_dropped(dropped: Mapping[str, int]) -> str:
-    """Returns the counts above 0 with their reasons, for a person."""
+    """Returns a text of how many points were dropped and why; empty if none were.
+
+    Args:
+        dropped: Numbers of points by the reason.
+    """
     return ", ".join(f"{count:,} {why}" for why, count in dropped.items() if count)
 
 
@@ -122,7 +156,7 @@ def project_velodyne(
     Args:
         points: (N, 3) or more columns, x y z in metres in the scanner's coordinates.
         camera: The camera of the image.
-        scanner: The scanner's pose.
+        scanner: The scanner's pose beside the camera.
         size: (H, W) of the image.
         keep_occluded: Whether points behind the foreground stay.
         has_scanner: Whether the points were measured from their origin. If not, only their own
@@ -157,9 +191,14 @@ def project_velodyne(
 
 
 def points_in_image(xyz: Floats, camera: Camera, size: Size) -> tuple[Floats, Floats]:
-    """Returns the points (M, 3) in the camera's coordinates that it sees, and their pixels (M, 2).
+    """Returns the points (M, 3) that project into a camera's image, and their pixels (M, 2).
 
-    The size (H, W) is the image's.
+    Points behind others are among them.
+
+    Args:
+        xyz: (N, 3) points in the camera's coordinates.
+        camera: The camera.
+        size: (H, W) of the image.
     """
     xyz = xyz[xyz[:, 2] > 0]
     xy = pixels_of(camera, xyz)
@@ -177,49 +216,64 @@ def hidden_points(
         depth: (N,) z in metres.
         size: (H, W) of the image.
         focal_px: Focal length in pixels.
-        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z. All 0: it is
+            at the camera's place, so that there is no parallax.
     """
-    reach = max(1, round(np.radians(_REACH_DEG) * focal_px))
-    margin = np.radians(_MARGIN_DEG) * focal_px
+    reach_px = max(1, round(np.radians(_REACH_DEG) * focal_px))
+    margin_px = np.radians(_MARGIN_DEG) * focal_px
     # Suspects are points with something nearer within reach.
     cells = np.floor(xy + 0.5).astype(np.intp)
     columns, rows = cells.T
     grid = np.full(size, np.inf, np.float32)
     grid[rows, columns] = depth
-    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)
+    window = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)  # the least in the window
     limit = depth * (1 - NEARER)
     suspects = np.flatnonzero(nearest < limit)
-    # Pairs of a suspect and a nearer point, no farther apart than its parallax allows.
+    # Pairs of a suspect and a nearer point, no farther apart than its parallax allows. `beam` leads
+    # from the suspect to where its beam passed the depth of the foreground.
     beam = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
-    farthest = margin + 0.5 * (1 + _STRETCH) * np.hypot(*beam.T)
-    sides = np.minimum(np.ceil(farthest), reach)
+    farthest_px = margin_px + 0.5 * (1 + _STRETCH) * np.hypot(*beam.T)
+    sides = np.minimum(np.ceil(farthest_px), reach_px)
     around = cKDTree(cells).query_ball_point(cells[suspects], sides, p=np.inf)
     suspect = np.repeat(suspects, [len(neighbours) for neighbours in around])
     neighbour = np.fromiter(itertools.chain.from_iterable(around), np.intp, len(suspect))
-    near = grid[rows[neighbour], columns[neighbour]].astype(np.float64)
-    nearer = near < limit[suspect]
-    suspect, neighbour, near = suspect[nearer], neighbour[nearer], near[nearer]
+    foreground = grid[rows[neighbour], columns[neighbour]].astype(np.float64)
+    is_nearer = foreground < limit[suspect]
+    suspect = suspect[is_nearer]
+    neighbour = neighbour[is_nearer]
+    foreground = foreground[is_nearer]
     # A suspect is hidden if the neighbour is near the middle of its parallax segment.
-    beam = _beam_at(near, xy[suspect], depth[suspect], scanner) - xy[suspect]
+    beam = _beam_at(foreground, xy[suspect], depth[suspect], scanner) - xy[suspect]
     away_px = np.hypot(*(cells[neighbour] - cells[suspect] - 0.5 * beam).T)
-    hides = away_px <= margin + _STRETCH * 0.5 * np.hypot(*beam.T)
-    hidden = np.zeros(len(depth), bool)
-    hidden[suspect[hides]] = True
-    return hidden
+    hides = away_px <= margin_px + _STRETCH * 0.5 * np.hypot(*beam.T)
+    is_hidden = np.zeros(len(depth), bool)
+    is_hidden[suspect[hides]] = True
+    return is_hidden
 
 
-def _beam_at(near: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
-    """(M, 2) pixels where the beam to each point passes the depth `near` (M,), else the point's."""
+def _beam_at(passed_depth: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
+    """(M, 2) pixels at which the camera sees a beam where it passes some depth, or its end.
+
+    It is the end, the pixel of the measured point, where the beam does not pass that depth.
+
+    Args:
+        passed_depth: (M,) the depth that each beam passes.
+        xy: (M, 2) pixel coordinates of the measured points.
+        depth: (M,) their depths.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = (near - scanner[2]) / (depth - scanner[2])
-        passed = (fraction > 0) & (fraction < 1)
-        at = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
-        return np.where(passed[:, None], at / near[:, None], xy)
+        # The fraction of the way from scanner to point; the point in homogeneous coordinates is
+        # linear in it.
+        fraction = (passed_depth - scanner[2]) / (depth - scanner[2])
+        is_passed = (fraction > 0) & (fraction < 1)
+        times_depth = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
+        return np.where(is_passed[:, None], times_depth / passed_depth[:, None], xy)
 
 
 def hidden_among(xy: Floats, depth: Floats, size: Size) -> Mask:
-    """Returns (N,) true for points that are occluded from the camera by something nearer.
+    """Returns (N,) true for points of an unknown sensor that something nearer occludes.
 
     Foreground is looked for within twice the median distance from a point to the nearest other. It
     was measured with points of other views of ICL-NUIM and 7-Scenes, a quarter of them behind a
@@ -233,8 +287,10 @@ def hidden_among(xy: Floats, depth: Floats, size: Size) -> Mask:
     """
     if len(xy) < 2:
         return np.zeros(len(xy), bool)
-    margin = 2 * float(np.median(cKDTree(xy).query(xy, k=2)[0][:, 1]))
-    focal_px = margin / np.radians(_MARGIN_DEG)
+    to_itself_and_next, _ = cKDTree(xy).query(xy, k=2)
+    margin_px = 2 * float(np.median(to_itself_and_next[:, 1]))
+    # No parallax is known. The focal length is the one that gives this margin.
+    focal_px = margin_px / np.radians(_MARGIN_DEG)
     return hidden_points(xy, depth, size, focal_px=focal_px, scanner=np.zeros(3))
 
 
@@ -245,6 +301,7 @@ def occluded_in_map(points: Points) -> Mask | None:
     spacing of scan lines. Scanner and focal length are unknown. None for points that are no
     projected scan on whole pixels, or whose occluded points are removed already.
     """
+    # Whether the points are a scan with occluded points.
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
     _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
@@ -264,11 +321,11 @@ def occluded_in_map(points: Points) -> Mask | None:
 
 
 def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
-    """Returns (N,) true for points that another point of their window shows to be behind others.
+    """Returns (N,) true for points behind the nearest point of any window that they share.
 
     The filter is that of Conti et al. 2022, as the completion papers of 2023 to 2025 use it. The
-    nearest depth in the window of each point counts for all points in that window. Points farther
-    than it by more than `metres` are behind.
+    nearest depth in the window around each point counts for all points in that window. Points
+    farther than it by more than `metres` are behind.
 
     Args:
         points: Points on whole pixels.
@@ -277,25 +334,32 @@ def behind_foreground(points: Points, window_px: int, metres: float) -> Mask:
     """
     depth = as_depth_image(points)
     window = np.ones((window_px, window_px), np.uint8)
-    known = depth > 0
-    nearest = np.where(known, depth, np.float32(np.inf))
+    is_known = depth > 0
+    nearest = np.where(is_known, depth, np.float32(np.inf))
     for _ in range(2):  # of the window of a point, and of all windows that a point lies in
         lowest = cv2.erode(nearest, window, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
-        nearest = np.where(known, lowest, np.float32(np.inf))
+        nearest = np.where(is_known, lowest, np.float32(np.inf))
     column, row = points.xy.astype(np.intp).T
     return np.asarray(points.depth - nearest[row, column] > metres)
 
 
 def interleaved(depth: NDArray[np.float32]) -> Mask:
-    """Returns (H, W) true for points of a map, 0 = unknown, between nearer ones on two sides."""
-    known = np.where(depth > 0, depth, np.float32(np.inf))
+    """Returns (H, W) true for points between nearer ones on two opposite sides.
+
+    A nearer one is nearer by more than the fraction `NEARER`.
+
+    Args:
+        depth: (H, W) the points' depths at their pixels, 0 = no point.
+    """
+    known_depth = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
     # The nearest point in an area above each pixel, and in the same area turned to the other sides.
-    reach, half = _INTERLEAVED_REACH_PX, _INTERLEAVED_HALF_WIDTH_PX
+    reach = _INTERLEAVED_REACH_PX
+    half = _INTERLEAVED_HALF_WIDTH_PX
     above = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
     above[:reach, reach - half : reach + half + 1] = 1
     up, left, down, right = (
-        cv2.erode(known, np.rot90(above, quarter_turns)) < limit for quarter_turns in range(4)
+        cv2.erode(known_depth, np.rot90(above, quarter_turns)) < limit for quarter_turns in range(4)
     )
     opposite: Mask = (up & down) | (left & right)
     return opposite

@@ -24,6 +24,9 @@ from pnpdepth_cli.sensors.projection import DropCounter, Points, pixel_index
 Pixels = NDArray[np.intp]
 """(N,) row-major indices of pixels."""
 
+_LEAST_AHEAD = 1e-9
+"""Least z of a beam's unit vector that looks ahead; beams are divided by it."""
+
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's coordinates to those of a camera facing the same way."""
 
@@ -41,7 +44,11 @@ class Lidar:
     """Standard deviation of each measurement's direction, in elevation and in azimuth."""
 
     def directions(self, rng: np.random.Generator) -> Floats:
-        """Returns (M, 3) unit vectors of one revolution in scanner coordinates, by beam."""
+        """Returns (M, 3) unit vectors of one revolution in scanner coordinates, beam after beam.
+
+        Args:
+            rng: Generator of the noise of the angles.
+        """
         steps = round(360 / self.azimuth_step_deg)
         azimuth_deg = np.arange(steps) * self.azimuth_step_deg
         elevation, azimuth = np.radians(
@@ -56,7 +63,7 @@ class Lidar:
 
 
 def evenly_spaced(top_deg: float, step_deg: float, beams: int) -> tuple[float, ...]:
-    """Returns elevations in degrees from the top downwards."""
+    """Returns elevations of beams in degrees, from the top downwards by equal steps."""
     return tuple(round(top_deg - step_deg * beam, 6) for beam in range(beams))
 
 
@@ -71,15 +78,19 @@ _HDL_64E_DEG = evenly_spaced(2, 1 / 3, 32) + evenly_spaced(-8.83, 0.5, 32)
 
 
 def _from_sheet(
-    name: str, elevations_deg: tuple[float, ...], step_deg: float, reach: float, noise: float
+    name: str,
+    elevations_deg: tuple[float, ...],
+    azimuth_step_deg: float,
+    max_range: float,
+    range_noise: float,
 ) -> Lidar:
-    """The scanner of a data sheet: range and its noise in metres, no noise of angles."""
+    """The scanner of a data sheet, which has no noise of angles; the arguments are its fields."""
     return Lidar(
         name=name,
         elevations_deg=elevations_deg,
-        azimuth_step_deg=step_deg,
-        max_range=reach,
-        range_noise=noise,
+        azimuth_step_deg=azimuth_step_deg,
+        max_range=max_range,
+        range_noise=range_noise,
     )
 
 
@@ -110,15 +121,17 @@ PAPER_HDL_64E = _from_paper("paper-hdl-64e", evenly_spaced(2, 0.4, 68))
 def lidar_of(
     name: str | None, beams: int | None, vertical_fov: tuple[float, float] | None
 ) -> Lidar:
-    """Returns the scanner of a name, or one without noise, with a VLP-16's azimuth step.
+    """Returns the scanner of a name, or one of a number of beams, without noise.
+
+    The latter has a VLP-16's azimuth step.
 
     Args:
-        name: One of `choices.SENSORS`.
-        beams: Number of beams, evenly spaced in elevation.
-        vertical_fov: Elevations of the uppermost and the lowest beam, degrees.
+        name: Name in `choices.SENSORS`. None with the other two arguments.
+        beams: Number of beams, evenly spaced in elevation. None with a name.
+        vertical_fov: Elevations of the uppermost and the lowest beam, degrees. None with a name.
 
     Raises:
-        UsageError: There is no such scanner, or neither or both are given.
+        UsageError: There is no such field of view, or neither or both are given.
     """
     if name is not None and beams is None and vertical_fov is None:
         named: Lidar = choices.SENSORS[name]
@@ -132,7 +145,11 @@ def lidar_of(
             " BOTTOM from 90° to −90°, or two equal ones of one beam"
         )
     elevations = evenly_spaced(top_deg, (top_deg - bottom_deg) / max(beams - 1, 1), beams)
-    return Lidar(name=f"{beams} beams", elevations_deg=elevations, azimuth_step_deg=0.2)
+    return Lidar(
+        name=f"{beams} beams",
+        elevations_deg=elevations,
+        azimuth_step_deg=LIDARS["vlp-16"].azimuth_step_deg,
+    )
 
 
 def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, seed: int) -> Points:
@@ -151,20 +168,20 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     # The beams that look ahead, and what each meets.
     rng = np.random.default_rng(seed)
     beams = sensor.directions(rng) @ FORWARD_LEFT_UP.T
-    beams = beams[beams[:, 2] > 1e-9]
+    beams = beams[beams[:, 2] > _LEAST_AHEAD]
     drops = DropCounter()
-    # a beam from the camera's centre stays in one pixel
+    # The scanner is at the camera's centre, so a beam stays in one pixel at all depths.
     beams, xy = drops.keep_seen(beams, camera, size)
     z = np.asarray(depth, np.float64).ravel()[pixel_index(xy, size)]
-    met = drops.keep(z > 0, "meets nothing that the camera sees")
-    z, beams = z[met], beams[met]
-    # How far it is, as the scanner measures it.
+    is_met = drops.keep(z > 0, "meets nothing that the camera sees")
+    z, beams = z[is_met], beams[is_met]
+    # How far that is, as the scanner measures it: along the beam.
     distance = z / beams[:, 2]
     in_range = drops.keep(distance <= sensor.max_range, "out of range")
     distance, beams = distance[in_range], beams[in_range]
     if sensor.range_noise > 0:
         distance = distance + rng.normal(0, sensor.range_noise, len(distance))
-    # The points, as noise moves them, of which the image shows the nearest of each pixel.
+    # The points, which noise moves along their beams; of each pixel the nearest.
     points = beams * distance[:, None]
     ahead = drops.keep(distance > 0, "noise put it behind the camera")
     points = points[ahead]
@@ -188,9 +205,9 @@ def sample_points(
 
     Args:
         depth: (H, W) metres, 0 = unknown.
-        pattern: Pattern of the pixels that are sampled.
-        seed: Random seed of the pattern.
-        image: (H, W, 3) in 0..1 of the same view, for `features`.
+        pattern: Kind of the pattern, and how many points or lines are wanted.
+        seed: Random seed of the patterns "uniform" and "shuffle".
+        image: (H, W, 3) in 0…1 of the same view, for the pattern "features".
 
     Raises:
         NoPointsError: The depth map or the pattern leaves no point.
@@ -200,30 +217,37 @@ def sample_points(
     size = (depth.shape[0], depth.shape[1])
     if image is not None and image.shape[:2] != size:
         raise unequal_sizes("the image", image.shape, "the depth", size)
-    known = np.flatnonzero(np.isfinite(depth) & (depth > 0))
-    if not known.size:
+    known_pixels = np.flatnonzero(np.isfinite(depth) & (depth > 0))
+    if not known_pixels.size:
         raise NoPointsError(
             "the depth map has no pixel with known depth to sample from; give one with depth above"
             " 0"
         )
-    wanted = pattern.wanted(known.size)
-    # The known pixels of the pattern.
+    wanted = pattern.wanted(known_pixels.size)
+    # The known pixels of the pattern, as row-major indices.
     match pattern.kind:
         case "uniform":
-            if wanted > known.size:
-                raise UsageError(f"{wanted:,} points of {known.size:,} known pixels; ask for fewer")
-            chosen = np.random.default_rng(seed).choice(known, wanted, replace=False)
+            if wanted > known_pixels.size:
+                raise UsageError(
+                    f"{wanted:,} points of {known_pixels.size:,} known pixels; ask for fewer"
+                )
+            chosen = np.random.default_rng(seed).choice(known_pixels, wanted, replace=False)
         case "shuffle":  # as Marigold-DC does, by numpy's legacy generator
-            rows = known[:, None].copy()  # rows of an array are shuffled unlike a flat one
+            rows = known_pixels[:, None].copy()  # rows of an array are shuffled unlike a flat one
             np.random.RandomState(seed).shuffle(rows)
             chosen = rows[:wanted, 0]
         case "grid":
-            chosen = np.intersect1d(_grid(pattern.fraction or wanted / depth.size, size), known)
+            fraction = pattern.fraction
+            if fraction is None:
+                fraction = wanted / depth.size
+            chosen = np.intersect1d(_grid(fraction, size), known_pixels)
         case "lines":
-            chosen = known[np.isin(known // size[1], _lines(pattern.wanted(size[0]), size[0]))]
-        case _:
+            height, width = size
+            lines = _lines(pattern.wanted(height), height)
+            chosen = known_pixels[np.isin(known_pixels // width, lines)]
+        case _:  # features
             corners = _corners(image, wanted)
-            chosen = corners[np.isin(corners, known)][:wanted]
+            chosen = corners[np.isin(corners, known_pixels)][:wanted]
     # Their depths.
     chosen = np.sort(chosen)
     if not chosen.size:
@@ -237,7 +261,7 @@ def sample_points(
 
 
 def _grid(fraction: float, size: Size) -> Pixels:
-    """The nodes of a square grid that are this fraction of all pixels."""
+    """The pixels at the nodes of a square grid, about this fraction of all of an image (H, W)."""
     spacing: float = max(1.0, fraction**-0.5)
     rows, columns = (
         np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing).clip(max=side - 1)
@@ -248,21 +272,31 @@ def _grid(fraction: float, size: Size) -> Pixels:
 
 
 def _lines(count: int, height: int) -> Pixels:
-    """The numbers of evenly spaced rows."""
+    """The numbers of `count` evenly spaced rows of an image. Raises UsageError if it has fewer."""
     if count > height:
         raise UsageError(f"{count:,} lines do not fit {height:,} rows; ask for fewer")
     return np.floor((np.arange(count) + 0.5) * height / count).astype(np.intp)
 
 
 def _corners(image: NDArray[np.float32] | None, wanted: int) -> Pixels:
-    """The pixels of ORB corners, the strongest first, as structure from motion has its points."""
+    """The pixels of corners of an image, the strongest first, as structure from motion finds them.
+
+    Args:
+        image: (H, W, 3) in 0…1.
+        wanted: Number of corners that are needed; there may be more or fewer.
+
+    Raises:
+        UsageError: There is no image.
+    """
     if image is None:
         raise UsageError("pattern 'features' needs the image that the depth belongs to; give it")
     grey = cv2.cvtColor(image.clip(0, 1), cv2.COLOR_RGB2GRAY)
-    # Corners of several pyramid levels share pixels; three times as many leave enough when merged.
+    # ORB's corners of several pyramid levels share pixels; three times as many leave enough when
+    # merged.
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
     corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
-    xy = np.array([c.pt for c in sorted(corners, key=lambda corner: -corner.response)])
+    strongest_first = sorted(corners, key=lambda corner: -corner.response)
+    xy = np.array([corner.pt for corner in strongest_first])
     column, row = np.rint(xy.reshape(-1, 2)).astype(np.intp).T
     pixels = (row * image.shape[1] + column).tolist()
-    return np.array(list(dict.fromkeys(pixels)), np.intp)
+    return np.array(list(dict.fromkeys(pixels)), np.intp)  # each once, in this order

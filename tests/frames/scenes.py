@@ -113,8 +113,8 @@ def network_expert(name: str, at: Tensor, weight: float = 1.0) -> NetworkExpert:
     return NetworkExpert(
         name=name,
         weight=weight,
-        at=at,
-        updated=at,
+        at_validation=at,
+        updated_at_validation=at,
         points=points,
         whole=prediction,
         kept=prediction,

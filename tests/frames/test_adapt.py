@@ -119,7 +119,7 @@ def test_two_points_of_a_frame_are_enough(network: pnp.Network) -> None:
 def test_few_frames_and_dense_points_teach_too_little() -> None:
     dense = SIZE[0] * SIZE[1] // 100  # 10 pixels apart
     cases = [(7, 60), (8, 60), (8, dense), (8, dense + 1)]
-    why = [adapt.too_little(count, frame_in_memory(points)) for count, points in cases]
+    why = [adapt.reason_not_to_learn(count, frame_in_memory(points)) for count, points in cases]
     assert [reason is None for reason in why] == [False, True, True, False]
 
 

@@ -19,7 +19,7 @@ from pnpdepth_cli.frames.fuse import OWN_SCANNER
 from pnpdepth_cli.frames.open_network import OpenNetwork
 from pnpdepth_cli.frames.refine_frame import (
     Pipeline,
-    contradict_strong,
+    outliers_beside_strong,
     refine_frame,
     without_outliers,
 )
@@ -393,5 +393,5 @@ def test_a_point_that_agrees_with_a_strong_network_is_no_outlier(
     called_out[[3, 4, 5]] = True
     constant = ResidualField(torch.ones(SIZE), frame.points, frame.rgb)
     with opened(network) as networks:
-        kept = called_out & contradict_strong(networks, frame, constant)
+        kept = called_out & outliers_beside_strong(networks, frame, constant)
     assert kept.nonzero().flatten().tolist() == [3]

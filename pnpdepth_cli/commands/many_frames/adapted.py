@@ -89,7 +89,7 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
     from safetensors.torch import save_file  # these import torch
 
     from pnpdepth_cli.commands.refinement.requested import read_requested
-    from pnpdepth_cli.frames.adapt import learn, too_little, weights_in_place
+    from pnpdepth_cli.frames.adapt import learn, reason_not_to_learn, weights_in_place
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network
 
@@ -100,7 +100,7 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
     # The network learns from the frames, if they are enough.
     asked = lessons[0]
     first = read_requested(asked)
-    if why := too_little(len(lessons), first):
+    if why := reason_not_to_learn(len(lessons), first):
         return why
     network = load_network(asked.model, asked.checkpoint, asked.device)
     network = resolve_definition(network, first.registered())
