@@ -21,6 +21,7 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
+from pnpdepth_cli.models.aligned_depth import align_output
 from pnpdepth_cli.models.decisions import recalled_layers
 from pnpdepth_cli.models.definition import (
     IMAGENET_MEAN,
@@ -29,7 +30,7 @@ from pnpdepth_cli.models.definition import (
     Normalisation,
 )
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.network import Network, align_output
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.models.shapes import by_shapes
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
