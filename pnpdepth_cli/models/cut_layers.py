@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.autograd.graph import Node
 
 from pnpdepth_cli.errors import ModelError, wrap_user_errors
-from pnpdepth_cli.models.shapes import by_shapes
+from pnpdepth_cli.models.shapes import run_by_shapes
 
 if TYPE_CHECKING:
     pass
@@ -52,7 +52,7 @@ def suggest_layers(
         return ()
     sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
     observe = partial(_observe, prediction_of=prediction_of)
-    prediction, maps = by_shapes(module, arguments, observe)
+    prediction, maps = run_by_shapes(module, arguments, observe)
     # Feature maps that the prediction depends on.
     behind = _nodes_of(prediction)
     areas = {

@@ -53,7 +53,7 @@ def cache_folder() -> Path:
     return user_cache_path("pnpdepth", appauthor=False) / "networks"
 
 
-def recalled(
+def recall_or_decide(
     module: nn.Module,
     file: Path | None,
     question: str,
@@ -81,7 +81,7 @@ def recalled(
     return answer
 
 
-def recalled_layers(
+def recall_or_decide_layers(
     module: nn.Module,
     definition: ModelDefinition,
     question: str,
@@ -96,7 +96,7 @@ def recalled_layers(
         decide: Function that decides it; called unless the answer is known.
     """
     names = {name for name, _ in module.named_modules()}
-    return recalled(
+    return recall_or_decide(
         module,
         definition.checkpoint if definition.complete else None,
         question,
@@ -105,7 +105,7 @@ def recalled_layers(
     )
 
 
-def kept() -> list[Path]:
+def kept_files() -> list[Path]:
     """Returns the files of all networks."""
     return sorted(cache_folder().glob("*.json"))
 
@@ -116,7 +116,7 @@ def forget() -> None:
     Raises:
         OutputError: One cannot be removed.
     """
-    for path in (*kept(), *cache_folder().glob("*.part")):
+    for path in (*kept_files(), *cache_folder().glob("*.part")):
         try:
             path.unlink(missing_ok=True)
         except OSError as error:

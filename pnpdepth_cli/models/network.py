@@ -24,7 +24,7 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.models.cut_layers import suggest_layers
-from pnpdepth_cli.models.decisions import recalled_layers
+from pnpdepth_cli.models.decisions import recall_or_decide_layers
 from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
@@ -396,7 +396,7 @@ def _with_suggested_layers(network: Network) -> Network:
             return list(suggest_layers(network.module, arguments, network.map_of))
 
     question = f"layers, of {frame.network}"
-    layers = tuple(recalled_layers(network.module, network.definition, question, suggest))
+    layers = tuple(recall_or_decide_layers(network.module, network.definition, question, suggest))
     if not layers:
         return network
     note = (

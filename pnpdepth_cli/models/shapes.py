@@ -16,7 +16,7 @@ from pnpdepth_cli.models.file_graph import FileGraph, result_without_values
 _Result = TypeVar("_Result")
 
 
-def by_shapes(
+def run_by_shapes(
     module: nn.Module,
     arguments: tuple[Tensor, ...],
     run: Callable[[nn.Module, tuple[Tensor, ...]], _Result],
