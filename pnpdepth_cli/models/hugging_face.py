@@ -287,7 +287,7 @@ def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
         nonlocal bytes_left
         if parameter is not None and parameter.is_meta:
-            bytes_left -= max(1, parameter.numel())
+            bytes_left -= max(1, parameter.numel())  # an element takes a byte at least
         if bytes_left < 0:
             raise ModelError(f"{folder}: config.json describes a larger network than its weights")
 
