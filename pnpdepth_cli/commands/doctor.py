@@ -68,7 +68,7 @@ def _devices() -> list[str]:
 
 def _cache() -> str:
     """What was decided about networks, and is kept for the next run."""
-    files = decisions.kept()
+    files = decisions.kept_files()
     size = sum(path.stat().st_size for path in files)
     return f"decisions about {count_of(len(files), 'network')}, {size / 1000:.1f} kB"
 

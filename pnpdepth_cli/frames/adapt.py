@@ -27,7 +27,8 @@ from pnpdepth_cli.core.losses import MIN_DEPTH
 from pnpdepth_cli.errors import DivergedError, NoPointsError, UsageError, wrap_user_errors
 from pnpdepth_cli.frames.frame import Frame, is_dense
 from pnpdepth_cli.frames.open_network import FEW_POINTS, PreparedFrame, encoding_once, prepare
-from pnpdepth_cli.models.network import AlignedDepth, Network
+from pnpdepth_cli.models.aligned_depth import AlignedDepth
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 
 STEPS = 100

@@ -26,8 +26,9 @@ from pnpdepth_cli.errors import (
     wrap_user_errors,
 )
 from pnpdepth_cli.frames.frame import Frame, Prediction, is_dense
+from pnpdepth_cli.models.aligned_depth import AlignedDepth
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.network import AlignedDepth, Network
+from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
 

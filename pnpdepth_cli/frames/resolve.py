@@ -22,11 +22,12 @@ from pnpdepth_cli.errors import (
 )
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import OpenNetwork, prepare
-from pnpdepth_cli.models.decisions import recalled_layers
+from pnpdepth_cli.models.aligned_depth import align_output
+from pnpdepth_cli.models.decisions import recall_or_decide_layers
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.frame_map import FrameMap
-from pnpdepth_cli.models.network import Network, align_output
-from pnpdepth_cli.models.shapes import by_shapes
+from pnpdepth_cli.models.network import Network
+from pnpdepth_cli.models.shapes import run_by_shapes
 from pnpdepth_cli.points import METRES
 from pnpdepth_cli.settings import PAPER, ClosedSettings, Settings
 from pnpdepth_cli.spent import spent_on
@@ -131,13 +132,13 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
             fields = fields_of(network, arguments, definition.layers)
             ordered = _by_preference(definition.layers, fields, enough_px)
             first_usable = partial(_first_usable, ordered)
-            layer = by_shapes(network.module, arguments, first_usable)
+            layer = run_by_shapes(network.module, arguments, first_usable)
             return [definition.layers[0] if layer is None else layer]
 
     # What was decided for this question in an earlier run is not decided again.
     question = f"layer of {definition.layers} for {enough_px:.6g} pixels of {frame.network}"
     with spent_on("layer"):
-        return recalled_layers(network.module, network.definition, question, decide)[0]
+        return recall_or_decide_layers(network.module, network.definition, question, decide)[0]
 
 
 def _first_usable(
@@ -176,7 +177,7 @@ def fields_of(
         """The fields of this network, or of its copy without values."""
         return influential_fields(module, arguments, layers, network.map_of)
 
-    return by_shapes(network.module, arguments, measured)
+    return run_by_shapes(network.module, arguments, measured)
 
 
 def _by_preference(

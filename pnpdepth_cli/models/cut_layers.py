@@ -6,29 +6,26 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
-from itertools import dropwhile
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.graph import Node
 
 from pnpdepth_cli.errors import ModelError, wrap_user_errors
-from pnpdepth_cli.models.shapes import by_shapes
+from pnpdepth_cli.models.shapes import run_by_shapes
 
-if TYPE_CHECKING:
-    pass
+_SIMILAR_ASPECT = 1.3
+"""A feature map's aspect ratio is at most this factor away from the image's."""
 
-_SIMILAR_ASPECT = 1.3  # a feature map's aspect ratio is at most this factor away from the image's
+_MOST_IMAGE_CHANNELS = 4
+"""A last axis of no more elements is that of the channels, as in (1, H, W, 3)."""
 
 _WITHOUT_GRADIENT = ("Round", "Floor", "Ceil", "Trunc", "Sign")
 """How names of torch's derivatives begin that are 0 everywhere."""
 
-_Arguments = tuple[Tensor, ...]
-
 
 def suggest_layers(
-    module: nn.Module, arguments: _Arguments, prediction_of: Callable[[object], Tensor]
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
 ) -> tuple[str, ...]:
     """Returns the bottleneck and, behind it, the last layer of each finer resolution.
 
@@ -38,75 +35,104 @@ def suggest_layers(
 
     Args:
         module: The network.
-        arguments: Its arguments for a frame, real or synthetic.
-        prediction_of: Returns the prediction (1, 1, h, w) from what the network returns.
+        arguments: Its arguments for a frame, real or synthetic. The first one with four axes is the
+            image, (1, c, H, W) or (1, H, W, c).
+        prediction_of: Function from what the network returns to the prediction (1, 1, h, w).
 
     Returns:
-        Names of submodules, from coarse to fine; empty if none qualifies.
+        Names of submodules, from coarse to fine; empty if none qualifies, or there is no image. One
+        as fine as the prediction is named only if there is no other.
 
     Raises:
         ModelError: The network raises, or no gradient comes back from its prediction.
     """
-    image = next((a for a in arguments if a.ndim == 4), None)
+    image = next((argument for argument in arguments if argument.ndim == 4), None)
     if image is None:
         return ()
-    sides = image.shape[1:3] if image.shape[-1] <= 4 else image.shape[2:4]
-    observe = partial(_observe, prediction_of=prediction_of)
-    prediction, maps = by_shapes(module, arguments, observe)
-    # Feature maps that the prediction depends on.
-    behind = _nodes_of(prediction)
+    is_channels_last = image.shape[-1] <= _MOST_IMAGE_CHANNELS
+    image_height, image_width = image.shape[1:3] if is_channels_last else image.shape[2:4]
+    # One pass, without values where the network allows that.
+    run = partial(_run_and_keep_maps, prediction_of=prediction_of)
+    prediction, maps = run_by_shapes(module, arguments, run)
+    # The feature maps that the prediction depends on, by their pixels.
+    operations = _operations_behind(prediction)
     areas = {
-        name: output.shape[2:].numel()
-        for name, output in maps.items()
-        if output.shape[1] > 1 and _has_aspect_of(output, sides) and output.grad_fn in behind
+        name: feature_map.shape[2:].numel()
+        for name, feature_map in maps.items()
+        if feature_map.shape[1] > 1
+        and _is_of_aspect(feature_map, image_height / image_width)
+        and feature_map.grad_fn in operations
     }
-    # The last map before each finer one, from the first of the coarsest maps on.
+    # From the bottleneck on, the last map of each area; coarser side branches do not count.
     coarsest = min(areas.values(), default=0)
-    last_of = dict[int, str]()
-    for name, area in dropwhile(lambda named: named[1] > coarsest, areas.items()):
-        if area >= max(last_of, default=0):
-            last_of[area] = name
-    finest = prediction.shape[2:].numel()
-    return tuple(n for area, n in last_of.items() if area < finest or len(last_of) == 1)
+    last_layers: dict[int, str] = {}
+    for name, area in areas.items():
+        is_from_bottleneck_on = bool(last_layers) or area == coarsest
+        if is_from_bottleneck_on and area >= max(last_layers, default=0):
+            last_layers[area] = name
+    if len(last_layers) == 1:
+        return tuple(last_layers.values())
+    prediction_area = prediction.shape[2:].numel()
+    return tuple(name for area, name in last_layers.items() if area < prediction_area)
 
 
-def _nodes_of(prediction: Tensor) -> set[Node]:
-    """The operations of torch's graph that a gradient of the prediction comes back through."""
+def _operations_behind(prediction: Tensor) -> set[Node]:
+    """Returns the operations of torch's graph that a gradient of the prediction comes back to."""
     seen = set[Node]()
-    nodes = [prediction.grad_fn]
-    while nodes:
-        node = nodes.pop()
-        if node is None or node in seen:
+    operations = [prediction.grad_fn]
+    while operations:
+        operation = operations.pop()
+        if operation is None or operation in seen:
             continue
-        seen.add(node)
-        if not node.name().startswith(_WITHOUT_GRADIENT):
-            nodes += [before for before, _ in node.next_functions]
+        seen.add(operation)
+        if not operation.name().startswith(_WITHOUT_GRADIENT):
+            operations += [earlier for earlier, _ in operation.next_functions]
     return seen
 
 
-def _has_aspect_of(output: Tensor, sides: tuple[int, ...]) -> bool:
-    height, width = output.shape[2:4]
-    ratio = (height / max(1, width)) / (sides[0] / sides[1])
-    return min(height, width) > 1 and 1 / _SIMILAR_ASPECT < ratio < _SIMILAR_ASPECT
+def _is_of_aspect(feature_map: Tensor, aspect: float) -> bool:
+    """Whether height over width of a map (1, c, h, w), of 2×2 at least, is about this aspect."""
+    height, width = feature_map.shape[2:4]
+    if min(height, width) < 2:
+        return False
+    return 1 / _SIMILAR_ASPECT < (height / width) / aspect < _SIMILAR_ASPECT
 
 
-def _observe(
-    module: nn.Module, arguments: _Arguments, prediction_of: Callable[[object], Tensor]
+def _run_and_keep_maps(
+    module: nn.Module, arguments: tuple[Tensor, ...], prediction_of: Callable[[object], Tensor]
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """One pass: the prediction, and by name the maps of submodules that ran once, in that order."""
-    maps: dict[str, Tensor] = {}
-    ran: Counter[str] = Counter()
+    """Runs the network once, with gradients.
 
-    def keep(name: str, _part: nn.Module, _inputs: object, output: object) -> None:
-        ran[name] += 1
+    Args:
+        module: The network.
+        arguments: Its arguments.
+        prediction_of: Function from what the network returns to the prediction (1, 1, h, w).
+
+    Returns:
+        The prediction, and by name the outputs (n, c, h, w) of the submodules that ran exactly once
+        and that gradients reach, in the order in which they finished.
+
+    Raises:
+        ModelError: The network raises, or no gradient comes back from its prediction.
+    """
+    maps: dict[str, Tensor] = {}
+    run_counts: Counter[str] = Counter()
+
+    def keep_map(name: str, _module: nn.Module, _inputs: object, output: object) -> None:
+        run_counts[name] += 1
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             maps[name] = output
 
     with ExitStack() as hooks, torch.enable_grad(), wrap_user_errors("the network's forward"):
         for name, submodule in module.named_modules():
+            # The network itself has no name, and TorchScript takes no such hooks.
             if name and not isinstance(submodule, torch.jit.ScriptModule):
-                hooks.enter_context(submodule.register_forward_hook(partial(keep, name)))
-        inputs = tuple(a.detach().requires_grad_(a.is_floating_point()).clone() for a in arguments)
+                hooks.enter_context(submodule.register_forward_hook(partial(keep_map, name)))
+        # Gradients reach the inputs, so all that is computed of them has an operation in the graph.
+        inputs = tuple(
+            argument.detach().requires_grad_(argument.is_floating_point()).clone()
+            for argument in arguments
+        )
         prediction = prediction_of(module(*inputs))
     if not prediction.requires_grad:
         raise ModelError(
@@ -114,4 +140,4 @@ def _observe(
             " under torch.no_grad or inference_mode, detach, or go through numpy? take that out, or"
             " state layers behind it in a definition"
         )
-    return prediction, {name: output for name, output in maps.items() if ran[name] == 1}
+    return prediction, {name: kept for name, kept in maps.items() if run_counts[name] == 1}

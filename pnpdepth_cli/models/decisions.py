@@ -35,16 +35,21 @@ if TYPE_CHECKING:
 FOLDER = "PNPDEPTH_CACHE"
 """Environment variable that names another cache folder."""
 
-_MOST_BYTES = 1 << 18  # of a file that is read
-_MOST_ANSWERS = 100  # of a network; a batch asks some for each size of image
-_HEADER_BYTES = 1 << 24  # of a safetensors file, with the names and shapes of its tensors
+_MOST_BYTES = 1 << 18
+"""Bytes of the largest file of answers that is read."""
+_MOST_ANSWERS = 100
+"""Answers that are kept of a network; a batch asks some for each size of image."""
+_HEADER_BYTES = 1 << 24
+"""Bytes that are read of a safetensors file's header, with the names and shapes of its tensors."""
+_LENGTH_BYTES = 8
+"""Bytes of a length: that of a safetensors file's header, and of each part of a digest."""
 
-# Each network's digest, as long as the network is in use: its file is read once.
 _DIGESTS = WeakKeyDictionary["nn.Module", str]()
+"""Each network's digest, as long as the network is in use: its file is read once."""
 
 
 def cache_folder() -> Path:
-    """Returns the folder of the files, which need not be there."""
+    """Returns the folder of the networks' files, which need not be there."""
     stated = os.environ.get(FOLDER)
     if stated:
         return Path(stated)
@@ -53,70 +58,74 @@ def cache_folder() -> Path:
     return user_cache_path("pnpdepth", appauthor=False) / "networks"
 
 
-def recalled(
+def recall_or_decide(
     module: nn.Module,
     file: Path | None,
     question: str,
     decide: Callable[[], list[str]],
     valid: Callable[[list[str]], bool] = bool,
 ) -> list[str]:
-    """Returns what was decided about a network before, else what is decided now, which is kept.
+    """Returns the answer to a question about a network: the kept one, or a new one, kept from now.
 
     Args:
         module: The network.
-        file: File or weights that it was read from; None keeps nothing.
+        file: File or weights that the network was read from; None keeps nothing.
         question: What is decided, with all that it depends on besides the network.
-        decide: Function that decides it; called unless the answer is known.
-        valid: Whether an answer can be right; another one is not taken.
+        decide: Function that decides it, called unless a valid answer is kept.
+        valid: Predicate of a kept answer: whether it can be right. By default it is not empty.
     """
-    digest = None if file is None else _digest(module, file)
+    digest = None if file is None else _digest_of(module, file)
     if digest is None:
         return decide()
     path = cache_folder() / f"{digest}.json"
-    known = _read(path).get(question)
-    if known is not None and valid(known):
-        return known
-    answer = decide()
-    _write(path, {question: answer} | {q: a for q, a in _read(path).items() if q != question})
-    return answer
+    kept_answer = _read(path).get(question)
+    if kept_answer is not None and valid(kept_answer):
+        return kept_answer
+    new_answer = decide()
+    # Another process may have kept answers meanwhile. The newest comes first.
+    answers = _read(path)
+    answers.pop(question, None)
+    _write(path, {question: new_answer} | answers)
+    return new_answer
 
 
-def recalled_layers(
+def recall_or_decide_layers(
     module: nn.Module,
     definition: ModelDefinition,
     question: str,
     decide: Callable[[], list[str]],
 ) -> list[str]:
-    """Returns layers of a network that were decided before, else what is decided now.
+    """Returns names of layers: the kept answer to a question about a network, or a new one.
+
+    Only for a network whose one file holds its structure and weights; else it is decided anew.
 
     Args:
         module: The network.
-        definition: Its definition.
+        definition: Definition of the network.
         question: What is decided, with all that it depends on besides the network.
-        decide: Function that decides it; called unless the answer is known.
+        decide: Function that decides it, called unless a valid answer is kept.
     """
     names = {name for name, _ in module.named_modules()}
-    return recalled(
-        module,
-        definition.checkpoint if definition.complete else None,
-        question,
-        decide,
-        lambda layers: bool(layers) and names.issuperset(layers),
-    )
+
+    def are_layers(answer: list[str]) -> bool:
+        return bool(answer) and names.issuperset(answer)
+
+    file = definition.checkpoint if definition.complete else None
+    return recall_or_decide(module, file, question, decide, are_layers)
 
 
-def kept() -> list[Path]:
-    """Returns the files of all networks."""
+def kept_files() -> list[Path]:
+    """Returns the paths of all networks' files."""
     return sorted(cache_folder().glob("*.json"))
 
 
 def forget() -> None:
-    """Removes the files of all networks.
+    """Removes the files of all networks, and what interrupted runs have left of them.
 
     Raises:
-        OutputError: One cannot be removed.
+        OutputError: A file cannot be removed.
     """
-    for path in (*kept(), *cache_folder().glob("*.part")):
+    for path in (*kept_files(), *cache_folder().glob("*.part")):
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
@@ -125,6 +134,7 @@ def forget() -> None:
 
 @functools.cache
 def _versions() -> dict[str, str]:
+    """Returns the versions of this program and of the installed packages that decide with it."""
     versions = {"pnpdepth": __version__}
     for package in ("torch", "transformers", "onnx", "onnxruntime"):
         with suppress(metadata.PackageNotFoundError):
@@ -132,35 +142,48 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _digest(module: nn.Module, file: Path) -> str | None:
-    """The digest of what describes the network; None if its code is not in files that are known."""
-    known = _DIGESTS.get(module)
-    if known is not None:
-        return known
-    parts = list[bytes]()
+def _digest_of(module: nn.Module, file: Path) -> str | None:
+    """Returns a digest that changes with the network's structure.
+
+    None for a network whose code may be anywhere, as that of a Python file, and if its files cannot
+    be read.
+
+    Args:
+        module: The network.
+        file: File of its graph, or safetensors file of its weights beside its config.json.
+    """
+    if module in _DIGESTS:
+        return _DIGESTS[module]
     try:
-        if isinstance(module, FileGraph):
-            # The nodes tell which output of the file it is.
-            parts = [file.read_bytes(), "\n".join(module._modules).encode()]
-        elif is_of_transformers(module):
-            with file.open("rb") as weights:
-                size = int.from_bytes(weights.read(8), "little")
-                parts = [weights.read(min(size, _HEADER_BYTES))]
-            parts += [file.with_name("config.json").read_bytes()]
+        contents = _structure_of(module, file)
     except OSError:
+        return None  # nothing is kept, and the network itself is in hand
+    if not contents:
         return None
-    if not parts:
-        return None
+    # Each length goes in, too, so that no two lists of contents give the same bytes.
     digest = hashlib.sha256()
-    for content in parts:
-        digest.update(len(content).to_bytes(8, "little"))
+    for content in contents:
+        digest.update(len(content).to_bytes(_LENGTH_BYTES, "little"))
         digest.update(content)
     _DIGESTS[module] = digest.hexdigest()
     return _DIGESTS[module]
 
 
+def _structure_of(module: nn.Module, file: Path) -> list[bytes]:
+    """Returns the bytes that tell the structure of a network; empty if its code may be anywhere."""
+    if isinstance(module, FileGraph):
+        # The nodes tell which output of the file it is.
+        return [file.read_bytes(), "\n".join(module._modules).encode()]
+    if is_of_transformers(module):
+        with file.open("rb") as weights:
+            size = int.from_bytes(weights.read(_LENGTH_BYTES), "little")
+            header = weights.read(min(size, _HEADER_BYTES))
+        return [header, file.with_name("config.json").read_bytes()]
+    return []
+
+
 def _read(path: Path) -> dict[str, list[str]]:
-    """The answers in a file by their questions; none if it is not as it should be."""
+    """Returns the answers in a file by their questions; none if it is absent, damaged or old."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             return {}
@@ -168,19 +191,21 @@ def _read(path: Path) -> dict[str, list[str]]:
         if content["versions"] != _versions():
             return {}
         answers = dict(content["answers"])
+    # What `json.loads` and the look-ups raise on other content; such a file counts as absent.
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return {}
-    good = all(
+    are_lists_of_text = all(
         isinstance(answer, list) and all(isinstance(word, str) for word in answer)
         for answer in answers.values()
     )
-    return answers if good else {}
+    return answers if are_lists_of_text else {}
 
 
 def _write(path: Path, answers: dict[str, list[str]]) -> None:
-    """Replaces a file by these answers, the first ones if they are many; or does nothing."""
-    latest = dict(list(answers.items())[:_MOST_ANSWERS])
-    content = json.dumps({"versions": _versions(), "answers": latest}, indent=1)
+    """Replaces a file by these answers, of many the first ones; or leaves it if it cannot."""
+    first_answers = dict(list(answers.items())[:_MOST_ANSWERS])
+    content = json.dumps({"versions": _versions(), "answers": first_answers}, indent=1)
+    # Without the file, the next run decides again.
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")

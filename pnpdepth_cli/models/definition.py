@@ -36,28 +36,42 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 
-def _check(owner: object, field: str, good: bool, wanted: str) -> None:
-    """ModelError with the field and its value, unless that is good or the default."""
+def _check(owner: object, field: str, is_valid: bool, wanted: str) -> None:
+    """Raises ModelError unless a field's value is valid, or the default of the field.
+
+    Args:
+        owner: Dataclass object with the field.
+        field: Name of the field.
+        is_valid: Whether its value makes sense.
+        wanted: What makes sense, for the message "FIELD=VALUE is not …".
+    """
     value = getattr(owner, field)
-    if not good and value is not getattr(type(owner), field, _check):
-        name = getattr(owner, "name", "")
-        shown = " ".join(repr(value).split())
-        title = type(owner).__name__
-        if name:
-            title += f" {name!r}"
-        raise ModelError(f"{title[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
+    # A field's default is the class attribute of its name.
+    is_default = hasattr(type(owner), field) and value is getattr(type(owner), field)
+    if is_valid or is_default:
+        return
+    name = getattr(owner, "name", "")
+    shown = " ".join(repr(value).split())
+    title = type(owner).__name__
+    if name:
+        title += f" {name!r}"
+    raise ModelError(f"{title[:_MAX_SHOWN]}: {field}={shown[:_MAX_SHOWN]} is not {wanted}")
 
 
-def _check_choice(owner: object, field: str, choices: object) -> None:
-    valid = get_args(choices)
-    _check(owner, field, getattr(owner, field) in valid, f"one of {', '.join(map(repr, valid))}")
+def _check_choice(owner: object, field: str, literal: object) -> None:
+    """Raises ModelError unless a field's value is one of a typing.Literal, or the default."""
+    choices = get_args(literal)
+    is_choice = getattr(owner, field) in choices
+    _check(owner, field, is_choice, f"one of {', '.join(map(repr, choices))}")
 
 
-def _check_whole(owner: object, *fields: str) -> None:
+def _check_positive(owner: object, *fields: str) -> None:
+    """Raises ModelError unless each field's value is a whole number above 0, or the default."""
     for field in fields:
         value = getattr(owner, field)
-        good = isinstance(value, Integral) and not isinstance(value, bool) and int(value) > 0
-        _check(owner, field, good, "a whole number of at least 1")
+        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+        is_positive = is_whole and int(value) > 0
+        _check(owner, field, is_positive, "a whole number of at least 1")
 
 
 @dataclass(frozen=True)
@@ -74,7 +88,7 @@ class Fixed:
     """
 
     def __post_init__(self) -> None:
-        _check_whole(self, "height", "width")
+        _check_positive(self, "height", "width")
         _check_choice(self, "fit", Fit)
 
 
@@ -88,7 +102,7 @@ class Multiple:
     """Images with a longer side, in pixels, are shrunk to it first; None shrinks none."""
 
     def __post_init__(self) -> None:
-        _check_whole(self, "of", "longest")
+        _check_positive(self, "of", "longest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +116,7 @@ class Near:
     """Columns to approach, or None. With neither, the image keeps about its own size."""
 
     def __post_init__(self) -> None:
-        _check_whole(self, "of", "height", "width")
+        _check_positive(self, "of", "height", "width")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +131,10 @@ class Normalisation:
         for field, least in (("mean", -math.inf), ("std", 0.0)):
             value = getattr(self, field)
             numbers = list(value) if isinstance(value, Iterable) else []
-            good = len(numbers) == 3 and all(isinstance(n, Real) for n in numbers)
-            good = good and all(least < n < math.inf for n in numbers)
-            _check(self, field, good, "a finite number each for red, green and blue, std above 0")
+            are_three = len(numbers) == 3 and all(isinstance(number, Real) for number in numbers)
+            are_valid = are_three and all(least < number < math.inf for number in numbers)
+            wanted = "a finite number each for red, green and blue, std above 0"
+            _check(self, field, are_valid, wanted)
 
 
 UNIT = Normalisation()
@@ -237,22 +252,27 @@ class ModelDefinition:
             ("checkpoint", Path, "a pathlib.Path"),
         ):
             _check(self, field, isinstance(getattr(self, field), kinds), wanted)
-        good = isinstance(self.layers, tuple | list)
-        good = good and all(isinstance(name, str) for name in self.layers)
-        _check(self, "layers", good, "a tuple of texts, as in ('encoder', 'decoder.up1')")
+        are_names = isinstance(self.layers, tuple | list) and all(
+            isinstance(name, str) for name in self.layers
+        )
+        _check(self, "layers", are_names, "a tuple of texts, as in ('encoder', 'decoder.up1')")
         for hook in ("build", "read_checkpoint", "arguments", "output", "verify", "coarse"):
             _check(self, hook, callable(getattr(self, hook)), "a function or a class")
 
     @property
     def default_layer(self) -> str | None:
         """The layer to cut at where no option names one; None if the definition has none."""
-        return self.defaults.layer or (self.layers[0] if self.layers else None)
+        if self.defaults.layer:
+            return self.defaults.layer
+        return self.layers[0] if self.layers else None
 
     @property
     def default_alignment(self) -> str:
-        """How the output is aligned with the points where no option says so."""
-        metric = self.output_scale == "metric" and self.output_kind != "unknown"
-        return self.defaults.align or ("none" if metric else "auto")
+        """How the output is aligned with the points if no option says it: of `ALIGNMENTS`."""
+        if self.defaults.align:
+            return self.defaults.align
+        is_metric = self.output_scale == "metric" and self.output_kind != "unknown"
+        return "none" if is_metric else "auto"
 
     def call_arguments(
         self, rgb: Tensor | None, sparse: Tensor | None, intrinsics: Tensor | None = None
@@ -260,71 +280,113 @@ class ModelDefinition:
         """Returns the positional arguments of the network's forward for one frame.
 
         Args:
-            rgb: (1, 3, H, W), normalised, or None.
-            sparse: (1, 1, H, W) in metres with 0 = unknown, or None.
-            intrinsics: (1, 3, 3), where the network takes them.
+            rgb: Image (1, 3, H, W), normalised; None if the network takes none.
+            sparse: Sparse depth (1, 1, H, W) in metres with 0 = unknown; None if it takes none.
+            intrinsics: Camera matrix (1, 3, 3) in pixels of the image; None if it takes none.
         """
+        if self.arguments is not None and self.takes_intrinsics:
+            return self.arguments(rgb, sparse, intrinsics)
         if self.arguments is not None:
-            return self.arguments(*(rgb, sparse, intrinsics)[: 2 + self.takes_intrinsics])
+            return self.arguments(rgb, sparse)
         by_name = {"rgb": rgb, "sparse": sparse}
-        inputs = (*(by_name[name] for name in self.input_kind.split("+")), intrinsics)
+        inputs = [by_name[name] for name in self.input_kind.split("+")]
+        inputs.append(intrinsics)
         return tuple(tensor for tensor in inputs if tensor is not None)
 
 
-def assume_definition(**known: object) -> ModelDefinition:
+def assume_definition(**fields: object) -> ModelDefinition:
     """Returns a definition for a network that brings no description of its numbers.
 
-    It is of rgb, and sides of images are padded to multiples of `ASSUMED_MULTIPLE`, unless other
-    things are known. The points decide its normalisation and what its output means.
+    It takes an rgb image, whose sides are padded to multiples of `ASSUMED_MULTIPLE`. The points
+    decide its normalisation and what its output means.
+
+    Args:
+        **fields: Fields of `ModelDefinition` that are known. They replace what is assumed, and
+            `name` and `build` must be among them.
     """
-    unknown: dict[str, Any] = {"input_kind": "rgb", "size": Multiple(ASSUMED_MULTIPLE)}
-    unknown |= {"normalisation": None, "output_kind": "unknown", "output_scale": "unknown"}
-    return ModelDefinition(**unknown | {"defaults": UNTUNED_DEFAULTS} | known)
+    assumed: dict[str, Any] = {
+        "input_kind": "rgb",
+        "size": Multiple(ASSUMED_MULTIPLE),
+        "normalisation": None,
+        "output_kind": "unknown",
+        "output_scale": "unknown",
+        "defaults": UNTUNED_DEFAULTS,
+    }
+    return ModelDefinition(**assumed | fields)
 
 
 def graph_definition(
-    shapes: Sequence[Sequence[object]], file: Path, stated: Mapping[str, object], **known: object
+    shapes: Sequence[Sequence[object]], file: Path, stated: Mapping[str, object], **read: object
 ) -> ModelDefinition:
     """Returns the definition of a graph that was exported with its weights.
 
     Args:
-        shapes: Shapes of its inputs, in their order; no whole number where a side is of any length.
+        shapes: Shapes of its inputs, in their order; a side of any length is no whole number.
         file: File of the graph.
-        stated: Fields that a definition file states of it.
-        **known: Fields that are read in the file.
+        stated: Fields of `ModelDefinition` that a definition file states of the network; they
+            replace what the file says.
+        **read: Fields that were read in the file; `build` must be among them.
 
     Raises:
-        ModelError: The inputs are others than those stated, without any one rgb image.
+        ModelError: The inputs are others than those stated, or without that one rgb image.
     """
+    # As many inputs as are stated, one rgb image where nothing is.
     kind = str(stated.get("input_kind", "rgb"))
     wanted = kind.split("+")
     if stated.get("takes_intrinsics"):
         wanted.append("intrinsics")
-    # The image, or the sparse depth where there is none, has the sides; 1×3×H×W or 1×H×W×3.
-    channels = 3 if "rgb" in kind else 1
-    sides = [s[1:] for s in shapes if len(s) == 4 and (s[0] == 1 or not isinstance(s[0], int))]
-    image = next((side for side in sides if channels in (side[0], side[2])), None)
-    if image is None or len(shapes) != len(wanted):
+    # The size is that of the image, or of the sparse depth where there is none.
+    size = _image_size(shapes, channels=3 if "rgb" in kind else 1)
+    if size is None or len(shapes) != len(wanted):
         listed = ", ".join("×".join(map(str, shape)) for shape in shapes)
         raise ModelError(
             f"{file} has {len(shapes)} input(s), {listed[:80]}, where {' and '.join(wanted)} is"
             " expected, the image as 1×3×H×W or 1×H×W×3; `input_kind` of a definition says others"
         )
-    height, width = image[1:] if image[0] == channels else image[:2]
+    height, width = size
 
-    def arguments(*given: Tensor | None) -> tuple[Tensor, ...]:
-        """The tensors without a batch axis, or with the channels last, where the graph has it."""
-        tensors = [tensor for tensor in given if tensor is not None]
-        for index, shape in enumerate(shapes):
-            if tensors[index].ndim > len(shape):
-                tensors[index] = tensors[index][0]
-            elif len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3):
-                tensors[index] = tensors[index].permute(0, 2, 3, 1).contiguous()
-        return tuple(tensors)
+    def arguments(*inputs: Tensor | None) -> tuple[Tensor, ...]:
+        """Returns the inputs that the network takes, with the axes that its graph has."""
+        tensors = [tensor for tensor in inputs if tensor is not None]
+        return tuple(
+            _with_axes_of(shape, tensor) for shape, tensor in zip(shapes, tensors, strict=True)
+        )
 
+    # What the graph says is known; the rest is assumed.
+    fields: dict[str, object] = {**read}
     if "rgb" not in kind:
-        known["normalisation"] = Normalisation()
+        fields["normalisation"] = Normalisation()
     if isinstance(height, int) and isinstance(width, int):
-        known["size"] = Fixed(height, width)
-    known |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
-    return assume_definition(**known | dict(stated))
+        fields["size"] = Fixed(height, width)
+    fields |= {"name": file.stem, "complete": True, "checkpoint": file, "arguments": arguments}
+    return assume_definition(**fields | dict(stated))
+
+
+def _image_size(shapes: Sequence[Sequence[object]], channels: int) -> tuple[object, object] | None:
+    """Returns (height, width) of the first shape 1×channels×H×W or 1×H×W×channels.
+
+    A side of any length is no whole number, neither in the shapes nor in the result. None if there
+    is no such shape.
+    """
+    for shape in shapes:
+        if len(shape) != 4:
+            continue
+        batch, second, third, last = shape
+        if isinstance(batch, int) and batch != 1:
+            continue
+        if second == channels:
+            return third, last
+        if last == channels:
+            return second, third
+    return None
+
+
+def _with_axes_of(shape: Sequence[object], tensor: Tensor) -> Tensor:
+    """Returns a tensor (1, c, H, W) or (1, 3, 3) without its batch axis if the shape has none.
+
+    With its channels last if the shape has them there.
+    """
+    if tensor.ndim > len(shape):
+        return tensor[0]
+    is_channels_last = len(shape) == 4 and shape[3] in (1, 3) and shape[1] not in (1, 3)
+    return tensor.permute(0, 2, 3, 1).contiguous() if is_channels_last else tensor

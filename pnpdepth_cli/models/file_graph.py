@@ -1,4 +1,4 @@
-"""A graph that was read from a file, as a torch module that is run without endless memory.
+"""A graph that was read from a file, as a torch module that takes no more memory than it may.
 
 ConstantOfShape, Tile, Pad, Expand and many other operators can turn a few bytes of a file into
 gigabytes; `SizeLimit` knows the size of every result before it is allocated.
@@ -61,17 +61,25 @@ _TRUTH_VALUES = (
 
 
 class Operation(nn.Module):
-    """One operation of a graph: a function, and what it is called in messages.
+    """One operation of a graph, as a module that calls a function.
 
-    A ModelError of the function says what use of the operator is not covered.
+    Args:
+        title: The operation's name in messages, with its file.
+        function: Function that computes it. Its ModelError says what use of the operator is not
+            covered.
     """
 
     def __init__(self, title: str, function: Callable[..., object]) -> None:
         super().__init__()
-        self.title, self._function = title, function
+        self.title = title
+        self._function = function
 
     def forward(self, *args: object, **kwargs: object) -> object:
-        """Returns the function's result."""
+        """Returns the function's result.
+
+        Raises:
+            ModelError: This use of the operator is not covered; the message begins with the title.
+        """
         try:
             return self._function(*args, **kwargs)
         except ModelError as error:
@@ -83,6 +91,8 @@ class FileGraph(nn.Module):
 
     Its operations are submodules in the file's order, so that the network can be cut at them. The
     first run for inputs of a size gives no result far larger than inputs and weights.
+
+    It is built by `add_input`, `add_tensor` and `add_operation`, and finished by `set_outputs`.
     """
 
     def __init__(self) -> None:
@@ -90,7 +100,8 @@ class FileGraph(nn.Module):
         self.values: dict[str, fx.Node] = {}
         """What the graph computes so far, by the file's names; empty once it has its outputs."""
         self._graph = fx.Graph()
-        self._allowed: set[tuple[torch.Size, ...]] = set()
+        self._checked_sizes: set[tuple[torch.Size, ...]] = set()
+        """Shapes of all inputs with which a run stayed within its limits."""
 
     @property
     def inputs(self) -> list[str]:
@@ -98,11 +109,14 @@ class FileGraph(nn.Module):
         return [str(node.target) for node in self._graph.nodes if node.op == "placeholder"]
 
     def add_input(self, name: str) -> None:
-        """Adds an input behind the others."""
+        """Adds an input of this name behind those that were added before."""
         self.values[name] = self._graph.create_node("placeholder", name)
 
     def add_tensor(self, name: str, tensor: Tensor) -> fx.Node:
-        """Returns the value of a weight or another constant, which is added without gradient."""
+        """Adds a weight or another constant under its name in the file; returns its graph node.
+
+        A gradient of it is never computed.
+        """
         attribute = f"tensor{len(self.values)}"
         if tensor.is_floating_point():
             self.register_parameter(attribute, nn.Parameter(tensor, requires_grad=False))
@@ -121,22 +135,27 @@ class FileGraph(nn.Module):
         *,
         is_layer: bool = True,
     ) -> None:
-        """Adds a call whose result, or the parts of it, are further values.
+        """Adds an operation whose result, or the entries of it, are further values of the graph.
 
         Args:
             name: Name of the submodule; one that is taken gets an underscore.
-            operation: What is called.
+            operation: Operation that is called.
             inputs: Positional arguments, with values of the graph in them.
             keywords: Keyword arguments.
-            outputs: Name of the result, or names of its parts, empty for one that nothing reads.
-            is_layer: Whether the operation is a submodule.
+            outputs: Name of the result; or, of a tuple, the names of its entries, empty or None for
+                one that nothing reads.
+            is_layer: Whether the operation is a submodule, at which the network can be cut.
         """
         while hasattr(self, name) or name in self._modules:  # as of a node named `to`
             name += "_"
-        kind: str = "call_module" if is_layer else "call_function"
+        # fx calls a submodule by its name, and a function itself.
         if is_layer:
             self._modules[name] = operation  # not add_module, which refuses dots
-        target = name if is_layer else operation
+            kind: str = "call_module"
+            target: str | Operation = name
+        else:
+            kind = "call_function"
+            target = operation
         result = self._graph.create_node(kind, target, tuple(inputs), dict(keywords), name)
         if isinstance(outputs, str):
             self.values[outputs] = result
@@ -146,7 +165,10 @@ class FileGraph(nn.Module):
                 self.values[output] = self._graph.call_function(operator.getitem, (result, index))
 
     def set_outputs(self, names: Sequence[str]) -> None:
-        """Ends the graph: these values are returned, a single one alone."""
+        """Ends the graph: forward returns the values of these names, a single one without a tuple.
+
+        No more can be added afterwards.
+        """
         values = tuple(self.values[name] for name in names)
         self._graph.output(values if len(values) > 1 else values[0])
         self.values.clear()
@@ -158,34 +180,46 @@ class FileGraph(nn.Module):
             ModelError: A result is too large, all at a time are, or it is too much arithmetic.
         """
         sizes = tuple(tensor.shape for tensor in inputs)
-        if sizes in self._allowed:
+        if sizes in self._checked_sizes:
             return _Runner(self, math.inf).run(*inputs)
-        given = _elements([*inputs, *self.parameters(), *self.buffers()])
-        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * given)
+        # The first run of a size is under limits that follow from inputs and weights.
+        held = _elements([*inputs, *self.parameters(), *self.buffers()])
+        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * held)
         pixels = max([tensor.shape[-2:].numel() for tensor in inputs], default=0)
         work = _WORK_PER_PIXEL * max(pixels, _LEAST_PIXELS)
         with SizeLimit(largest, work=work, work_is="of any published depth network"):
             result = _Runner(self, 2 * largest).run(*inputs)
-        self._allowed.add(sizes)
+        self._checked_sizes.add(sizes)
         return result
 
 
 class _Runner(fx.Interpreter):
-    """Runs a graph with so many elements at a time; a value is dropped behind its last use."""
+    """Runs a graph, and drops each value behind its last use.
+
+    Args:
+        module: The graph.
+        most: Elements that all values may have together at a time; infinite for no limit.
+    """
 
     def __init__(self, module: FileGraph, most: float) -> None:
         super().__init__(module, graph=module._graph)
-        self.extra_traceback = False
+        self.extra_traceback = False  # errors are shown by the operation's title
         self._most = most
 
     def call_module(
         self, target: Target, args: tuple[Argument, ...], kwargs: dict[str, object]
     ) -> object:
-        """The result of a submodule, whose name may have dots in it."""
+        """Returns the result of a submodule, whose name may have dots in it; fx calls this."""
         return self.submodules[str(target)](*args, **kwargs)
 
     def run_node(self, node: fx.Node) -> object:
-        """The node's result, without what debuggers of graphs would note of it."""
+        """Returns the result of one node of the graph; fx calls this.
+
+        Unlike fx's own, it notes nothing for debuggers of graphs.
+
+        Raises:
+            ModelError: All values together have too many elements.
+        """
         args, kwargs = self.fetch_args_kwargs_from_env(node)
         result = getattr(self, node.op)(node.target, args, kwargs)
         if self._most < math.inf and _elements([*self.env.values(), result]) > self._most:
@@ -197,23 +231,24 @@ class _Runner(fx.Interpreter):
 
 
 def _elements(values: object) -> int:
+    """Returns the number of elements of all tensors in a nested structure."""
     return sum(map(torch.numel, _tensors_in(values)))
 
 
 class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Inside, an operation with a result of too many elements raises ModelError without being run.
+    """Inside, an operation of torch that goes beyond a limit raises ModelError without being run.
 
     Args:
-        largest: Elements of one result.
-        in_all: Elements of all results together, or no limit.
-        work: Elements read and products summed by all operations together, or no limit.
-        work_is: What `work` is far more than, for the message.
+        largest: Elements that one operation's result may have.
+        in_all: Elements that all results together may have; infinite for no limit.
+        work: Elements read and products summed by all operations together; infinite for no limit.
+        work_is: Arithmetic that is far less than `work`, as in "of any published depth network",
+            for the message.
     """
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        # As in `Watch`: without this mark, torch would import its whole compiler.
-        return False
+        return False  # without this mark, torch would import its whole compiler
 
     def __init__(
         self,
@@ -224,8 +259,8 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
     ) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._largest = largest
-        self._left = in_all
-        self._work = work
+        self._elements_left = in_all
+        self._work_left = work
         self._work_is = work_is
 
     def __torch_dispatch__(
@@ -235,29 +270,53 @@ class SizeLimit(TorchDispatchMode):  # type: ignore[no-untyped-call]
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Runs the operation if its result fits; see TorchDispatchMode."""
+        """Returns the operation's result if it is within the limits; torch calls this.
+
+        See TorchDispatchMode.
+        """
         kwargs = kwargs or {}
-        expected = _shaped_result(func, args, kwargs)
+        # How large the result will be. A view, or a result in place, takes no memory.
+        expected = _result_without_memory(func, args, kwargs)
         elements = [tensor.numel() for tensor in _tensors_in(expected)]
-        in_place_or_view = any(returned.alias_info is not None for returned in func._schema.returns)
-        self._left -= 0 if in_place_or_view else sum(elements)
-        if max(elements, default=0) > self._largest or self._left < 0:
+        is_view_or_in_place = any(entry.alias_info is not None for entry in func._schema.returns)
+        if not is_view_or_in_place:
+            self._elements_left -= sum(elements)
+        if max(elements, default=0) > self._largest or self._elements_left < 0:
             raise ModelError(f"a result of {sum(elements):.3g} elements")
-        self._work -= sum(map(torch.numel, _tensors_in((args, kwargs))))
-        if elements and func.overloadpacket in flop_registry:
-            self._work -= flop_registry[func.overloadpacket](*args, **kwargs, out_val=expected) / 2
-        if self._work < 0:
+        # What it takes: the elements that are read, and half of torch's count of operations, as it
+        # has a product and its sum as two.
+        self._work_left -= sum(map(torch.numel, _tensors_in((args, kwargs))))
+        count_operations = flop_registry.get(func.overloadpacket)
+        if elements and count_operations is not None:
+            self._work_left -= count_operations(*args, **kwargs, out_val=expected) / 2
+        if self._work_left < 0:
             raise ModelError(f"far more arithmetic than that {self._work_is}")
         return func(*args, **kwargs)
 
 
-def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str, object]) -> object:
-    """Tensors without memory that are at least as large as the operation's results."""
-    without = {"device": "meta"} if "device" in kwargs or not _tensors_in((args, kwargs)) else {}
+def _result_without_memory(
+    func: OpOverload, args: tuple[object, ...], kwargs: dict[str, object]
+) -> object:
+    """Returns tensors of the meta device that are at least as large as the operation's results.
+
+    None if the result is a number, or the operation will fail.
+
+    Args:
+        func: Operation of torch.
+        args: Positional arguments, with tensors of any device.
+        kwargs: Keyword arguments, the same.
+
+    Raises:
+        ModelError: The size of the result follows from values.
+    """
+    # An operation that makes a tensor of none is told the device.
+    makes_tensor = "device" in kwargs or not _tensors_in((args, kwargs))
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
+    if makes_tensor:
+        kwargs = kwargs | {"device": "meta"}
     try:
-        return result_without_values(func, args, kwargs | without)
-    except NotImplementedError:
+        return result_without_values(func, args, kwargs)
+    except NotImplementedError:  # torch says so where the meta device cannot know a result
         if func._opname not in _NUMBERS:
             raise ModelError("a result of a size that only its values tell") from None
         return None
@@ -268,28 +327,24 @@ def _shaped_result(func: OpOverload, args: tuple[object, ...], kwargs: dict[str,
 def result_without_values(
     func: OpOverload, args: Sequence[object], kwargs: Mapping[str, object]
 ) -> object:
-    """Returns the result of an operation on tensors of the meta device.
+    """Returns the result of an operation on tensors of the meta device, which have no values.
 
-    Where torch would write it out in smaller operations, it imports its compiler, which takes 1 s.
-    The commonest operations need none.
+    Where torch would write the operation out in smaller ones, it imports its compiler, which takes
+    1 s. So the commonest operations are done here: batch normalisation, functions of single
+    elements, and concatenation. All others are left to torch.
     """
     tensors = _tensors_in((args, kwargs))
-    first = tensors[0] if tensors else None
-    if first is None or not all(tensor.is_meta for tensor in tensors):
+    if not tensors or not all(tensor.is_meta for tensor in tensors):
         return func(*args, **kwargs)
+    first = tensors[0]
     if func._opname in _BATCH_NORMS:
+        # The output, and the statistics of the batch, which there are none of outside training.
         return torch.empty_like(first), first.new_empty(0), first.new_empty(0)
-    plain = torch.Tag.pointwise in func.tags and not func._schema.is_mutable
-    plain = plain and func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
-    same = all(tensor.dtype == first.dtype for tensor in tensors)
-    if plain and same and first.dtype == torch.float32:
+    has_one_dtype = all(tensor.dtype == first.dtype for tensor in tensors)
+    if _is_elementwise(func) and has_one_dtype and first.dtype == torch.float32:
         return first.new_empty(_broadcast([tensor.shape for tensor in tensors]))
-    if (
-        func._opname == "cat"
-        and same
-        and len({tensor.ndim for tensor in tensors}) == 1
-        and first.ndim
-    ):
+    has_one_rank = all(tensor.ndim == first.ndim for tensor in tensors)
+    if func._opname == "cat" and has_one_dtype and has_one_rank and first.ndim > 0:
         axis = int(args[1]) if len(args) > 1 else 0  # type: ignore[call-overload]
         shape = list(first.shape)
         shape[axis] = sum(tensor.shape[axis] for tensor in tensors)
@@ -297,12 +352,27 @@ def result_without_values(
     return func(*args, **kwargs)
 
 
+def _is_elementwise(func: OpOverload) -> bool:
+    """Whether an operation makes one new tensor, each element from one element of each argument.
+
+    And of the arguments' type: those that make true or false are none.
+    """
+    if torch.Tag.pointwise not in func.tags or func._schema.is_mutable:
+        return False
+    return func._opname not in _TRUTH_VALUES and len(func._schema.returns) == 1
+
+
 def _broadcast(shapes: Sequence[Sequence[int]]) -> list[int]:
-    """The shape of a function of single elements of tensors that have these shapes."""
-    # torch.broadcast_shapes imports a package for symbols.
-    sides = itertools.zip_longest(*map(reversed, shapes), fillvalue=1)
-    return [next((size for size in sizes if size != 1), 1) for sizes in sides][::-1]
+    """Returns the shape that tensors of these shapes are broadcast to, by the rules of NumPy.
+
+    torch.broadcast_shapes does the same, but imports a package for symbols.
+    """
+    # Shapes are aligned at their last axis; missing axes have length 1.
+    from_last = itertools.zip_longest(*map(reversed, shapes), fillvalue=1)
+    broadcast = [next((side for side in sides if side != 1), 1) for sides in from_last]
+    return broadcast[::-1]
 
 
 def _tensors_in(value: object) -> list[Tensor]:
+    """Returns all tensors in a nested structure, in order."""
     return [leaf for leaf in tree_leaves(value) if isinstance(leaf, Tensor)]

@@ -27,13 +27,19 @@ from pnpdepth_cli.models.weights.pickle_reader import wrap_content_errors
 from pnpdepth_cli.spent import spent_on
 
 _MOST_JSON_BYTES = 1 << 24
-_MAX_SIDE = 1 << 16  # pixels
-_LARGEST_NUMBER = 1e6  # in a config.json; no network has more of any part
+"""Bytes of the largest JSON file that is read."""
+_MAX_SIDE = 1 << 16
+"""Pixels of the longest side of an image that a file may state."""
+_LARGEST_NUMBER = 1e6
+"""Largest number in a config.json; no network has more of any part."""
+_MAX_SHOWN = 60
+"""Characters of a wrong value that are shown."""
 _PLAIN_ATTENTION = ("eager", "sdpa")
+"""Attention that is torch's own code; any other name may be that of a package to fetch."""
 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=_MAX_SIDE)]
-_Sides = _Side | Annotated[float, msgspec.Meta(ge=1 / _MAX_SIDE, lt=1)] | None
-"""Pixels; or their reciprocal, as ZoeDepth's folders have 1/32."""
+_Multiple = _Side | Annotated[float, msgspec.Meta(ge=1 / _MAX_SIDE, lt=1)] | None
+"""What sides are multiples of: pixels, or their reciprocal, as ZoeDepth's folders have 1/32."""
 _Number = Annotated[float, msgspec.Meta(ge=-_LARGEST_NUMBER, le=_LARGEST_NUMBER)]
 _Positive = Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_NUMBER)]
 
@@ -46,8 +52,8 @@ class _Processing(msgspec.Struct, frozen=True):
     do_resize: bool | None = True
     size: _Side | dict[str, _Side | None] | None = None
     keep_aspect_ratio: bool | None = False
-    size_divisor: _Sides = None
-    ensure_multiple_of: _Sides = None
+    size_divisor: _Multiple = None
+    ensure_multiple_of: _Multiple = None
     do_rescale: bool | None = True
     rescale_factor: _Positive = 1 / 255
     do_normalize: bool | None = None
@@ -55,13 +61,19 @@ class _Processing(msgspec.Struct, frozen=True):
     image_std: tuple[_Positive, _Positive, _Positive] | None = None
 
     def size_policy(self, of: int) -> definition.Fixed | definition.Near | None:
-        """How images are resized, to multiples of a number at least; None if it is not said."""
+        """Returns the image sizes that the network takes; None if the file does not say it.
+
+        Args:
+            of: Number that sides are multiples of, or of a larger one that the file states.
+        """
+        # The image's own size, but for rounding.
         if not self.do_resize or self.size_divisor is not None:
             return definition.Near(of=max(of, _pixels(self.size_divisor)))
+        # A height and a width, or one length for both.
         sides = self.size if isinstance(self.size, dict) else {"shortest_edge": self.size}
-        height, width = (
-            sides.get(side) or sides.get("shortest_edge") for side in ("height", "width")
-        )
+        shortest_edge = sides.get("shortest_edge")
+        height = sides.get("height") or shortest_edge
+        width = sides.get("width") or shortest_edge
         if height is None or width is None:
             return None
         if not self.keep_aspect_ratio:
@@ -70,20 +82,30 @@ class _Processing(msgspec.Struct, frozen=True):
         return definition.Near(of=multiple, height=height, width=width)
 
     def normalisation(self) -> definition.Normalisation:
-        """The same of an image in 0…1."""
-        # An image that is not rescaled is in 0…255: a standard deviation of 1/255 does the same.
-        unit = self.rescale_factor * 255 if self.do_rescale else 255.0
-        asked = self.image_mean is not None if self.do_normalize is None else self.do_normalize
-        m0, m1, m2 = (self.image_mean or (0.5, 0.5, 0.5)) if asked else (0.0, 0.0, 0.0)
-        s0, s1, s2 = (self.image_std or (0.5, 0.5, 0.5)) if asked else (1.0, 1.0, 1.0)
+        """Returns the normalisation of an image in 0…1 that does what the file says of 0…255."""
+        # The file's image is in 0…255 × rescale_factor: 0…white, where ours is in 0…1.
+        white = self.rescale_factor * 255 if self.do_rescale else 255.0
+        # Where nothing says whether, an image with a mean is normalised; 0.5 is transformers'
+        # default.
+        is_normalised = self.do_normalize
+        if is_normalised is None:
+            is_normalised = self.image_mean is not None
+        mean = (0.0, 0.0, 0.0)
+        std = (1.0, 1.0, 1.0)
+        if is_normalised:
+            mean = self.image_mean or (0.5, 0.5, 0.5)
+            std = self.image_std or (0.5, 0.5, 0.5)
         return definition.Normalisation(
-            mean=(m0 / unit, m1 / unit, m2 / unit), std=(s0 / unit, s1 / unit, s2 / unit)
+            mean=(mean[0] / white, mean[1] / white, mean[2] / white),
+            std=(std[0] / white, std[1] / white, std[2] / white),
         )
 
 
 def _pixels(side: float | None) -> int:
-    """A number of pixels; 1 if there is none."""
-    return round(1 / side) if isinstance(side, float) else side or 1
+    """Returns a number of pixels from `_Multiple`; 1 if there is none."""
+    if isinstance(side, float):
+        return round(1 / side)
+    return side or 1
 
 
 class _Family(NamedTuple):
@@ -94,6 +116,7 @@ class _Family(NamedTuple):
     output_kind: OutputKind
     output_scale: OutputScale
     multiple: int
+    """Pixels that sides of images are multiples of."""
 
 
 _FAMILIES = {
@@ -123,16 +146,19 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
     kind = config.get("model_type")
     if not isinstance(kind, str) or kind not in _FAMILIES:
         known = ", ".join(_FAMILIES)
-        raise ModelError(f"{folder}: network type {str(kind)[:60]!r} is not one of {known}")
+        raise ModelError(f"{folder}: network type {str(kind)[:_MAX_SHOWN]!r} is not one of {known}")
     with wrap_content_errors(str(folder / "config.json")):
         _check_settings(config)
     # What its numbers are, and how images are prepared.
-    _, output_kind, output_scale, of = _FAMILIES[kind]
+    family = _FAMILIES[kind]
+    output_kind = family.output_kind
+    output_scale = family.output_scale
     if config.get("depth_estimation_type") == "metric":
-        output_kind, output_scale = "depth", "metric"
+        output_kind = "depth"
+        output_scale = "metric"
     file = folder / "preprocessor_config.json"
     processing = _read(file, _Processing)
-    size = processing.size_policy(of)
+    size = processing.size_policy(family.multiple)
     if size is None:
         raise ModelError(f"{file}: it says no size")
     weights = folder / "model.safetensors"
@@ -158,23 +184,36 @@ def hf_definition(folder: Path) -> definition.ModelDefinition:
     )
 
 
-def _check_settings(value: object, *, attention: bool = False) -> None:
-    """InputError for a huge number, or an attention that transformers may fetch and run."""
+def _check_settings(value: object, *, is_attention: bool = False) -> None:
+    """Raises InputError for a huge number, or an attention that transformers may fetch and run.
+
+    Args:
+        value: Content of config.json, or any value in it.
+        is_attention: Whether a text in it names an implementation of attention.
+    """
+    # NaN is larger than any number, too.
     if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
         raise InputError(f"{str(value)[:20]} is larger than any part of a network")
-    if attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:
+    if is_attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:
         raise InputError(
-            f"attn_implementation {value[:60]!r} may fetch and run code; only"
+            f"attn_implementation {value[:_MAX_SHOWN]!r} may fetch and run code; only"
             f" {' and '.join(_PLAIN_ATTENTION)} are taken, remove the entry"
         )
-    for key, setting in value.items() if isinstance(value, dict) else ():
-        _check_settings(setting, attention=attention or "attn_implementation" in key)
-    for setting in value if isinstance(value, list) else ():
-        _check_settings(setting, attention=attention)
+    if isinstance(value, dict):
+        for key, setting in value.items():
+            is_of_attention = is_attention or "attn_implementation" in key
+            _check_settings(setting, is_attention=is_of_attention)
+    if isinstance(value, list):
+        for setting in value:
+            _check_settings(setting, is_attention=is_attention)
 
 
 def _read(file: Path, kind: type[_Kind]) -> _Kind:
-    """The settings in a JSON file of the folder."""
+    """Returns the content of a JSON file of the folder, of the kind that msgspec makes of it.
+
+    Raises:
+        ModelError: The file is missing, too large, no JSON, or of another kind.
+    """
     if not file.is_file():
         raise ModelError(
             f"{file.parent} is not a Hugging Face folder: {file.name} is missing; take it from the"
@@ -186,7 +225,17 @@ def _read(file: Path, kind: type[_Kind]) -> _Kind:
 
 
 def _build(folder: Path, kind: str) -> nn.Module:
-    # Read when huggingface_hub is imported; a folder may name a backbone that is looked for online.
+    """Returns the network of a folder with its weights, in float32; nothing is downloaded.
+
+    Args:
+        folder: Hugging Face folder.
+        kind: Model type in its config.json, a key of `_FAMILIES`.
+
+    Raises:
+        ModelError: transformers is missing, or the weights are not those of the network.
+    """
+    # A folder may name a backbone that is looked for online. huggingface_hub reads the variable
+    # when it is imported.
     os.environ["HF_HUB_OFFLINE"] = "1"
     try:
         with spent_on("import"):
@@ -222,7 +271,7 @@ def _build(folder: Path, kind: str) -> nn.Module:
 
 
 def _network_class(kind: str) -> Any:
-    """The network for depth of a type, from the module of transformers that defines it."""
+    """Returns the class of transformers for the depth networks of a model type."""
     module = importlib.import_module(f"transformers.models.{kind}.modeling_{kind}")
     return getattr(module, _FAMILIES[kind].network)
 
@@ -233,13 +282,13 @@ def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
 
     transformers describes the network on the meta device, and gives it its weights afterwards.
     """
-    left = (folder / "model.safetensors").stat().st_size
+    bytes_left = (folder / "model.safetensors").stat().st_size
 
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-        nonlocal left
+        nonlocal bytes_left
         if parameter is not None and parameter.is_meta:
-            left -= max(1, parameter.numel())
-        if left < 0:
+            bytes_left -= max(1, parameter.numel())  # an element takes a byte at least
+        if bytes_left < 0:
             raise ModelError(f"{folder}: config.json describes a larger network than its weights")
 
     with register_module_parameter_registration_hook(count):

@@ -1,4 +1,7 @@
-"""A part of what a network gives, named behind its file: `net.onnx:points[z]`, `net.pt2:[1]`."""
+"""The one tensor that is depth in what a network gives: `net.onnx:points[z]`, `net.pt2:[1]`.
+
+Each name in square brackets behind the network chooses an entry, or a channel of a tensor.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +15,36 @@ from pnpdepth_cli.errors import ModelError
 
 _AXES = ("x", "y", "z")
 """Names of the channels of a map of points."""
-_NAMED = re.compile(r"(.+:[^:\[\]]*?)((?:\[[^\[\]]+\])+)", re.DOTALL)
+_NETWORK_AND_PARTS = re.compile(r"(.+:[^:\[\]]*?)((?:\[[^\[\]]+\])+)", re.DOTALL)
+"""FILE:OUTPUT or FILE: in the first group, all of the brackets behind it in the second."""
 _PART = re.compile(r"\[([^\[\]]+)\]")
 
 
 class NamedOutput(NamedTuple):
-    """A network as it is named, without the parts of its output, and these."""
+    """A network as a user names it, and which part of its output is meant."""
 
     spec: str
+    """The network without the parts, such as `net.onnx:points`."""
     parts: tuple[str, ...]
+    """Names of entries or channels, the outermost first, such as ("z",); empty for the whole."""
 
 
 def split_parts(spec: str) -> NamedOutput:
     """Returns `net.onnx:points` and ("z",) of `net.onnx:points[z]`."""
-    found = _NAMED.fullmatch(spec)
-    if found is None:
+    match = _NETWORK_AND_PARTS.fullmatch(spec)
+    if match is None:
         return NamedOutput(spec, ())
-    return NamedOutput(found[1].removesuffix(":"), tuple(_PART.findall(found[2])))
+    network, brackets = match.groups()
+    return NamedOutput(network.removesuffix(":"), tuple(_PART.findall(brackets)))
 
 
 def part_of(output: Any, part: str) -> Any:
-    """Returns the element of a list or a mapping, or the channel of a tensor, of this name.
+    """Returns the element of a list or a mapping, or the channel (1, 1, h, w) of a tensor.
 
-    Channels are counted from 0, or are x, y and z of a map of points. The axis of channels is the
-    first or the last behind those of length 1, whichever is shorter.
+    Args:
+        output: What a network gives, or a part of that.
+        part: Key in a mapping, or number from 0 in a list or of a channel; or x, y or z, the
+            channels of a tensor that has three.
 
     Raises:
         ModelError: There is no such part.
@@ -55,8 +64,19 @@ def part_of(output: Any, part: str) -> Any:
 
 
 def _channel_of(output: Tensor, part: str, number: int | None) -> Tensor:
-    """The channel as a map (1, 1, h, w)."""
+    """Returns a channel of a tensor as a map (1, 1, h, w).
+
+    Args:
+        output: (c, h, w) or (h, w, c), whichever has the shorter axis of channels, or (h, w), with
+            any number of axes of length 1 before.
+        part: Name of the channel.
+        number: The name as a number; None if it is none.
+
+    Raises:
+        ModelError: There is no such channel.
+    """
     shape = "×".join(map(str, output.shape))
+    # As (c, h, w).
     maps = output
     while maps.ndim > 3 and maps.shape[0] == 1:
         maps = maps[0]
@@ -64,7 +84,8 @@ def _channel_of(output: Tensor, part: str, number: int | None) -> Tensor:
         maps = maps[None]
     if maps.ndim != 3:
         raise ModelError(f"an output of {shape} has no channel {part!r}")
-    if maps.shape[2] < maps.shape[0]:
+    is_channels_last = maps.shape[2] < maps.shape[0]
+    if is_channels_last:
         maps = maps.permute(2, 0, 1)
     if part in _AXES and len(maps) == len(_AXES):
         number = _AXES.index(part)

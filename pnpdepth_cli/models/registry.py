@@ -35,6 +35,9 @@ from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
 if TYPE_CHECKING:
     from torch import Tensor
 
+_FILE_AND_NAME = re.compile(r"(.*\.(?:py|onnx)):([^:]*)", re.DOTALL)
+"""FILE.py:ATTRIBUTE or FILE.onnx:OUTPUT."""
+
 
 def all_definitions() -> dict[str, ModelDefinition]:
     """Returns the definitions of all networks that can be named, in the order of the families.
@@ -44,14 +47,20 @@ def all_definitions() -> dict[str, ModelDefinition]:
     by_name = dict[str, ModelDefinition]()
     for family in choices.NETWORKS:
         with suppress(ModelError):
-            by_name |= {n: d for n, d in _definitions_of(family).items() if n not in by_name}
+            for name, definition in _definitions_of(family).items():
+                by_name.setdefault(name, definition)
     return by_name
 
 
 def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
-    """The definitions of one family. ModelError if it cannot be loaded, or holds none."""
+    """Returns the definitions of one family of `choices.NETWORKS`, by the networks' names.
+
+    Raises:
+        ModelError: The family cannot be loaded, or holds no definitions.
+    """
     with wrap_user_errors(f"network family {family!r}"):  # the code of another package
         entry = choices.NETWORKS[family]
+    # A module has one of two names; an entry point may also be the object itself.
     if isinstance(entry, ModuleType):
         entry = getattr(entry, "definitions", None) or getattr(entry, "definition", None)
     definitions = {entry.name: entry} if isinstance(entry, ModelDefinition) else entry
@@ -77,22 +86,28 @@ def find_definition(spec: str) -> ModelDefinition:
     Raises:
         ModelError: There is no such name or file, or it does not define a network.
     """
-    by_prefix = [f for f in choices.NETWORKS if spec == f or spec.startswith(f"{f}-")]
-    for family in sorted(by_prefix, key=len, reverse=True):
-        if spec in (definitions := _definitions_of(family)):
+    # A network is mostly named FAMILY or FAMILY-VARIANT; then no other family is loaded.
+    families = [
+        family for family in choices.NETWORKS if spec == family or spec.startswith(f"{family}-")
+    ]
+    for family in sorted(families, key=len, reverse=True):
+        definitions = _definitions_of(family)
+        if spec in definitions:
             return definitions[spec]
+    # A file or folder.
     named = split_parts(spec)
     from_file = _from_file(named.spec)
     if from_file is not None:
         return _with_parts(from_file, named.parts)
-    known = all_definitions()
-    if spec in known:
-        return known[spec]
-    near = difflib.get_close_matches(spec, known, n=1)
-    if near:
+    # A network whose name does not begin with its family's.
+    by_name = all_definitions()
+    if spec in by_name:
+        return by_name[spec]
+    similar_names = difflib.get_close_matches(spec, by_name, n=1)
+    if similar_names:
         raise ModelError(
             f"model {spec!r} is neither a known name nor a file or folder of a network; did you"
-            f" mean {near[0]!r}?"
+            f" mean {similar_names[0]!r}?"
         )
     raise ModelError(
         f"model {spec!r} is neither a known name nor a file or folder of a network; `pnpdepth"
@@ -101,33 +116,46 @@ def find_definition(spec: str) -> ModelDefinition:
 
 
 def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDefinition:
-    """The definition whose output is a part of what its own would be."""
+    """Returns the definition with an output that is a part of its own output.
+
+    Args:
+        definition: Definition of the network.
+        parts: Names for `part_of`, the outermost first; the definition stays as it is without any.
+    """
     if not parts:
         return definition
-    before = definition.output
+    choose_own_output = definition.output
 
-    def output(given: Any) -> Tensor:
-        found = given if before is None else before(given)
+    def output(returned: Any) -> Tensor:
+        chosen = returned if choose_own_output is None else choose_own_output(returned)
         for name in parts:
-            found = part_of(found, name)
-        return cast("Tensor", found)
+            chosen = part_of(chosen, name)
+        return cast("Tensor", chosen)
 
     return replace(definition, output=output)
 
 
 def _from_file(spec: str) -> ModelDefinition | None:
-    """The definition of a file or folder; None if `spec` looks like neither."""
-    # A Python or an ONNX file, perhaps with the name of a part behind a colon.
+    """Returns the definition of a file or folder; None if `spec` looks like neither.
+
+    Args:
+        spec: File or folder as `find_definition` takes it, without parts in brackets.
+
+    Raises:
+        ModelError: It cannot be read, or is of a kind that is not run.
+    """
+    # A Python or an ONNX file, perhaps with an attribute or an output behind a colon.
     file = spec
-    part = None
-    if (found := re.fullmatch(r"(.*\.(?:py|onnx)):([^:]*)", spec, re.DOTALL)) is not None:
-        file, part = found.groups()
+    name = None
+    match = _FILE_AND_NAME.fullmatch(spec)
+    if match is not None:
+        file, name = match.groups()
     if file.endswith(".py"):
-        return _python_definition(Path(file), part)
+        return _python_definition(Path(file), name)
     if file.endswith(".onnx"):
         from pnpdepth_cli.models.onnx import onnx_definition
 
-        return onnx_definition(Path(file), part)
+        return onnx_definition(Path(file), name)
     # An exported program has one graph.
     if spec.endswith(".pt2"):
         from pnpdepth_cli.models.torch_export import exported_definition
@@ -149,27 +177,40 @@ def _from_file(spec: str) -> ModelDefinition | None:
 
 
 def _python_definition(file: Path, attribute: str | None) -> ModelDefinition:
-    """The definition in a Python file, or one assumed for the network class in it."""
-    named = attribute or "definition"
-    value = getattr(_run(file), named, None)
+    """Returns the definition in a Python file, or one assumed for the network class in it.
+
+    Args:
+        file: The Python file, which is run.
+        attribute: Name of the definition, or of a class or function that makes the network; None
+            or empty for `definition`.
+
+    Raises:
+        ModelError: The file raises, or has no such attribute.
+    """
+    name = attribute or "definition"
+    value = getattr(_run(file), name, None)
     if value is None:
-        raise ModelError(f"model file {file} defines no {named!r}; name it as {file}:ATTRIBUTE")
+        raise ModelError(f"model file {file} defines no {name!r}; name it as {file}:ATTRIBUTE")
     if isinstance(value, ModelDefinition):
         return value
     if not callable(value):
-        raise ModelError(f"{named!r} in model file {file} is not a ModelDefinition")
+        raise ModelError(f"{name!r} in model file {file} is not a ModelDefinition")
     return assume_definition(
-        name=f"{file.stem}.{named}",
-        summary=f"{named} of {file.name}",
+        name=f"{file.stem}.{name}",
+        summary=f"{name} of {file.name}",
         build=value,
-        assumed=f"{named!r} of {file.name} is not a definition; assumed: one rgb image in, sides"
+        assumed=f"{name!r} of {file.name} is not a definition; assumed: one rgb image in, sides"
         f" padded to multiples of {ASSUMED_MULTIPLE}; what its numbers mean is decided from the"
         " points",
     )
 
 
 def _run(file: Path) -> ModuleType:
-    """The module that a Python file makes."""
+    """Runs a Python file as a new module, and returns the module.
+
+    Raises:
+        ModelError: The file is missing, or raises.
+    """
     check_network_file(file, "model file")
     name = f"pnpdepth_user_model_{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file)

@@ -1,4 +1,4 @@
-"""A depth map on disk as a network: it returns the map of the frame, whatever network made it."""
+"""A depth map on disk as a network, which returns the map that it is given."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.settings import Settings
 
 _LAYER = "0"
+"""Name of the only submodule of `_Same`, an nn.Sequential."""
 
 
 def stored_map(number: int, count: int) -> Network:
-    """Returns the network that gives a depth map of the frame as it is.
+    """Returns a network whose input is a depth map of the frame, and whose output is that map.
 
-    What its numbers mean is decided from the points, as of any network that does not say it. z is
-    the map itself. By default it is not updated, as no network behind z spreads an update.
+    What the map's numbers mean is decided from the points, as for any network that does not state
+    it. z is the map itself. By default z is not updated, as no layers behind it spread an update.
 
     Args:
         number: Number of the map among those of the frame, from 0.
-        count: How many maps a frame has.
+        count: How many maps a frame has; if more than one, the network's name has the number.
     """
     name = "depth map" if count == 1 else f"depth map {number + 1}"
     definition = ModelDefinition(

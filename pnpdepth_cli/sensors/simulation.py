@@ -148,7 +148,7 @@ def lidar_of(
     return Lidar(
         name=f"{beams} beams",
         elevations_deg=elevations,
-        azimuth_step_deg=LIDARS["vlp-16"].azimuth_step_deg,
+        azimuth_step_deg=VLP_16.azimuth_step_deg,
     )
 
 

@@ -1,4 +1,4 @@
-"""A file that defines a user's network."""
+"""A definition of a user's network, and that network."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pnpdepth_cli.models.definition import (
     ModelDefinition,
     Multiple,
 )
+from pnpdepth_cli.models.network import Network, load_network
 
 
 def definition(**more: object) -> ModelDefinition:
@@ -15,3 +16,7 @@ def definition(**more: object) -> ModelDefinition:
         "name": "n", "input_kind": "rgb", "size": Multiple(1), "build": nn.Identity, **more,
     }  # fmt: skip
     return ModelDefinition(**settings)  # type: ignore[arg-type]
+
+
+def network(**more: object) -> Network:
+    return load_network(definition(layers=("",), **more), None)

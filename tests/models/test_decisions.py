@@ -90,7 +90,7 @@ def test_what_was_decided_is_recalled(file: str, asked: list[str], cache: Path) 
 
 def test_what_is_kept_of_a_network_is_one_small_file(file: str, cache: Path) -> None:
     decided(file)
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     assert kept.stat().st_size < 4096
 
 
@@ -128,7 +128,7 @@ def test_a_damaged_file_is_ignored_and_replaced(
     content: bytes, file: str, asked: list[str]
 ) -> None:
     first = decided(file)
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     kept.write_bytes(content)
     assert decided(file) == first
     assert decided(file) == first
@@ -143,7 +143,7 @@ def test_decisions_of_another_version_are_not_taken(
     key: str, value: str, file: str, asked: list[str]
 ) -> None:
     decided(file)
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     content = json.loads(kept.read_text())
     content["versions"][key] = value
     kept.write_text(json.dumps(content))
@@ -156,7 +156,7 @@ def test_an_answer_that_cannot_be_right_is_not_taken(
     answer: object, file: str, asked: list[str]
 ) -> None:
     first = decided(file)
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     content = json.loads(kept.read_text())
     content["answers"] = dict.fromkeys(content["answers"], answer)
     kept.write_text(json.dumps(content))
@@ -195,7 +195,9 @@ def _ask_often(loaded: Any, number: int) -> None:
     """Asks of a network what another process does not; exit code 1 for an answer of another's."""
     for count in range(30):
         text = f"{number}.{count}"
-        answer = decisions.recalled(loaded.module, loaded.checkpoint, text, partial(list, [text]))
+        answer = decisions.recall_or_decide(
+            loaded.module, loaded.checkpoint, text, partial(list, [text])
+        )
         if answer != [text]:
             raise SystemExit(1)
 
@@ -216,7 +218,7 @@ def test_processes_that_write_at_once_leave_a_whole_file(
     for process in processes:
         process.join()
     assert [process.exitcode for process in processes] == [0] * 4
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     assert [path for path in cache.iterdir() if path != kept] == []
     # An answer may be lost, but none is wrong.
     answers = json.loads(kept.read_text())["answers"]
@@ -230,11 +232,11 @@ def test_the_file_of_a_network_in_use_is_read_once_for_all_questions(
     file: str, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loaded = load_network(file, None)
-    decisions.recalled(loaded.module, loaded.checkpoint, "one", lambda: ["a"])
+    decisions.recall_or_decide(loaded.module, loaded.checkpoint, "one", lambda: ["a"])
     read = list[Path]()
     original = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or original(path))
-    decisions.recalled(loaded.module, loaded.checkpoint, "two", lambda: ["b"])
+    decisions.recall_or_decide(loaded.module, loaded.checkpoint, "two", lambda: ["b"])
     assert loaded.checkpoint not in read
 
 
@@ -246,7 +248,7 @@ def test_two_that_write_at_once_leave_a_whole_file(file: str) -> None:
         for question in range(20):
             text = f"{number}.{question}"
             decide = partial(list, [text])
-            got = decisions.recalled(loaded.module, loaded.checkpoint, text, decide)
+            got = decisions.recall_or_decide(loaded.module, loaded.checkpoint, text, decide)
             assert got == [text]
 
     threads = [threading.Thread(target=ask, args=(number,)) for number in range(2)]
@@ -254,7 +256,7 @@ def test_two_that_write_at_once_leave_a_whole_file(file: str) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    (kept,) = decisions.kept()
+    (kept,) = decisions.kept_files()
     assert json.loads(kept.read_text())["answers"]
     assert [path for path in kept.parent.iterdir() if path != kept] == []
 
@@ -263,5 +265,5 @@ def test_nothing_is_kept_of_code_that_is_not_known(tmp_path: Path, cache: Path) 
     code = "import torch\nfrom torch import nn\n\ndef net():\n    return nn.Conv2d(3, 1, 3)\n"
     (tmp_path / "net.py").write_text(code)
     module = nn.Conv2d(3, 1, 3)
-    assert decisions.recalled(module, tmp_path / "net.py", "layers", lambda: ["a"]) == ["a"]
+    assert decisions.recall_or_decide(module, tmp_path / "net.py", "layers", lambda: ["a"]) == ["a"]
     assert not cache.exists()

@@ -14,10 +14,11 @@ import torch
 from pnpdepth_cli.core.refine_z import refine
 from pnpdepth_cli.core.split import Split
 from pnpdepth_cli.errors import ModelError
+from pnpdepth_cli.models.aligned_depth import AlignedDepth
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Near, Normalisation
 from pnpdepth_cli.models.frame_map import FrameMap, synthetic_frame
 from pnpdepth_cli.models.hugging_face import hf_definition
-from pnpdepth_cli.models.network import AlignedDepth, load_network
+from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import ClosedSettings
 from tests.models.weights.files import little
 

@@ -22,7 +22,7 @@ from torch.fx.node import Argument
 
 from pnpdepth_cli.budget import check_claim, check_network_file, max_decoded_bytes
 from pnpdepth_cli.errors import InputError, ModelError, wrap_user_errors
-from pnpdepth_cli.models.decisions import recalled
+from pnpdepth_cli.models.decisions import recall_or_decide
 from pnpdepth_cli.models.definition import (
     ASSUMED_MULTIPLE,
     ModelDefinition,
@@ -225,7 +225,9 @@ def _verify(
         return [_AGREES]
 
     sizes = [(tuple(tensor.shape), tensor.device.type) for tensor in arguments]
-    recalled(module, file if is_whole else None, f"agrees for {sizes}", compare, [_AGREES].__eq__)
+    recall_or_decide(
+        module, file if is_whole else None, f"agrees for {sizes}", compare, [_AGREES].__eq__
+    )
     return _AGREES
 
 

@@ -51,6 +51,14 @@ def test_of_a_whole_module_the_state_is_read_the_rest_named(tmp_path: Path, new:
     assert notes[0].startswith("checkpoint net.pth.tar: its pickle names argparse.Namespace")
 
 
+@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+def test_a_module_and_sets_are_read_of_every_protocol(tmp_path: Path, protocol: int) -> None:
+    net = Net()
+    path = tmp_path / "net.pth"
+    torch.save({"epochs": {1, 2}, "model": net}, path, pickle_protocol=protocol)
+    torch.testing.assert_close(read_checkpoint(path), dict(net.state_dict()), rtol=0, atol=0)
+
+
 @both_layouts
 def test_every_dtype_view_and_empty_tensor_is_read_to_the_bit(tmp_path: Path, new: bool) -> None:
     base = torch.arange(24).reshape(4, 6)
