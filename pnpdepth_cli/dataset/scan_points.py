@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.dataset.plausible import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
+from pnpdepth_cli.dataset.scan_returns import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.dataset import arrays
 from pnpdepth_cli.dataset.frame_files import ReadOptions, ScanOptions
-from pnpdepth_cli.dataset.plausible import (
-    check_pixels,
-    check_rows,
-    divisor_to_metres,
-    interpolation_warning,
-    named,
-)
+from pnpdepth_cli.dataset.pixel_checks import check_pixels, check_rows
+from pnpdepth_cli.dataset.plausible import divisor_to_metres, named
 from pnpdepth_cli.dataset.range_ends import far_values
+from pnpdepth_cli.dataset.resized_maps import interpolation_warning
 from pnpdepth_cli.dataset.stored_depth import StoredNumbers
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
