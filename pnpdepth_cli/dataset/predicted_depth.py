@@ -348,8 +348,8 @@ def _add_ends(unknown: _Unknown, values: Map) -> None:
             (near_end(known), "98 % of the others are at least"),
         ):
             found = np.zeros(values.shape, bool)
-            found[place] = end.is_none
-            unknown.add(found, f"about {end.value:.6g}, where {reach} {end.rest:.4g}")
+            found[place] = end.is_no_surface
+            unknown.add(found, f"about {end.value:.6g}, where {reach} {end.reach:.4g}")
     # Exactly one value.
     for value, _ in repeated_ends(unknown.others):
         name = "smallest" if value <= float(unknown.others.min()) else "largest"

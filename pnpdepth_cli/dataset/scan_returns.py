@@ -25,28 +25,37 @@ from pnpdepth_cli.errors import InputError, NoPointsError
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.sensors.projection import DropCounter, Mask
 
+# Returns of a scan.
 _AT_SENSOR_M = 1e-3
 """Range up to which a point is at the sensor, a beam without return."""
 _FARTHEST_M = 1e5
 """Largest coordinate of a scan; no LiDAR reaches a hundredth of it."""
-_BROKEN = 0.1
-"""Of the points; more that are no numbers are of another format."""
-_MANY_RETURNS = 1000
+_MOST_BROKEN = 0.1
+"""Fraction of the points that may have a coordinate that is none. With more, the file is of another
+format than it was read as."""
+_FEWEST_POINTS = 10
+"""Points of a scan; equal ones among fewer tell nothing."""
+_SAME_PLACE = 0.005
+"""Fraction of the points that are at one place, from which that place is no surface."""
+_FEWEST_AT_PLACE = 3
+"""Points at one place, at least, for the same."""
+
+# Whether one scanner measured the points; see `has_scanner`.
+_FEWEST_RETURNS = 1000
 """Points; fewer do not tell whether one scanner saw them."""
 _CELLS_DEG = (0.25, 0.35, 0.5, 0.7, 1.0)
-"""Azimuth and elevation of the cells in which a scanner sees one surface; see `has_scanner`."""
+"""Sides of square cells of azimuth and elevation in which a scanner sees one surface."""
+_CELL_ROWS = 4096
+"""More cells than there are above each other, 180° / 0.25°, so that each cell has its number."""
 _MANY_SHARED = 0.4
-"""Of the cells that have a point, how many have several if the cells are large enough."""
-_SEVERAL = 0.26
-"""Log ratio of ranges in a cell, 1.3 times, beyond which they are of several surfaces."""
+"""Fraction of the cells with a point that have two or more, if the cells are large enough."""
+_FEWEST_SHARED = 100
+"""Cells with two points or more; fewer tell nothing."""
+_SEVERAL_SURFACES = 0.26
+"""Log ratio of the ranges in a cell, 1.3 times, beyond which they are of several surfaces."""
 _MOST_SEVERAL = 0.12
-"""Of the cells with two points; between the 11 % and 13 % of `has_scanner`."""
-_FEW = 10
-"""Numbers; fewer decide nothing."""
-_SAME = 0.005
-"""Of the points; as many at one place are no surface."""
-_LEAST_SAME = 3
-"""Points at one place, at least."""
+"""Fraction of the cells with two points or more that may have several surfaces: between the 11 %
+and the 13 % of `has_scanner`."""
 
 
 class CloudInMetres(NamedTuple):
@@ -55,7 +64,7 @@ class CloudInMetres(NamedTuple):
     points: NDArray[np.floating]
     """(N, 3) metres."""
     dropped: dict[str, int]
-    """Number of the others, by the reason."""
+    """Number of the points that were dropped, by the reason."""
     notes: list[str]
     """Lines for a person."""
 
@@ -67,31 +76,31 @@ def scan_returns(
     *,
     of_integers: str = OF_DATA_SET,
 ) -> CloudInMetres:
-    """Returns the points of a scan that are returns, in metres.
+    """Returns the points of a scan that are returns of a beam, in metres.
 
     Args:
-        path: Path or topic of the scan.
+        path: Path or topic of the scan, for messages.
         xyz: (N, 3) in the scanner's coordinates, as they are stored.
-        scale: Numbers per metre that the user states.
-        of_integers: The other file of the frame whose integers that scale is of. Empty: it is
-            stated of these numbers.
+        scale: Numbers per metre that the user or the data set states. None: nothing is stated.
+        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
+            frame's other file, or `OF_DATA_SET`. Empty: it is stated of these very numbers.
 
     Raises:
         InputError: Many coordinates are none of a scan, or are implausible in metres.
         NoPointsError: No point is left.
     """
-    # The returns, and how many of the others there are.
-    range_m = np.linalg.norm(np.where(np.isfinite(xyz), xyz, 0).astype(np.float64), axis=1)
+    # The returns, and how many of the other points there are.
+    stored_range = np.linalg.norm(np.where(np.isfinite(xyz), xyz, 0).astype(np.float64), axis=1)
     drops = DropCounter()
-    row = _drop_no_returns(path, xyz, range_m, drops)
-    if not len(row):
+    rows = _rows_of_returns(path, xyz, stored_range, drops)
+    if not len(rows):
         raise NoPointsError(
             f"{path}: none of its {len(xyz):,} points is a return; give another scan"
         )
-    dropped, notes = _described(drops, len(xyz))
+    dropped, notes = _describe_drops(drops, len(xyz))
     # Their unit.
     divisor, lines = divisor_to_metres(
-        range_m[row],
+        stored_range[rows],
         Reading("scan"),
         f"{path}: range",
         "--depth-scale",
@@ -99,53 +108,61 @@ def scan_returns(
         SCANS,
         of_integers=of_integers,
     )
-    points = np.ascontiguousarray(xyz[row], np.float32) / np.float32(divisor)
+    points = np.ascontiguousarray(xyz[rows], np.float32) / np.float32(divisor)
     return CloudInMetres(points, dropped, [*notes, *lines])
 
 
-def _drop_no_returns(
+def _rows_of_returns(
     path: Path | str,
     xyz: NDArray[np.floating],
-    range_m: NDArray[np.float64],
+    stored_range: NDArray[np.float64],
     drops: DropCounter,
 ) -> NDArray[np.intp]:
-    """The numbers of the points (N, 3) that are returns, with these ranges (N,).
+    """The row numbers (M,) of the points of a scan that are returns of a beam.
 
-    The others are counted by the reason.
+    Args:
+        path: Path or topic of the scan, for messages.
+        xyz: (N, 3), as they are stored.
+        stored_range: (N,) distances from the scanner, in the unit of `xyz`; coordinates that are
+            not finite count as 0.
+        drops: Counter of the other points, by the reason.
 
     Raises:
         InputError: Many coordinates are none of a scan.
     """
-    finite = np.isfinite(xyz)
-    far = np.abs(np.where(finite, xyz, 0)) > _FARTHEST_M
-    odd = ~finite.all(axis=1) | far.any(axis=1)
-    # Beams without return: as no numbers, as zeros, at one place, at the sensor's largest range.
-    row = np.arange(len(xyz))
-    row = row[drops.keep(finite.any(axis=1), "without return, as they are not finite")]
-    seen = ~finite[row].all(axis=1) | (range_m[row] >= _AT_SENSOR_M)
-    row = row[drops.keep(seen, "without return, as they are at the sensor")]
-    apart = ~_at_one_place(xyz[row].astype(np.float64))
-    row = row[drops.keep(apart, "without return, as they are at one and the same place")]
-    near = ~far_end(range_m[row]).is_none
-    row = row[drops.keep(near, "without return, as they are at one range far beyond all others")]
-    beyond = ~near_end(range_m[row]).is_none
-    row = row[
-        drops.keep(beyond, "without return, as they are at one range, nearer than all others")
+    is_finite = np.isfinite(xyz)
+    is_far = np.abs(np.where(is_finite, xyz, 0)) > _FARTHEST_M
+    is_broken = ~is_finite.all(axis=1) | is_far.any(axis=1)
+    # Beams without return: as no numbers, as zeros, at one place, at the sensor's largest range or
+    # at its smallest. A point with some finite coordinates is broken, not without return.
+    rows = np.arange(len(xyz))
+    rows = rows[drops.keep(is_finite.any(axis=1), "without return, as they are not finite")]
+    is_away = ~is_finite[rows].all(axis=1) | (stored_range[rows] >= _AT_SENSOR_M)
+    rows = rows[drops.keep(is_away, "without return, as they are at the sensor")]
+    is_apart = ~_at_one_place(xyz[rows].astype(np.float64))
+    rows = rows[drops.keep(is_apart, "without return, as they are at one and the same place")]
+    is_nearer = ~far_end(stored_range[rows]).is_no_surface
+    rows = rows[
+        drops.keep(is_nearer, "without return, as they are at one range far beyond all others")
+    ]
+    is_farther = ~near_end(stored_range[rows]).is_no_surface
+    rows = rows[
+        drops.keep(is_farther, "without return, as they are at one range, nearer than all others")
     ]
     # Coordinates that are none.
-    if np.count_nonzero(odd[row]) > _BROKEN * len(xyz):
-        first = int(row[odd[row]][0])
+    if np.count_nonzero(is_broken[rows]) > _MOST_BROKEN * len(xyz):
+        first = int(rows[is_broken[rows]][0])
         raise InputError(
-            f"{path}: {np.count_nonzero(odd[row]):,} of {len(xyz):,} points have a coordinate"
-            f" that is none of a scan (number {first + 1:,}:"
+            f"{path}: {np.count_nonzero(is_broken[rows]):,} of {len(xyz):,} points have a"
+            f" coordinate that is none of a scan (number {first + 1:,}:"
             f" {' '.join(f'{number:.3g}' for number in xyz[first])} m); its numbers are probably"
             " not stored as the format says"
         )
-    return row[drops.keep(~odd[row], "with a coordinate that is none")]
+    return rows[drops.keep(~is_broken[rows], "with a coordinate that is none")]
 
 
-def _described(drops: DropCounter, total: int) -> tuple[dict[str, int], list[str]]:
-    """How many points were dropped for each reason that applies, and lines for a person."""
+def _describe_drops(drops: DropCounter, total: int) -> tuple[dict[str, int], list[str]]:
+    """How many of all points were dropped, by each reason that applies; and lines that say it."""
     dropped = {why: count for why, count in drops.dropped.items() if count}
     notes = [
         f"sparse: dropped {count:,} of {total:,} points {why}" for why, count in dropped.items()
@@ -158,64 +175,78 @@ def cloud_points(
 ) -> CloudInMetres:
     """Returns the points of a cloud that no scanner at its origin measured, in metres.
 
-    Its coordinates are of a map or a survey, so they have no range, and no limit.
+    Its coordinates are of a map or a survey. Their distances from the origin are no ranges, so the
+    rules of a scan do not apply, and no coordinate is too large.
+
+    Args:
+        path: Path of the cloud, for messages.
+        xyz: (N, 3), as they are stored.
+        scale: Numbers per metre that the user states. None: the cloud is in metres.
 
     Raises:
-        NoPointsError: No point is a number.
+        NoPointsError: No point has three finite coordinates.
     """
     drops = DropCounter()
-    known = np.isfinite(xyz).all(axis=1)
-    row = np.flatnonzero(drops.keep(known, "with a coordinate that is none"))
-    if not len(row):
+    has_place = np.isfinite(xyz).all(axis=1)
+    rows = np.flatnonzero(drops.keep(has_place, "with a coordinate that is none"))
+    if not len(rows):
         raise NoPointsError(
             f"{path}: none of its {len(xyz):,} points has coordinates; give another cloud"
         )
-    dropped, notes = _described(drops, len(xyz))
+    dropped, notes = _describe_drops(drops, len(xyz))
     if scale is not None and scale != 1:
         notes.append(f"{path}: ÷ {scale:g}, as is stated")
-    points = np.asarray(xyz[row], np.float64) / (scale or 1.0)
+    points = np.asarray(xyz[rows], np.float64) / (scale or 1.0)
     return CloudInMetres(points, dropped, notes)
 
 
 def has_scanner(xyz: NDArray[np.floating]) -> bool:
-    """Returns whether points (N, 3) may be of one scanner at their origin.
+    """Returns whether one scanner at the origin may have measured the points (N, 3).
 
     A scanner sees one surface in each direction. Of cells with two points or more, 11 % at most
     have surfaces at very different ranges in five scans, whole and thinned, and 13 to 49 % where
     the same scans are moved 10 m away. The cells are the smallest of which many have two points:
-    in smaller ones, two points are of different beams.
+    in smaller ones, two points are of different beams. Too few points may always be of a scanner.
     """
-    range_m = np.linalg.norm(np.asarray(xyz, np.float64), axis=1)
-    usable = np.isfinite(range_m) & (range_m > _AT_SENSOR_M)
-    if np.count_nonzero(usable) < _MANY_RETURNS:
+    # Ranges and directions of the points.
+    points = np.asarray(xyz, np.float64)
+    range_m = np.linalg.norm(points, axis=1)
+    is_usable = np.isfinite(range_m) & (range_m > _AT_SENSOR_M)
+    if np.count_nonzero(is_usable) < _FEWEST_RETURNS:
         return True
-    points = np.asarray(xyz, np.float64)[usable]
-    range_m = range_m[usable]
-    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    elevation = np.degrees(np.arcsin(np.clip(points[:, 2] / range_m, -1, 1)))
+    points = points[is_usable]
+    range_m = range_m[is_usable]
+    azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    elevation_deg = np.degrees(np.arcsin(np.clip(points[:, 2] / range_m, -1, 1)))
+    # The smallest cells of which many have two points or more; else the largest ones.
     for cell_deg in _CELLS_DEG:
-        cell = np.floor(azimuth / cell_deg) * 4096 + np.floor(elevation / cell_deg)
-        _, place, counts = np.unique(cell, return_inverse=True, return_counts=True)
-        shared = counts >= 2
-        if shared.mean() >= _MANY_SHARED:
+        column = np.floor(azimuth_deg / cell_deg)
+        row = np.floor(elevation_deg / cell_deg)
+        _, cell_of_point, counts = np.unique(
+            column * _CELL_ROWS + row, return_inverse=True, return_counts=True
+        )
+        is_shared = counts >= 2
+        if is_shared.mean() >= _MANY_SHARED:
             break
-    if np.count_nonzero(shared) < _MANY_RETURNS / 10:
+    if np.count_nonzero(is_shared) < _FEWEST_SHARED:
         return True
     # How many of these cells hold very different ranges.
     log_range = np.log(range_m)
     nearest = np.full(len(counts), np.inf)
     farthest = np.full(len(counts), -np.inf)
-    np.minimum.at(nearest, place, log_range)
-    np.maximum.at(farthest, place, log_range)
-    several = (farthest - nearest)[shared] > _SEVERAL
-    return float(several.mean()) < _MOST_SEVERAL
+    np.minimum.at(nearest, cell_of_point, log_range)
+    np.maximum.at(farthest, cell_of_point, log_range)
+    has_several_surfaces = (farthest - nearest)[is_shared] > _SEVERAL_SURFACES
+    return float(has_several_surfaces.mean()) < _MOST_SEVERAL
 
 
 def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
-    """(N,) true for points at a place that more of them share than beams can."""
-    if len(xyz) < _FEW:
+    """(N,) true for points of a scan (N, 3) at one place that too many of them share."""
+    if len(xyz) < _FEWEST_POINTS:
         return np.zeros(len(xyz), bool)
-    mixed = xyz @ (1.0, np.pi, np.e**2)  # one number for each place
-    keys, counts = np.unique(mixed, return_counts=True)
-    is_shared: bool = counts.max() >= max(_LEAST_SAME, _SAME * len(xyz))
-    return np.asarray((mixed == keys[counts.argmax()]) & is_shared)
+    # Places are compared as one number each: a sum with weights that no coordinates have.
+    place = xyz @ (1.0, np.pi, np.e**2)
+    places, counts = np.unique(place, return_counts=True)
+    if counts.max() < max(_FEWEST_AT_PLACE, _SAME_PLACE * len(xyz)):
+        return np.zeros(len(xyz), bool)
+    return np.asarray(place == places[counts.argmax()])

@@ -31,11 +31,25 @@ def read_sparse_depth(
     size: Size | None,
     seed: int,
 ) -> SparseDepth:
-    """The sparse depth of an image (H, W), in the part of it that the protocol keeps."""
+    """Returns the sparse depth of the part of a frame that is used.
+
+    Args:
+        files: The files of the frame.
+        options: Options of reading, such as scales and the sampling of points.
+        stored: What the files hold.
+        truth: The ground truth, from which points are sampled without a file of sparse depth.
+        size: (H, W) of the whole image. None: it is that of the sparse depth.
+        seed: Random seed of points that are sampled.
+
+    Raises:
+        InputError: Its numbers are no depth of this image, or there is nothing to sample from.
+        NoPointsError: No point is left.
+        UsageError: An option does not apply to its file.
+    """
     if stored.sparse is None:
         return sample_truth(files, options, stored.rgb, truth, seed)
     _check_sparse_options(files, options, stored.sparse)
-    # Its points in the image.
+    # Its points in the whole image.
     if isinstance(stored.sparse, StoredNumbers):
         sparse = _points_of_numbers(files, options, stored, stored.sparse, size)
     elif stored.sparse.kind == "model":
@@ -52,7 +66,7 @@ def read_sparse_depth(
             of_integers=stated.of_integers,
             search=files.is_first,
         )
-    # Those that are sure enough, in the part of the frame.
+    # Those that are sure enough, in the part of the frame that is used.
     if files.sparse_mask is not None:
         sparse = sparse.confident(files.sparse_mask, files.min_confidence)
     return sparse.in_part(files.part)
@@ -65,7 +79,19 @@ def sample_truth(
     truth: GroundTruth | None,
     seed: int,
 ) -> SparseDepth:
-    """Points sampled from the ground truth."""
+    """Returns points sampled from the ground truth, of the part of the frame that is used.
+
+    Args:
+        files: The files of the frame.
+        options: Options with the pattern of the samples, and its seed if that is stated.
+        rgb: (H, W, 3) in 0…1, the whole image, which some patterns need. None: there is none.
+        truth: The ground truth of the whole frame.
+        seed: Random seed, if the pattern states none.
+
+    Raises:
+        InputError: There is no ground truth, or too little of it for the pattern.
+        UsageError: An option of files of sparse depth is given.
+    """
     # What the user states must be of a sampled frame.
     if options.sparse_range:
         raise UsageError(
@@ -79,9 +105,10 @@ def sample_truth(
         raise InputError(f"{files.image} has no sparse depth; add it, or sample the ground truth")
     if truth is None:
         raise InputError(f"{files.image} has no ground truth to sample points from; add it")
-    # The points, of the part of the frame that the protocol keeps.
-    seed = seed if options.sample.seed is None else options.sample.seed
-    gt = files.part.apply(truth.values)
+    # The points, of the part of the frame that is used.
+    if options.sample.seed is not None:
+        seed = options.sample.seed
+    gt = files.part.apply(truth.depth)
     image = None if rgb is None else files.part.apply(rgb)
     try:
         points = sample_points(gt, options.sample, seed, image=image)
@@ -103,6 +130,7 @@ def _check_sparse_options(files: FrameFiles, options: ReadOptions, sparse: Store
     path = sparse.path
     is_model = isinstance(sparse, StoredPoints) and sparse.kind == "model"
     kind = options.sparse_kind or files.kind_of_sparse
+    # Beside a model, the scale may be of the ground truth.
     if options.depth_scale is not None and is_model and files.gt is None:
         raise UsageError(f"{path} is a COLMAP model; --unit-scale is its scale, not --depth-scale")
     if options.unit_scale is not None and not is_model:
@@ -124,9 +152,17 @@ def _check_sparse_options(files: FrameFiles, options: ReadOptions, sparse: Store
 def _points_of_model(
     files: FrameFiles, options: ReadOptions, path: Path, size: Size | None
 ) -> SparseDepth:
-    """The points of a COLMAP model that the image shows."""
+    """The points of a COLMAP model that the image shows.
+
+    Args:
+        files: The files of the frame, with the image.
+        options: Options with the metres per unit of the model.
+        path: Folder of the model.
+        size: (H, W) of the image. None: there is none, which is an error.
+    """
     if size is None or files.image_file is None:
         raise UsageError(f"{path} is a folder, taken for a COLMAP model, which needs the image")
+    # `keep_occluded` is of every kind of sparse depth: the paper's method sets it.
     if replace(options.scan, keep_occluded=False) != ScanOptions():
         raise UsageError(
             f"{path} is a COLMAP model, so the options of a scan do not apply; leave them out"
@@ -143,7 +179,15 @@ def _points_of_numbers(
     sparse: StoredNumbers,
     size: Size | None,
 ) -> SparseDepth:
-    """The points of a depth map or a list."""
+    """The points of a depth map or a list, with depth z in metres.
+
+    Args:
+        files: The files of the frame.
+        options: Options with what the numbers are: scale, kind, distances.
+        stored: What the files hold.
+        sparse: The map or list, as it is stored.
+        size: (H, W) of the image. None: it is that of the map.
+    """
     stated = stored_depth.scale_of_sparse(files, options, stored.truth)
     kind = options.sparse_kind or files.kind_of_sparse
     points = sparse_depth.read_map_points(

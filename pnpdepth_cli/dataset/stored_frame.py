@@ -32,8 +32,11 @@ class StoredFrame:
     rgb: NDArray[np.float32] | None
     """(H, W, 3) in 0…1. None without an image."""
     image: NotedFile | None
+    """The file of the image. None without an image."""
     truth: StoredDepth | None
+    """None without ground truth."""
     sparse: StoredDepth | None
+    """None where points are sampled from the ground truth."""
 
     @property
     def size(self) -> Size | None:
@@ -42,7 +45,12 @@ class StoredFrame:
 
 
 def read_stored_frame(files: FrameFiles, options: ReadOptions) -> StoredFrame:
-    """What the files hold: the image, the ground truth and the sparse depth."""
+    """Returns what the files of a frame hold: the image, the ground truth and the sparse depth.
+
+    Raises:
+        InputError: A file cannot be read.
+        UsageError: An option does not apply to the file.
+    """
     rgb = image = truth = sparse = None
     if files.image is not None:
         notes = list[str]()
@@ -64,5 +72,8 @@ def read_stored_frame(files: FrameFiles, options: ReadOptions) -> StoredFrame:
 
 
 def rgb_of_file(files: FrameFiles, stored: StoredFrame) -> NDArray[np.float32] | None:
-    """The image, unless it is the frame of a video, whose edges no scan is compared with."""
+    """Returns the image (H, W, 3) in 0…1 whose edges a scan is compared with.
+
+    None without an image, and of a frame of a video, which is no file of its own.
+    """
     return None if files.image_file is None else stored.rgb
