@@ -63,7 +63,7 @@ def read_frame(
     size = stored.size if truth is None else truth.size
     sparse = read_sparse_depth(files, options, stored, truth, size, seed)
     points = sparse.points.tensors()
-    size = size or points.size
+    size = size or sparse.whole_size or points.size
     gt = None if truth is None else files.part.apply(truth.depth)
     findings = list[str]()
     if truth is not None and gt is not None:

@@ -66,6 +66,8 @@ class SparseDepth:
     """The camera of the whole image, by which a calibration or a model projects the points."""
     pose: NDArray[np.float64] | None = None
     """(3, 4) from the camera's coordinates to the world's, in `unit`. None: unknown."""
+    whole_size: Size | None = None
+    """(H, W) of the whole image, if the points are of a part of it. None: they are of all of it."""
 
     def confident(self, path: Path, least: float | None) -> SparseDepth:
         """Returns the points whose confidence in a file is `least` or more, above 0 for None.
@@ -106,7 +108,7 @@ class SparseDepth:
             raise NoPointsError(
                 f"{self.record.path}: none of its {len(self.points)} points lies in the image"
             )
-        return replace(self, points=points)
+        return replace(self, points=points, whole_size=self.points.size)
 
 
 class _Visible(NamedTuple):
