@@ -28,18 +28,24 @@ from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.projection import Points, as_depth_image
 
 _OFF_CENTRE_ACROSS = 0.15
-"""Of the image's width: a principal point nearer to the middle gives no warning."""
+"""Fraction of the image's width by which a principal point may be off its middle."""
 _OFF_CENTRE_DOWN = 0.35
 """The same of its height. Rows are cut off above, where a LiDAR sees nothing, with the calibration
 adjusted."""
 _ASPECT_TOLERANCE = 0.02
-"""Relative difference of aspect ratios of images of one view."""
+"""Relative difference of aspect ratios up to which images may be of one view."""
 
 
 def record_of(
     source: ImageSource, reading: Reading | None = None, *, kind: FileKind = "depth"
 ) -> FileRecord:
-    """Returns what a record keeps of a file, and of how it was read."""
+    """Returns what a record keeps of a file, and of how it was read.
+
+    Args:
+        source: The file, or a frame of a video, whose file's digest is kept.
+        reading: How depth was read from it. None: it holds none, or that is not kept.
+        kind: What the file is.
+    """
     digest = file_bytes.fingerprint(file_of(source)).sha256
     record = FileRecord(path=str(source), kind=kind, sha256=digest)
     if reading is None:
@@ -48,17 +54,23 @@ def record_of(
 
 
 def read_image(source: ImageSource) -> NDArray[np.float32]:
-    """Returns (H, W, 3) float32 in 0..1. Raises InputError for a file that is no image."""
+    """Returns an image (H, W, 3) in 0…1. Raises InputError for a file that is no image."""
     if isinstance(source, Path):
         return read_rgb(source).values
     return read_video_frame(source.path, source.index)
 
 
 def image_of_size(source: ImageSource, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Returns (H, W, 3) in 0..1 of the image that has this size: upright, or as COLMAP reads it.
+    """Returns an image (H, W, 3) in 0…1 at the size of its depth: upright, or as it is stored.
+
+    COLMAP reads photos as they are stored, so its depth is of that size.
+
+    Args:
+        source: The image.
+        size: (H, W) of its depth.
 
     Raises:
-        InputError: It has neither.
+        InputError: It has that size neither upright nor as it is stored.
     """
     rgb = read_image(source)
     if rgb.shape[:2] != size and isinstance(source, Path):
@@ -96,7 +108,11 @@ def read_levels(path: Path) -> NDArray[np.floating | np.integer]:
 
 
 def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[np.float32]:
-    """Returns the depth (H, W) with 0 where any of the masks is 0.
+    """Returns the depth (H, W), 0 where unknown, with 0 also where any of the masks is 0.
+
+    Args:
+        depth: (H, W) ground truth.
+        masks: Files of masks, of the same size.
 
     Raises:
         InputError: A mask has another size.
@@ -109,16 +125,22 @@ def apply_masks(depth: NDArray[np.float32], masks: tuple[Path, ...]) -> NDArray[
     return depth
 
 
-def same_aspect_ratio(own: tuple[int, ...], size: tuple[int, ...]) -> bool:
-    """Returns whether images of these sizes (H, W) can show one view."""
-    return abs(own[1] * size[0] / (own[0] * size[1]) - 1) <= _ASPECT_TOLERANCE
+def same_aspect_ratio(first: tuple[int, ...], second: tuple[int, ...]) -> bool:
+    """Returns whether images of two sizes (H, W) can show one view."""
+    return abs(first[1] * second[0] / (first[0] * second[1]) - 1) <= _ASPECT_TOLERANCE
 
 
-def check_same_view(what: str, own: tuple[int, ...], size: Size) -> None:
-    """Raises InputError unless the sizes `own` and `size` (H, W) have one aspect ratio."""
-    if not same_aspect_ratio(own, size):
-        sizes = f"{own[1]}×{own[0]} and the image {size[1]}×{size[0]}"
-        if same_aspect_ratio(own[::-1], size):
+def check_same_view(what: str, map_size: tuple[int, ...], size: Size) -> None:
+    """Raises InputError unless a map and the image have one aspect ratio.
+
+    Args:
+        what: Name of the map, as a sentence begins.
+        map_size: (H, W) of the map.
+        size: (H, W) of the image.
+    """
+    if not same_aspect_ratio(map_size, size):
+        sizes = f"{map_size[1]}×{map_size[0]} and the image {size[1]}×{size[0]}"
+        if same_aspect_ratio(map_size[::-1], size):
             raise InputError(
                 f"{what} is {sizes}: they do not show the same view; one is turned by 90°, turn it"
                 " back"
@@ -126,15 +148,21 @@ def check_same_view(what: str, own: tuple[int, ...], size: Size) -> None:
         raise InputError(f"{what} is {sizes}: they do not show the same view")
 
 
-def moved_note(own: tuple[int, ...], size: Size) -> str:
+def moved_note(map_size: tuple[int, ...], size: Size) -> str:
     """Returns a line for a person on points of a map (H, W) in an image of another size (H, W)."""
-    return f"points of {own[1]}×{own[0]} are moved to the image of {size[1]}×{size[0]}"
+    return f"points of {map_size[1]}×{map_size[0]} are moved to the image of {size[1]}×{size[0]}"
 
 
 def move_depth(path: Path, depth: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
-    """Returns the known depths (H, W) at the pixels of an image of the same view; the nearest wins.
+    """Returns a depth map of the image's size, with each known depth on its pixel; others are 0.
 
-    No depth is interpolated: in an image that is larger, `size` (H, W), most pixels stay unknown.
+    No depth is interpolated: in a larger image most pixels stay unknown. In a smaller one the
+    nearest of the depths on a pixel wins.
+
+    Args:
+        path: The file of the depth, for messages.
+        depth: (h, w), 0 where unknown.
+        size: (H, W) of the image, of the same view.
 
     Raises:
         InputError: The two have different aspect ratios.
@@ -147,9 +175,14 @@ def move_depth(path: Path, depth: NDArray[np.float32], size: Size) -> NDArray[np
 
 
 def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
-    """Returns depth (H, W) of a file without a header, as ETH3D has it; None for other files.
+    """Returns the depth (H, W) in a file without a header, as ETH3D has it; None of other files.
 
-    It holds float32 metres, row by row, of its image's size, and is named as that, *.JPG.
+    Such a file holds float32 metres, row by row, at its image's size. It is named as the image,
+    *.JPG, and is told from a picture by its length.
+
+    Args:
+        path: The file.
+        image: The image of this depth. None: there is none, so there is no such depth.
     """
     if path.suffix.lower() != ".jpg" or not isinstance(image, Path):
         return None
@@ -166,8 +199,9 @@ def depth_of_inverse(file: DepthFile, factor: float, scale: float | None) -> Dep
 
     Args:
         file: Numbers of any shape, 0 where unknown, as `read_depth` returns them.
-        factor: Depth × number, of `inverse_factor`.
-        scale: Numbers per unit that the user states. Integers are divided by it already.
+        factor: Depth × number, as `inverse_factor` returns it: 1 of 1/depth.
+        scale: Numbers per unit that the user states, by which floats are divided first. None: none.
+            Integers are divided by it already.
     """
     values = file.values.astype(np.float64)
     if file.reading.scale is None and scale is not None:
@@ -181,7 +215,13 @@ def depth_of_inverse(file: DepthFile, factor: float, scale: float | None) -> Dep
 def camera_of_file(
     path: Path, number: int | None, size: Size, image: Path | None = None
 ) -> tuple[Camera, list[str]]:
-    """Returns the camera of a calibration file for an image (H, W) of this file, and warnings.
+    """Returns the camera of a calibration file, and warnings if it seems not to be of the image.
+
+    Args:
+        path: The calibration.
+        number: Number of the camera in a file of several. None: the file's usual one.
+        size: (H, W) of the image.
+        image: File of the image, for messages. None: there is none.
 
     Raises:
         InputError: The file is no calibration, or is of another image.
@@ -192,7 +232,13 @@ def camera_of_file(
 
 
 def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None) -> list[str]:
-    """Returns warnings if an image (H, W) seems to be of another camera than a calibration.
+    """Returns warnings if an image seems to be of another camera than a calibration, or none.
+
+    Args:
+        path: The calibration, for messages.
+        camera: Its camera.
+        size: (H, W) of the image.
+        image: File of the image, for messages. None: there is none.
 
     Raises:
         InputError: They cannot belong together.
@@ -219,10 +265,17 @@ def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None
 
 
 def camera_of_exif(image: ImageSource | None, size: Size, lacking: str) -> tuple[Camera, list[str]]:
-    """Returns the camera of EXIF, without distortion, and a line for a person.
+    """Returns a camera of the focal length in an image's EXIF, and a line for a person.
+
+    Its principal point is the image's middle, and it has no distortion.
+
+    Args:
+        image: The image. None: there is none.
+        size: (H, W) of the image.
+        lacking: Words that say what else has no camera, as the error begins.
 
     Raises:
-        UsageError: There is none. It begins with what is `lacking` elsewhere.
+        UsageError: EXIF states no focal length.
     """
     focal = read_focal_length(image, size) if isinstance(image, Path) else None
     if focal is None:

@@ -16,14 +16,14 @@ from pnpdepth_cli.points import SparsePoints
 _BEYOND_POINTS = 1.5
 """Depths up to this multiple of the farthest point fit the codes of a file."""
 _LEAST_CODES = 25.6
-"""Codes of the nearest point, at least: 2 % of rounding."""
+"""Codes of the nearest point, at least: rounding changes it by 2 % at most then."""
 
 
 def integer_scale(points: SparsePoints, stated: float | None = None) -> float:
     """Returns the codes per metre of an integer file of the depth that points were refined to.
 
-    They are those of the sparse depth file. Without them they are 256, or the largest power of ten
-    that fits where the points do not fit 256 or are rounded by it.
+    They are those of the file of the sparse depth. If it states none they are 256, or the largest
+    power of ten that fits where the points do not fit 256 or are rounded by it.
 
     Args:
         points: The points of the frame.
@@ -31,13 +31,14 @@ def integer_scale(points: SparsePoints, stated: float | None = None) -> float:
     """
     if stated is not None:
         return stated
-    nearest = float(points.depth.min())
-    farthest = float(points.depth.max())
-    finest = LARGEST_CODE / (_BEYOND_POINTS * farthest)
+    nearest_m = float(points.depth.min())
+    farthest_m = float(points.depth.max())
+    finest = LARGEST_CODE / (_BEYOND_POINTS * farthest_m)
     if finest < KITTI_SCALE:
         return _power_of_ten(finest)
-    is_exact = nearest * KITTI_SCALE >= _LEAST_CODES
-    return KITTI_SCALE if is_exact else max(_power_of_ten(finest), KITTI_SCALE)
+    if nearest_m * KITTI_SCALE >= _LEAST_CODES:
+        return KITTI_SCALE
+    return max(_power_of_ten(finest), KITTI_SCALE)
 
 
 def within_range(frame: Refined, path: Path, scale: float) -> Refined:
@@ -45,29 +46,35 @@ def within_range(frame: Refined, path: Path, scale: float) -> Refined:
 
     Args:
         frame: The refined frame.
-        path: The depth file.
+        path: The depth file. One of floats holds every depth.
         scale: Codes per metre of an integer file.
     """
     if not format_of_suffix(path).integer:
         return frame
-    nearest = np.float32(1 / scale)
-    farthest = np.float32(LARGEST_CODE / scale)
-    known = np.isfinite(frame.depth) & (frame.depth > 0)
-    clipped = known & ((frame.depth > farthest) | (frame.depth < 0.5 / scale))
-    if not clipped.any():
+    nearest_m = np.float32(1 / scale)
+    farthest_m = np.float32(LARGEST_CODE / scale)
+    is_known = np.isfinite(frame.depth) & (frame.depth > 0)
+    # Less than half a code would be rounded to 0, unknown.
+    is_clipped = is_known & ((frame.depth > farthest_m) | (frame.depth < 0.5 / scale))
+    if not is_clipped.any():
         return frame
     note = (
-        f"warning: {int(clipped.sum()):,} of {clipped.size:,} pixels clipped to"
-        f" {metres(float(nearest))}–{metres(float(farthest))} m, what a 16-bit PNG with {scale:g}"
-        " codes per metre holds; EXR and NPY hold every depth"
+        f"warning: {int(is_clipped.sum()):,} of {is_clipped.size:,} pixels clipped to"
+        f" {metres(float(nearest_m))}–{metres(float(farthest_m))} m, what a 16-bit PNG with"
+        f" {scale:g} codes per metre holds; EXR and NPY hold every depth"
     )
-    after = np.where(clipped, np.clip(frame.depth, nearest, farthest), frame.depth)
-    return replace(frame, depth=after, notes=(*frame.notes, note))
+    depth = np.where(is_clipped, np.clip(frame.depth, nearest_m, farthest_m), frame.depth)
+    return replace(frame, depth=depth, notes=(*frame.notes, note))
 
 
 def write_sigma(path: Path, sigma: DepthMap) -> None:
-    """Writes σ; a PNG has the largest power of ten of codes per metre that holds the largest σ."""
-    scale = _power_of_ten(LARGEST_CODE / max(float(sigma.max()), 1e-9))
+    """Writes σ, the standard deviation of depth, (H, W) metres, 0 where unknown.
+
+    A PNG has the largest power of ten of codes per metre that holds the largest σ. A σ that would
+    be rounded to 0 gets the smallest code.
+    """
+    largest_m = max(float(sigma.max()), 1e-9)  # above 0, where all are unknown
+    scale = _power_of_ten(LARGEST_CODE / largest_m)
     if format_of_suffix(path).integer:
         sigma = np.where(sigma > 0, np.maximum(sigma, np.float32(1 / scale)), np.float32(0))
     write_depth(path, sigma, scale=scale)

@@ -28,6 +28,6 @@ class ReadFrame(Frame):
     depth_scale: float | None = None
     """Integers per metre of the file of the sparse depth. None if it holds metres."""
     sources: Mapping[str, FileRecord] = field(default_factory=dict)
-    """What a record keeps of each file, by its part."""
+    """What a record keeps of each file, by what it is of: "image", "sparse", "gt", …"""
     neighbours: tuple[FileRecord, ...] = ()
-    """Files of neighbouring frames, whose points are among `points`."""
+    """What a record keeps of neighbouring frames; `points` has the points of those that join."""

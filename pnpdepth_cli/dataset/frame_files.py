@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+# Suffixes of files, in lower case.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".exr")
 SCAN_ONLY_SUFFIXES = (".bin", ".pcd", ".ply")
 VIDEO_SUFFIXES = (".mp4", ".mov")
 
 _LONGEST_PART = 255 - len("_improvement.png")
 """Bytes of a part of a name, so that the longest file name of a result has 255."""
-
 _DRIVE = re.compile(r"[A-Za-z]:")
+"""Beginning of a path on Windows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,15 +47,15 @@ ImageSource = Path | VideoFrame
 
 
 def source_of(text: str) -> Path | VideoFrame:
-    """Returns the image that a record names: a file, or a frame of a video."""
-    found = re.fullmatch(r"(.*)\[(\d{1,9})\]", text, re.DOTALL)
-    if found is None or not found[1].lower().endswith(VIDEO_SUFFIXES):
+    """Returns the image that a record names: a file, or a frame of a video as VIDEO[NUMBER]."""
+    match = re.fullmatch(r"(.*)\[(\d{1,9})\]", text, re.DOTALL)
+    if match is None or not match[1].lower().endswith(VIDEO_SUFFIXES):
         return Path(text)
-    return VideoFrame(path=Path(found[1]), index=int(found[2]))
+    return VideoFrame(path=Path(match[1]), index=int(match[2]))
 
 
 def file_of(source: ImageSource) -> Path:
-    """Returns the file that a source lies in."""
+    """Returns the file of an image: itself, or the video that it is a frame of."""
     return source if isinstance(source, Path) else source.path
 
 
@@ -63,7 +64,7 @@ Pose = tuple[tuple[float, ...], ...]
 
 
 def as_pose(matrix: NDArray[np.float64]) -> Pose:
-    """Returns a (3, 4) matrix as the pose of a frame."""
+    """Returns a (3, 4) matrix as tuples of numbers, which can be compared and hashed."""
     return tuple(map(tuple, matrix.tolist()))
 
 
@@ -72,9 +73,12 @@ class Neighbour:
     """Another frame of the same sequence, whose points are moved into this one."""
 
     files: FrameFiles
-    motion: Pose | None  # from the other camera's coordinates to this one's. None: to be estimated.
-    poses: str  # where the motion is from, for a person
-    apart: int  # frames between the two, at least 1
+    motion: Pose | None
+    """From the other camera's coordinates to this one's. None: to be estimated from the images."""
+    poses: str
+    """Where the motion is from, for a person."""
+    apart: int
+    """How many frames later or earlier the other one is, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,9 +155,13 @@ class ScanOptions:
     def over(self, files: FrameFiles) -> ScanOptions:
         """Returns these options, with the calibration and camera that the data set names.
 
-        The user's own go before.
+        What the user states goes before.
+
+        Args:
+            files: Files of the frame, which name them.
         """
-        if (calib := self.calib or files.calib) is None:
+        calib = self.calib or files.calib
+        if calib is None:
             return self
         camera = files.camera if self.camera is None else self.camera
         return replace(self, calib=calib, camera=camera)
@@ -200,11 +208,15 @@ class ReadOptions:
 
 
 def inverse_factor(option: str, kind: str | None) -> float | None:
-    """Returns depth × value of what a file of this kind holds; None for depth itself.
+    """Returns depth × number, a constant, of a file that holds 1/depth or disparity.
 
     Args:
-        option: Name of what states the kind, for a message.
-        kind: "depth" or None; "inverse"; or "disparity:B", with B in metres × pixels.
+        option: Option, or column of a list, that states the kind; for messages.
+        kind: "depth" or None; "inverse", 1/depth in 1/m; or "disparity:B", disparity in pixels, with
+            B in metres × pixels.
+
+    Returns:
+        1 of "inverse", and B of "disparity:B". None for depth itself.
 
     Raises:
         UsageError: There is no such kind.
@@ -216,7 +228,7 @@ def inverse_factor(option: str, kind: str | None) -> float | None:
     name, _, number = str(kind).partition(":")
     try:
         factor = float(number)
-    except ValueError:
+    except ValueError:  # no number, which the next line refuses
         factor = math.nan
     if name != "disparity" or not 0 < factor < math.inf:
         raise UsageError(
@@ -227,30 +239,36 @@ def inverse_factor(option: str, kind: str | None) -> float | None:
 
 
 Unmatched = tuple[Path, str]
-"""A file or folder that belongs to no frame, and why: the end of a sentence that the path begins.
+"""A file or folder that belongs to no frame, and the reason, as a sentence that begins with it ends.
 """
 
 
 def check_path(path: Path) -> None:
-    """Raises InputError for a path that no file can have: an index file may hold any text."""
+    """Raises InputError for a path that no file can have, as a list may hold any text."""
     if not _can_be_named(str(path)):
         raise InputError(f"{str(path)!r}: no file can have this name; correct the list")
 
 
 def _can_be_named(text: str) -> bool:
-    """Whether a file can have the name."""
+    """Whether a file can have the name: no zero byte, and no character that cannot be encoded."""
     try:
         return b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
+    except UnicodeEncodeError:  # such as of half a surrogate pair
         return False
 
 
 def find_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[dict[str, Path], list[Unmatched]]:
-    """Returns the files with one of these suffixes, by relative path without suffix, and problems.
+    """Returns the files with one of these suffixes, in a folder and below, and what is left out.
 
     Links are followed, except into a folder that they lie in. Hidden files and folders are skipped.
-    Files are in natural order of their paths. Problems are folders that cannot be read, and files
-    that differ in suffix only, which are left out. The folder need not exist.
+
+    Args:
+        folder: The folder, which need not exist.
+        suffixes: Suffixes in lower case, with their dots.
+
+    Returns:
+        The files by their path below the folder, without suffix, in natural order; and folders that
+        cannot be read, and files that differ in suffix only.
     """
     problems: list[Unmatched] = []
     walked = _walk(folder, frozenset(), problems) if folder.is_dir() else ()
@@ -269,19 +287,34 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 
 def one_of_each(named: Iterable[tuple[str, Path]]) -> tuple[dict[str, Path], list[Unmatched]]:
-    """Returns the files whose name no other file has, by name, and the others."""
-    files: dict[str, list[Path]] = {}
+    """Returns the files whose name no other file has, by name; and files that share a name.
+
+    Args:
+        named: Names of frames, each with a file.
+
+    Returns:
+        Of files that share a name, all but the first are listed, and none is among the files.
+    """
+    paths_by_name: dict[str, list[Path]] = {}
     for name, path in named:
-        files.setdefault(name, []).append(path)
+        paths_by_name.setdefault(name, []).append(path)
     ambiguous = [
         (path, f"and {paths[0].name} are one frame; keep one")
-        for paths in files.values()
+        for paths in paths_by_name.values()
         for path in paths[1:]
     ]
-    return {name: paths[0] for name, paths in files.items() if len(paths) == 1}, ambiguous
+    files = {name: paths[0] for name, paths in paths_by_name.items() if len(paths) == 1}
+    return files, ambiguous
 
 
 def _walk(folder: Path, above: frozenset[str], problems: list[Unmatched]) -> Iterator[Path]:
+    """Yields the files in a folder and below, in no order, without hidden ones.
+
+    Args:
+        folder: The folder.
+        above: Real paths of the folders that it was reached through.
+        problems: List to which folders are added that cannot be read.
+    """
     real = os.path.realpath(folder)
     if real in above:
         return  # a link to a folder that it is in
@@ -318,6 +351,7 @@ def name_problem(name: str) -> str | None:
 
 
 _FRAME_NUMBER = re.compile(r"(?:^|[_\-/])\d+(?:_image_\d+)?$")
+"""End of a frame's name; KITTI's depth benchmark has the camera's number behind it."""
 
 
 def groups_of(names: Sequence[str], stated: Sequence[str | None]) -> list[str]:
@@ -325,9 +359,13 @@ def groups_of(names: Sequence[str], stated: Sequence[str | None]) -> list[str]:
 
     That is its name before the frame number, or else its folder: of `drive_02_sync_008_image_02`
     it is `drive_02_sync`, of `office/0012` `office`. Unless all names end in a number, only folders
-    make groups.
+    make groups; a frame in none has an empty group.
+
+    Args:
+        names: Names of the frames.
+        stated: Sequence of each that the data set states. None: it states none.
     """
     groups = [_FRAME_NUMBER.sub("", name) for name in names]
     if any(group == name for group, name in zip(groups, names, strict=True)):
         groups = [name.rpartition("/")[0] for name in names]
-    return [of_set or group for of_set, group in zip(stated, groups, strict=True)]
+    return [of_data_set or group for of_data_set, group in zip(stated, groups, strict=True)]

@@ -61,8 +61,9 @@ class CameraRecord:
         """Returns the camera and its pose. Raises ValueError if no camera has these numbers."""
         intrinsics = np.array(self.intrinsics, np.float64).reshape(3, 3)
         pose = None if self.pose is None else np.array(self.pose, np.float64).reshape(3, 4)
-        focal_px = intrinsics[0, 0], intrinsics[1, 1]
-        if min(focal_px) <= 0 or intrinsics[2].tolist() != [0, 0, 1] or self.lens not in LENSES:
+        has_focal_lengths = min(intrinsics[0, 0], intrinsics[1, 1]) > 0
+        has_last_row = intrinsics[2].tolist() == [0, 0, 1]
+        if not has_focal_lengths or not has_last_row or self.lens not in LENSES:
             raise ValueError("no camera has these intrinsics")
         camera = Camera(
             intrinsics=intrinsics,
@@ -248,9 +249,10 @@ class FrameRecord:
         """
         for basis in (GT, HELD_OUT, VALIDATION):
             stages = self.errors.get(basis, {})
-            own, linear = (stages.get(stage, {}).get("mae") for stage in (AFTER, LINEAR))
-            if own is not None and linear is not None:
-                return own > linear
+            result_mae = stages.get(AFTER, {}).get("mae")
+            linear_mae = stages.get(LINEAR, {}).get("mae")
+            if result_mae is not None and linear_mae is not None:
+                return result_mae > linear_mae
         return None
 
     def to_json(self) -> dict[str, Any]:
@@ -270,7 +272,7 @@ class FrameRecord:
             source: The file, for messages.
 
         Raises:
-            InputError: It is none.
+            InputError: The entry is no record of this version of the program.
         """
         if isinstance(entry, dict) and entry.get("schema") != SCHEMA:
             raise InputError(

@@ -33,31 +33,38 @@ from pnpdepth_cli.points import Size, SparsePoints
 Map = NDArray[np.float32]
 
 _RAW = "save the raw array as NPY (numpy.save), or as a 16-bit PNG"
+"""The way out of messages on files that hold pictures instead of numbers."""
 _LIST_SUFFIXES = (".csv", ".txt")
+
+# Arrays of an archive.
 _DEPTH_WORDS = re.compile("depth|disp|pred|inverse|inv_")
+"""In names of arrays that are depth."""
 _OTHER_WORDS = re.compile(
     "conf|mask(?!ed)|valid(?!_depth)|sigma|uncert|std|_var|variance|label|seg|sky|normal(?!i)|flow"
     "|intrin|extrin|pose|fov|focal"
 )
-"""Words in names of arrays that are depth, and that are maps beside it."""
-_MATRIX = 4
+"""In names of arrays that are other maps or matrices beside depth."""
+_LARGEST_MATRIX = 4
 """Rows or columns of a camera's matrix or pose, at most."""
+
+# What numbers are none of depth.
 _GREY = 2
-"""Levels of 255 between the channels of a grey picture; compression makes some."""
+"""Levels of 255 by which the channels of a grey picture may differ; compression makes some."""
 _STEPS = 256
-"""Numbers of 8 bits."""
-_FEW = 20
+"""Different numbers that 8 bits have."""
+_FEW_NUMBERS = 20
 """Different numbers; fewer are of labels."""
-_MANY = 1000
+_MANY_PIXELS = 1000
 """Pixels, of which few different numbers tell something."""
 _FILLED = 0.005
-"""Of the pixels; so many zeros in the middle of a range stand for unknown."""
-_MORE = 3
-"""Times as many as any other number."""
+"""Fraction of the pixels; so many zeros in the middle of a range stand for unknown."""
+_MORE_ZEROS = 3
+"""Times as many as any other number, for the same."""
+
 _SAMPLED = 2000
-"""Pixels, whose neighbours are compared with the image's edges."""
-_KNOWN = 0.5 - 1e-6
-"""Weight of known pixels, from which an interpolated one is known."""
+"""Pixels that stand for all of a map: their depths are compared with the image's edges."""
+_LEAST_WEIGHT = 0.5 - 1e-6
+"""Weight of known pixels, from which an interpolated one is known; half of it, but for rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +122,15 @@ def read_predicted_depth(
 
 
 def _load(path: Path, part: str) -> DepthFile:
-    """The numbers in the file, or in this part of it, as they are stored."""
+    """The numbers in a file, or in one part of it, as they are stored.
+
+    Args:
+        path: The file.
+        part: Name of an array of an NPZ, or of a channel of an EXR. Empty: the one that is depth.
+
+    Raises:
+        InputError: The file holds no such part, or no depth.
+    """
     data = read_bytes(path)
     kind = formats.kind_of(data)
     if kind == "NPZ":
@@ -135,7 +150,7 @@ def _load(path: Path, part: str) -> DepthFile:
         raise InputError(f"{path} is a video; save the depth of the image's frame, as NPY")
     if kind is None and path.suffix.lower() in _LIST_SUFFIXES:
         raise InputError(f"{path} is a text, as of a list of points; {_RAW}")
-    if kind in ("JPEG", "WEBP") or data[4:8] == b"ftyp":
+    if kind in ("JPEG", "WEBP") or data[4:8] == b"ftyp":  # HEIC, which `kind_of` does not know
         return _load_picture(path, kind or "HEIC")
     if kind in ("PNG", "TIFF") and not _holds_depth(path, data, kind):
         return _load_picture(path, kind)
@@ -143,34 +158,50 @@ def _load(path: Path, part: str) -> DepthFile:
 
 
 def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
-    """The array of an archive that is depth: the only map, or the only one named so."""
+    """The name of the array of an archive that is depth: the only map, or the only one named so.
+
+    Args:
+        path: The archive, for messages.
+        arrays: Shape and type of its arrays, by name.
+
+    Raises:
+        InputError: No array is depth, or several are.
+    """
     listed = one_line(", ".join(f"{name} {array.shape}" for name, array in arrays.items()))
+    # Arrays whose name is of nothing else; of these, those that are named depth, and those that are
+    # maps.
+    eligible = [name for name in arrays if not _OTHER_WORDS.search(name.lower())]
+    named_depth = [name for name in eligible if _DEPTH_WORDS.search(name.lower())]
     maps = list[str]()
-    for name, (shape, dtype) in arrays.items():
+    for name in eligible:
+        shape, dtype = arrays[name]
         sides = [side for side in shape if side != 1]
-        is_map = len(sides) == 2 and min(sides) > _MATRIX and dtype.kind in "fiu"
-        if is_map and not _OTHER_WORDS.search(name.lower()):
+        if len(sides) == 2 and min(sides) > _LARGEST_MATRIX and dtype.kind in "fiu":
             maps.append(name)
-    by_name = [name for name in maps if _DEPTH_WORDS.search(name.lower())]
-    # A stack of maps, which is refused with its shape, is named so, too.
-    stacks = [
-        name
-        for name in arrays
-        if _DEPTH_WORDS.search(name.lower()) and not _OTHER_WORDS.search(name.lower())
-    ]
-    # The only array is refused for what it is, unless for its name.
-    alone = [name for name in arrays if len(arrays) == 1 and not _OTHER_WORDS.search(name.lower())]
-    found = by_name or maps or stacks or alone
-    if len(found) == 1:
-        return found[0]
-    if not found:
+    maps_named_depth = [name for name in maps if name in named_depth]
+    # Without a map, an array that is named depth, or the only one, is chosen, too: it is a stack of
+    # maps, say, which is refused later with its shape.
+    only_one = eligible if len(arrays) == 1 else []
+    candidates = maps_named_depth or maps or named_depth or only_one
+    if len(candidates) == 1:
+        return candidates[0]
+    if not candidates:
         raise InputError(f"{path} has no depth map among its arrays ({listed}); {_RAW}")
-    names = " and ".join(found)
-    raise InputError(f"{path} has several maps, {names}; name one as {path.name}:{found[0]}")
+    names = " and ".join(candidates)
+    raise InputError(f"{path} has several maps, {names}; name one as {path.name}:{candidates[0]}")
 
 
 def _load_exr(path: Path, data: bytes, part: str) -> DepthFile:
-    """The channel of this name, or the one that holds depth."""
+    """The channel (H, W) of an EXR that has a name, or that holds depth if the name is empty.
+
+    Args:
+        path: The file, for messages.
+        data: Its content.
+        part: Name of the channel. Empty: the one that holds depth.
+
+    Raises:
+        InputError: There is no such channel, or several may hold depth.
+    """
     channels = images.read_exr_channels(path, data)
     listed = one_line(", ".join(channels))
     name = part or images.depth_channel(channels)
@@ -185,7 +216,7 @@ def _load_exr(path: Path, data: bytes, part: str) -> DepthFile:
 
 
 def _is_video(data: bytes) -> bool:
-    """Whether the content of a file is that of a video."""
+    """Whether the content of a file is that of a video: MP4, AVI, Matroska or WebM."""
     is_mp4 = data[4:8] == b"ftyp" and data[8:11] in VIDEO_BRANDS
     is_avi = data[:4] == b"RIFF" and data[8:11] == b"AVI"
     return is_mp4 or is_avi or data.startswith(b"\x1aE\xdf\xa3")  # Matroska and WebM
@@ -199,12 +230,20 @@ def _holds_depth(path: Path, data: bytes, kind: str) -> bool:
 
 
 def _load_picture(path: Path, kind: str) -> DepthFile:
-    """The levels (H, W) of a grey picture, of 8 or 16 bits; a picture in colour is refused."""
+    """The levels (H, W) of a grey picture, of 8 or 16 bits.
+
+    Args:
+        path: The file.
+        kind: Format of the file, such as "JPEG".
+
+    Raises:
+        InputError: The picture is in colour.
+    """
     picture = read_rgb(path)
     levels = np.rint(picture.values * picture.white)
     bits = 8 if picture.white == _STEPS - 1 else 16
-    spread = np.ptp(levels, axis=2)
-    if spread.max() > _GREY * picture.white / (_STEPS - 1):
+    difference = np.ptp(levels, axis=2)  # (H, W) of the largest and the smallest channel
+    if difference.max() > _GREY * picture.white / (_STEPS - 1):
         raise InputError(
             f"{path} is a {kind} in colour, a photo or depth drawn with a colour map, which is no"
             f" number; {_RAW}"
@@ -220,7 +259,17 @@ def _load_picture(path: Path, kind: str) -> DepthFile:
 
 
 def _one_channel(path: Path, stored: DepthFile, size: Size | None) -> NDArray[np.generic]:
-    """The stored numbers as (H, W). InputError if they are no one map."""
+    """The stored numbers as (H, W), without axes of length 1 and equal channels.
+
+    Args:
+        path: The file, for messages.
+        stored: Its numbers, as they are stored.
+        size: (H, W) of the image, by which a map of three columns is no list of points. None:
+            there is no image.
+
+    Raises:
+        InputError: They are no numbers, or not one map.
+    """
     shape = stored.values.shape
     values = without_single_axes(stored.values)
     if values.dtype.kind not in "fiu":
@@ -243,7 +292,7 @@ def _one_channel(path: Path, stored: DepthFile, size: Size | None) -> NDArray[np
 
 
 def _equal_channels(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The first channel of (H, W, C), of which the others are copies."""
+    """The first channel (H, W) of (H, W, C). InputError unless the others are copies of it."""
     first = values[..., 0]
     others = range(1, values.shape[-1])
     if all(np.array_equal(first, values[..., channel]) for channel in others):
@@ -263,27 +312,28 @@ class _Unknown:
         self.notes = list[str]()
 
     @property
-    def others(self) -> Map:
-        """The numbers (N,) of all other pixels."""
+    def known(self) -> Map:
+        """The numbers (N,) of the pixels that are not unknown."""
         return self._values[~self.mask]
 
-    def add(self, found: NDArray[np.bool_], what: str) -> None:
-        """Adds pixels (H, W), and a line on those that are new."""
-        found = found & ~self.mask
-        count = int(np.count_nonzero(found))
+    def add(self, pixels: NDArray[np.bool_], what: str) -> None:
+        """Adds pixels, (H, W) true, and a line that says what those that are new hold."""
+        new = pixels & ~self.mask
+        count = int(np.count_nonzero(new))
         if count:
             verb = "is" if count == 1 else "are"
-            self.notes.append(f"{count:,} of {found.size:,} pixels {verb} {what}; taken as unknown")
-            self.mask |= found
+            self.notes.append(f"{count:,} of {new.size:,} pixels {verb} {what}; taken as unknown")
+            self.mask |= new
 
 
 def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, list[str]]:
-    """The numbers (H, W) as float32, NaN where unknown; and lines that count those.
+    """The numbers (H, W) as float32, NaN where unknown; and lines that count the unknown pixels.
 
     Args:
         codes: (H, W) numbers as stored.
-        scale: Codes per unit that the file states; None for none.
+        scale: Codes per unit that the file states. None: it states none.
     """
+    # A float64 beyond float32 becomes infinite, and with that unknown.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         values = np.array(codes if scale is None else codes / scale, dtype=np.float32)
     unknown = _Unknown(values)
@@ -299,7 +349,7 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
 
 
 def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
-    """0 and 255, beyond which a picture of depth is clipped, and a warning that it has steps."""
+    """Adds 0 and 255, at which a picture of depth is clipped, and a warning that it has steps."""
     lowest = codes == 0
     highest = codes == _STEPS - 1
     levels = len(np.unique(codes[np.isfinite(codes)]))
@@ -313,7 +363,10 @@ def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
 
 
 def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
-    """The largest code of an integer type, and the smallest below 0: what no sensor measures."""
+    """Adds the largest code of an integer type, and the smallest below 0: no sensor measures them.
+
+    Floats have none.
+    """
     if codes.dtype.kind not in "iu":
         return
     limits = np.iinfo(codes.dtype)
@@ -323,41 +376,43 @@ def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
 
 
 def _add_marks(unknown: _Unknown, values: Map) -> None:
-    """The only number below 0; and 0, unless it is one of many numbers of both signs."""
-    others = unknown.others
-    below = np.unique(others[others < 0])
-    if len(below) == 1 and others.max(initial=0) > 0:
-        unknown.add(values == below[0], f"{below[0]:.6g}, the only number below 0")
-    others = unknown.others
-    zeros = int(np.count_nonzero(others == 0))
-    if zeros and others.min() < 0 < others.max():
-        counts = np.unique(others[others != 0], return_counts=True)[1]
-        if zeros < max(_FILLED * values.size, _MORE * int(counts.max())):
+    """Adds the only number below 0; and 0, unless it is one of many numbers of both signs."""
+    known = unknown.known
+    below_zero = np.unique(known[known < 0])
+    if len(below_zero) == 1 and known.max(initial=0) > 0:
+        unknown.add(values == below_zero[0], f"{below_zero[0]:.6g}, the only number below 0")
+    # Between numbers of both signs, as of logarithms, 0 is a number as any other, unless it is far
+    # more frequent.
+    known = unknown.known
+    zeros = int(np.count_nonzero(known == 0))
+    if zeros and known.min() < 0 < known.max():
+        _, counts = np.unique(known[known != 0], return_counts=True)
+        if zeros < max(_FILLED * values.size, _MORE_ZEROS * int(counts.max())):
             return
     unknown.add(values == 0, "0")
 
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
-    """Extreme values that many pixels have: the sky, a far plane, a clip, also of 1/disparity."""
+    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity."""
     # About one value, far from all others and mixed with them at its edges.
-    known = unknown.others.astype(np.float64)
+    known = unknown.known.astype(np.float64)
     if known.min(initial=np.inf) > 0:
-        place = ~unknown.mask
-        for end, reach in (
+        is_known = ~unknown.mask
+        for end, bound in (
             (far_end(known), "98 % of the others are at most"),
             (near_end(known), "98 % of the others are at least"),
         ):
-            found = np.zeros(values.shape, bool)
-            found[place] = end.is_none
-            unknown.add(found, f"about {end.value:.6g}, where {reach} {end.rest:.4g}")
+            pixels = np.zeros(values.shape, bool)
+            pixels[is_known] = end.is_no_surface
+            unknown.add(pixels, f"about {end.value:.6g}, where {bound} {end.reach:.4g}")
     # Exactly one value.
-    for value, _ in repeated_ends(unknown.others):
-        name = "smallest" if value <= float(unknown.others.min()) else "largest"
+    for value, _ in repeated_ends(unknown.known):
+        name = "smallest" if value <= float(unknown.known.min()) else "largest"
         unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")
 
 
 def _is_8_bit(codes: NDArray[Any]) -> bool:
-    """Whether the numbers are 0…255 as of 8 bits, whatever type they have."""
+    """Whether the numbers are whole and go from 0 or more to 255, as of 8 bits, of any type."""
     if codes.dtype == np.uint8:
         return True
     finite = codes[np.isfinite(codes)] if codes.dtype.kind == "f" else codes
@@ -367,7 +422,16 @@ def _is_8_bit(codes: NDArray[Any]) -> bool:
 
 
 def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
-    """Lines on a map of few different numbers. InputError for one of none, or of one number."""
+    """Lines on a map of few different numbers, which may be none of depth.
+
+    Args:
+        path: The file, for messages.
+        values: (H, W), NaN where unknown.
+        is_float: Whether the file holds floats.
+
+    Raises:
+        InputError: No number is known, or all are one.
+    """
     known = values[np.isfinite(values)]
     if not known.size:
         raise InputError(
@@ -381,12 +445,12 @@ def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
         )
     # Most maps show by a sample that they have more.
     sample = known[:: max(1, known.size // _SAMPLED)]
-    if known.size < _MANY or len(np.unique(sample)) > _STEPS:
+    if known.size < _MANY_PIXELS or len(np.unique(sample)) > _STEPS:
         return []
     different = len(np.unique(known))
     if different > _STEPS:
         return []
-    if different < _FEW:
+    if different < _FEW_NUMBERS:
         return [f"warning: {different} different numbers only, as of labels or a drawing"]
     if not is_float:  # steps of a sensor, or those of 8 bits, which are said already
         return []
@@ -394,11 +458,16 @@ def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
 
 
 def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:
-    """A warning if the image's edges meet the jumps of a map better mirrored or turned.
+    """A warning if the image's edges meet the jumps of a map better mirrored or turned, else none.
 
-    Of 34 stored predictions none gets it as it is, and 85 get the right one of 102 that are
-    mirrored, upside down, or turned by 180°.
+    Of 34 stored predictions none gets a warning as it is. Of 102 that are mirrored, upside down, or
+    turned by 180°, 85 get the right one.
+
+    Args:
+        values: (H, W) of any meaning, NaN where unknown.
+        image: (H, W, 3) in 0…1.
     """
+    # A sample of the known pixels stands for the map; the seed is fixed, so that it is always one.
     rows, columns = np.nonzero(np.isfinite(values))
     chosen = np.random.default_rng(0).choice(
         len(rows), min(_SAMPLED, len(rows)), replace=False, shuffle=False
@@ -406,6 +475,7 @@ def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:
     rows, columns = rows[chosen], columns[chosen]
     numbers = values[rows, columns].astype(np.float64)
     # Changes of the logarithm are compared, which are those of depth or of disparity alike.
+    # Numbers that are not all above 0 are taken for logarithms, whose middle 96 % then span 2.
     if numbers.min() <= 0:
         low, high = np.quantile(numbers, (0.02, 0.98))
         numbers = np.exp(2 * (numbers - low) / max(float(high - low), 1e-9))
@@ -414,8 +484,8 @@ def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:
         depth=numbers.astype(np.float32),
         size=(values.shape[0], values.shape[1]),
     )
-    found = evidence(np.ascontiguousarray(image), points.tensors())
-    turned = None if found is None else better_orientation([found])
+    edges = evidence(np.ascontiguousarray(image), points.tensors())
+    turned = None if edges is None else better_orientation([edges])
     if turned is None:
         return []
     return [
@@ -424,14 +494,23 @@ def _orientation_warning(values: Map, image: NDArray[np.float32]) -> list[str]:
     ]
 
 
-def _check_view(path: Path, own: tuple[int, ...], size: Size) -> str:
-    """A line on how a map (H, W) is resized. InputError if it cannot be of the image's view."""
-    sizes = f"{own[1]}×{own[0]} and the image {size[1]}×{size[0]}"
-    # A pixel's rounding of one side or the other.
-    columns = abs(own[1] - own[0] * size[1] / size[0])
-    rows = abs(own[0] - own[1] * size[0] / size[1])
-    if min(columns, rows) > 1 and not same_aspect_ratio(own, size):
-        if same_aspect_ratio(own[::-1], size):
+def _check_view(path: Path, map_size: tuple[int, ...], size: Size) -> str:
+    """A line on how a map is resized.
+
+    Args:
+        path: The file of the map, for messages.
+        map_size: (H, W) of the map.
+        size: (H, W) of the image.
+
+    Raises:
+        InputError: Their aspect ratios differ, so that the map is not of the image's view.
+    """
+    sizes = f"{map_size[1]}×{map_size[0]} and the image {size[1]}×{size[0]}"
+    # By how many pixels one side or the other is off; one is rounding.
+    columns = abs(map_size[1] - map_size[0] * size[1] / size[0])
+    rows = abs(map_size[0] - map_size[1] * size[0] / size[1])
+    if min(columns, rows) > 1 and not same_aspect_ratio(map_size, size):
+        if same_aspect_ratio(map_size[::-1], size):
             raise InputError(
                 f"{path} is {sizes}, so one is turned by 90°; turn it back with numpy.rot90, or"
                 " give the image as it was given to the network"
@@ -442,7 +521,7 @@ def _check_view(path: Path, own: tuple[int, ...], size: Size) -> str:
         )
     note = f"{sizes}; it is resized by linear interpolation"
     if min(columns, rows) > 1:
-        stretch = abs(own[1] * size[0] / (own[0] * size[1]) - 1)
+        stretch = abs(map_size[1] * size[0] / (map_size[0] * size[1]) - 1)
         note += f" and stretched by {stretch:.1%}"
     return note
 
@@ -453,11 +532,11 @@ def resize_known(values: Map, size: Size) -> Map:
     A pixel is NaN, unknown, where unknown ones have most of its weight. Elsewhere they have none.
     """
     height, width = size
-    known = np.isfinite(values)
-    total = cv2.resize(np.where(known, values, np.float32(0)), (width, height))
-    if known.all():
-        return np.asarray(total, np.float32)
-    weight = cv2.resize(known.astype(np.float32), (width, height))
+    is_known = np.isfinite(values)
+    weighted_sum = cv2.resize(np.where(is_known, values, np.float32(0)), (width, height))
+    if is_known.all():
+        return np.asarray(weighted_sum, np.float32)
+    weight = cv2.resize(is_known.astype(np.float32), (width, height))
     resized = np.full(size, np.nan, np.float32)
-    np.divide(total, weight, out=resized, where=weight >= _KNOWN)
+    np.divide(weighted_sum, weight, out=resized, where=weight >= _LEAST_WEIGHT)
     return resized

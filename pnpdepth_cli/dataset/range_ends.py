@@ -19,180 +19,216 @@ Mask = NDArray[np.bool_]
 
 _FEW = 10
 """Numbers; fewer decide nothing."""
+_FEW_VALUES = 20
+"""Different numbers; fewer are of a drawing."""
+_FAR = 1000.0
+"""Times the median depth; no point of an image is farther."""
+
+# How many have an extreme value that is no surface.
 _SAME = 0.005
-"""Of the numbers, that no surface shares."""
+"""Fraction of the numbers that no surface shares."""
 _LEAST_SAME = 3
-"""How many these are at least."""
+"""Numbers that these are at least."""
 _EQUAL = 1e-5
 """Relative difference of numbers that were computed from one."""
 _NOISY = 0.02
 """Relative difference of numbers that noise was added to."""
+
+# How far it is from all others.
 _BEYOND = 10.0
-"""Times the 98th percentile of the rest, which edges of the sky may exceed."""
+"""Times the 98th percentile of the others, which edges of the sky may exceed."""
 _BEYOND_MOST = 8.0
-"""Times the 90th percentile of the rest, where all are exactly the same."""
+"""Times the 90th percentile of the others, where all at the end are exactly the same."""
 _ABOVE = 1.5
-"""Times the largest of the rest."""
+"""Times the largest of the others."""
 _FAR_M = 40.0
 """Beyond it, surfaces are rare."""
 _NEAR_M = 0.12
 """Nearer, surfaces are rare."""
+
+# An extreme value that is not far from all others.
 _SPIKE = 3.0
-"""Times as many as have any other value."""
+"""Times as many numbers as have any other value."""
 _LEAST_SPIKE = 10
-"""How many these are at least."""
+"""Numbers that these are at least."""
 _NEXT = 10
-"""Distinct values beside an extreme one, of which one may have as many."""
-_VALUES = 20
-"""Distinct values; fewer are of a drawing."""
-_FAR = 1000.0
-"""Times the median depth; no point of an image is farther."""
+"""Different values beside an extreme one, of which one may be as frequent."""
 
 
 class _End(NamedTuple):
-    """What lies at the end of a range; numbers are depths, or 1/depths."""
+    """What lies at one end of a range of numbers, which are depths or 1/depths."""
 
-    is_none: Mask  # (N,)
-    value: float  # the extreme one
-    rest: float  # 98th percentile of the others
+    is_no_surface: Mask  # (N,) which of the numbers are of no surface; none, if the end is one
+    value: float  # the extreme number; 0 if the end is a surface
+    reach: float  # number that 98 % (or 90 %) of the others do not exceed; 0 if it is a surface
 
 
 def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
-    """Returns which of the known depths (N,) are no depth, and lines for a person."""
+    """Returns which of the known depths (N,) are no depth, and lines for a person.
+
+    Args:
+        depth: The known depths, above 0, in `unit`.
+        unit: Name of the unit, for the lines.
+    """
     values = np.asarray(depth, np.float64)
-    none = np.zeros(len(values), bool)
+    is_no_depth = np.zeros(len(values), bool)
     lines = list[str]()
     # One value for many, at either end.
     far = far_end(values)
     near = near_end(values)
-    for found, what, most in (
-        (far, "of the sky or a far plane", f"at most {metres(far.rest)}"),
-        (near, "of no surface", f"at least {metres(near.rest)}"),
+    for end, what, reach in (
+        (far, "of the sky or a far plane", f"at most {metres(far.reach)}"),
+        (near, "of no surface", f"at least {metres(near.reach)}"),
     ):
-        if found.is_none.any():
-            none |= found.is_none
+        if end.is_no_surface.any():
+            is_no_depth |= end.is_no_surface
             lines.append(
-                f"{np.count_nonzero(found.is_none):,} of {len(values):,} depths are {what}, at"
-                f" {metres(found.value)} {unit}, where 98 % of the others are {most} {unit}; taken"
+                f"{np.count_nonzero(end.is_no_surface):,} of {len(values):,} depths are {what}, at"
+                f" {metres(end.value)} {unit}, where 98 % of the others are {reach} {unit}; taken"
                 " as unknown"
             )
-    if none.any():
-        return none, lines
+    if is_no_depth.any():
+        return is_no_depth, lines
     # Single values far beyond all others.
     median = float(np.median(values)) if len(values) >= _FEW else math.inf
-    none = values > _FAR * median
-    if none.any():
-        return none, [
-            f"dropped {np.count_nonzero(none):,} of {len(values):,} points more than {_FAR:,.0f}"
-            f" times as far as the median of {metres(median)} {unit}; the farthest was at"
-            f" {metres(float(values.max(initial=0)))} {unit}"
+    is_no_depth = values > _FAR * median
+    if is_no_depth.any():
+        return is_no_depth, [
+            f"dropped {np.count_nonzero(is_no_depth):,} of {len(values):,} points more than"
+            f" {_FAR:,.0f} times as far as the median of {metres(median)} {unit}; the farthest was"
+            f" at {metres(float(values.max(initial=0)))} {unit}"
         ]
-    return none, _clip_lines(values, unit)
+    return is_no_depth, _clip_lines(values, unit)
 
 
-def far_end(values: Floats) -> _End:
+def far_end(depth: Floats) -> _End:
     """Returns which of depths (N,) above 0 are of the sky or a far plane, and its depth."""
-    return _end(values, _FAR_M)
+    return _upper_end(depth, _FAR_M)
 
 
-def near_end(values: Floats) -> _End:
-    """Returns which of depths (N,) above 0 stand for an unknown one, and its value."""
-    none = _End(np.zeros(len(values), bool), 0.0, 0.0)
-    if not len(values) or float(values.min()) > _NEAR_M:
-        return none
+def near_end(depth: Floats) -> _End:
+    """Returns which of depths (N,) above 0 are one small number that stands for unknown."""
+    surface = _End(np.zeros(len(depth), bool), 0.0, 0.0)
+    if not len(depth) or float(depth.min()) > _NEAR_M:
+        return surface
     with np.errstate(divide="ignore"):
-        end = _end(1 / values, 1 / _NEAR_M)
-    if not end.is_none.any() or len(np.unique(values)) < _VALUES:
-        return none
-    return _End(end.is_none, 1 / end.value, 1 / end.rest)
+        end = _upper_end(1 / depth, 1 / _NEAR_M)
+    if not end.is_no_surface.any() or len(np.unique(depth)) < _FEW_VALUES:
+        return surface
+    return _End(end.is_no_surface, 1 / end.value, 1 / end.reach)
 
 
-def repeated_ends(values: NDArray[np.float32]) -> list[tuple[float, int]]:
+def repeated_ends(numbers: NDArray[np.float32]) -> list[tuple[float, int]]:
     """Returns extreme values that many of the numbers (N,) are exactly, and how many are.
 
     The numbers are a network's, of any meaning and sign. What it computes for a surface has no one
     value, and if it is stored in steps, a step at the end holds no more than those before it. So
-    one value for many at either end is the sky, a clip, a far plane, or stands for unknown.
+    one value for many at either end is the sky, a clip, a far plane, or stands for unknown. The
+    values from the smallest up come first, then those from the largest down.
     """
-    found = list[tuple[float, int]]()
-    enough = max(_LEAST_SPIKE, _SAME * len(values))
-    if not len(values) or enough > max(
-        np.count_nonzero(values == values.min()), np.count_nonzero(values == values.max())
-    ):
-        return found
-    distinct, counts = np.unique(values, return_counts=True)
+    repeated = list[tuple[float, int]]()
+    if not len(numbers):
+        return repeated
+    # Most maps have no such value, which is told without sorting them.
+    least_count = max(_LEAST_SPIKE, _SAME * len(numbers))
+    at_smallest = np.count_nonzero(numbers == numbers.min())
+    at_largest = np.count_nonzero(numbers == numbers.max())
+    if max(at_smallest, at_largest) < least_count:
+        return repeated
+    distinct, counts = np.unique(numbers, return_counts=True)
     for step in (1, -1):  # from the smallest up, from the largest down
         inwards = distinct[::step]
         counts_inwards = counts[::step]
-        at = 0
+        place = 0
         # Behind one such value there may be another: unknown as -1, and a clip.
-        while len(distinct) - at > _VALUES and counts_inwards[at] >= enough:
-            usual = np.sort(counts_inwards[at + 1 : at + 1 + _NEXT])[-2]
-            if counts_inwards[at] < _SPIKE * usual:
+        while len(distinct) - place > _FEW_VALUES and counts_inwards[place] >= least_count:
+            # The second largest of the next counts, as one value may be as frequent.
+            usual = np.sort(counts_inwards[place + 1 : place + 1 + _NEXT])[-2]
+            if counts_inwards[place] < _SPIKE * usual:
                 break
-            found.append((float(inwards[at]), int(counts_inwards[at])))
-            at += 1
-    return found
+            repeated.append((float(inwards[place]), int(counts_inwards[place])))
+            place += 1
+    return repeated
 
 
-def _end(values: Floats, beyond: float) -> _End:
-    """What is at the upper end of numbers (N,).
+def _upper_end(numbers: Floats, rare: float) -> _End:
+    """What lies at the upper end of numbers (N,): a surface, or one value for many that is none.
 
     Args:
-        values: The numbers.
-        beyond: Number beyond which one that many share is no surface's.
+        numbers: Depths, or 1/depths.
+        rare: Number beyond which surfaces are rare. One that many share exactly is none there, if
+            it is beyond all others.
     """
-    none = _End(np.zeros(len(values), bool), 0.0, 0.0)
-    if len(values) < _FEW:
-        return none
+    surface = _End(np.zeros(len(numbers), bool), 0.0, 0.0)
+    if len(numbers) < _FEW:
+        return surface
     # Many are nearly the largest.
-    largest = float(values.max())
-    enough = max(_LEAST_SAME, _SAME * len(values))
-    alike = values >= largest * (1 - _NOISY)
-    if np.count_nonzero(alike) < enough:
-        return none
-    # The others, but for further values that many share.
-    distinct, place, counts = np.unique(
-        values.astype(np.float32), return_inverse=True, return_counts=True
-    )
-    others = values[~alike]
-    rest = others
-    if len(distinct) >= _VALUES and np.count_nonzero(counts >= enough) <= _FEW:
-        rest = values[~(alike | (counts[place] >= enough))]
-    # Most are of few values, as of a drawing.
-    if rest.size < len(others) / 2 or not rest.size:
-        rest = others
-    if not rest.size:
-        return none
-    # Far beyond the others, also with the mixtures that a renderer makes at edges of the sky.
-    most = float(np.quantile(rest, 0.98))
-    if largest >= _BEYOND * most:
-        return _End(values > math.sqrt(largest * most), largest, most)
+    largest = float(numbers.max())
+    least_count = max(_LEAST_SAME, _SAME * len(numbers))
+    is_alike = numbers >= largest * (1 - _NOISY)
+    if np.count_nonzero(is_alike) < least_count:
+        return surface
+    others = _usual_numbers(numbers, is_alike, least_count)
+    if not others.size:
+        return surface
+    # Far beyond the others, also with the mixtures that a renderer makes at edges of the sky. Those
+    # go from the geometric mean of the two on.
+    reach = float(np.quantile(others, 0.98))
+    if largest >= _BEYOND * reach:
+        return _End(numbers > math.sqrt(largest * reach), largest, reach)
     # Exactly the same, and beyond the others.
-    same = values >= largest * (1 - _EQUAL)
-    rest = values[~same]
-    if np.count_nonzero(same) < enough or not rest.size or largest < beyond:
-        return none
-    if largest >= _ABOVE * float(rest.max()):
-        return _End(same, largest, most)
-    usual = float(np.quantile(rest, 0.9))
-    if largest >= _BEYOND_MOST * usual:
-        return _End(values > math.sqrt(largest * usual), largest, usual)
-    return none
+    is_same = numbers >= largest * (1 - _EQUAL)
+    different = numbers[~is_same]
+    if np.count_nonzero(is_same) < least_count or not different.size or largest < rare:
+        return surface
+    if largest >= _ABOVE * float(different.max()):
+        return _End(is_same, largest, reach)
+    reach_of_most = float(np.quantile(different, 0.9))
+    if largest >= _BEYOND_MOST * reach_of_most:
+        return _End(numbers > math.sqrt(largest * reach_of_most), largest, reach_of_most)
+    return surface
 
 
-def _clip_lines(values: Floats, unit: str) -> list[str]:
-    """Lines on an end that may be a clip: far more depths have its value than any other."""
-    distinct, counts = np.unique(values.astype(np.float32), return_counts=True)
-    if len(distinct) < _VALUES:
+def _usual_numbers(numbers: Floats, is_alike: Mask, least_count: float) -> Floats:
+    """The numbers (M,) that are not at the end, and have no value that many share either.
+
+    Values that many share are left in if most of the others have one, or if there are many of them,
+    as in a drawing.
+
+    Args:
+        numbers: (N,) all numbers.
+        is_alike: (N,) which are at the end, of nearly one value.
+        least_count: How many have a value that many share, at least.
+    """
+    others = numbers[~is_alike]
+    distinct, place, counts = np.unique(
+        numbers.astype(np.float32), return_inverse=True, return_counts=True
+    )
+    is_shared = counts >= least_count
+    if len(distinct) < _FEW_VALUES or np.count_nonzero(is_shared) > _FEW:
+        return others
+    unshared = numbers[~(is_alike | is_shared[place])]
+    if not unshared.size or unshared.size < len(others) / 2:
+        return others
+    return unshared
+
+
+def _clip_lines(depth: Floats, unit: str) -> list[str]:
+    """Warnings on ends that may be a clip: far more depths (N,) have its value than any other.
+
+    A drawing, of few values, gives none.
+    """
+    distinct, counts = np.unique(depth.astype(np.float32), return_counts=True)
+    if len(distinct) < _FEW_VALUES:
         return []
     lines = list[str]()
-    for at, name in ((-1, "largest"), (0, "smallest")):
-        least = max(_LEAST_SPIKE, _SAME * len(values), _SPIKE * float(np.delete(counts, at).max()))
-        if counts[at] >= least:
+    for place, name in ((-1, "largest"), (0, "smallest")):
+        most_frequent = float(np.delete(counts, place).max())
+        least_count = max(_LEAST_SPIKE, _SAME * len(depth), _SPIKE * most_frequent)
+        if counts[place] >= least_count:
             lines.append(
-                f"warning: {counts[at] / len(values):.1%} of the depths have the {name} one,"
-                f" {float(distinct[at]):.6g} {unit} exactly, as of a clip, a sensor's range or a"
+                f"warning: {counts[place] / len(depth):.1%} of the depths have the {name} one,"
+                f" {float(distinct[place]):.6g} {unit} exactly, as of a clip, a sensor's range or a"
                 " far plane; they count as depth, unless a mask rules them out"
             )
     return lines

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
@@ -34,6 +33,7 @@ from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.version import __version__
 
 Stages = dict[str, Scores]
+"""Errors by the stage that they are of, such as `BEFORE` and `AFTER`."""
 
 
 def record_of_frame(
@@ -51,7 +51,7 @@ def record_of_frame(
         refined: The refined frame.
         frame: The frame as it was read.
         name: Name of the frame.
-        group: Sequence that the frame is of.
+        group: Sequence that the frame is of. None: none is known.
         notes: Lines for a person, before those of the refined frame.
         with_baselines: Whether every classical completion is scored, too.
     """
@@ -78,45 +78,45 @@ def record_of_result(
         spec: What the user called the network. None: its name.
         holdout: Fraction of the points that is held out.
     """
-    own = refined.networks[0]
+    network = refined.networks[0]  # the user's; further ones are the program's
     # The points that were used, of which some are of neighbouring frames.
-    own_used = len(frame.own) - len(frame.held_out)
+    used_of_frame = len(frame.own) - len(frame.held_out)
     points = PointsRecord(
         used=len(refined.used),
         held_out=len(frame.held_out),
         nearest=float(frame.own.depth.min()),
         farthest=float(frame.own.depth.max()),
-        moved=len(refined.used) - own_used if frame.neighbours else None,
+        moved=len(refined.used) - used_of_frame if frame.neighbours else None,
     )
     # The settings of the user's network, with nothing left open.
     settings = {
         "method": refined.asked.method,
-        "layer": own.layer,
-        **asdict(own.settings),
+        "layer": network.layer,
+        **asdict(network.settings),
         "seed": refined.asked.seed,
         "step": refined.step,
         "propagate": refined.propagation,
-        "output_kind": own.output_kind,
-        "normalise": own.normalise,
+        "output_kind": network.output_kind,
+        "normalise": network.normalise,
         "holdout": holdout,
-        "device": own.device,
+        "device": network.device,
     }
-    weights = own.checkpoint
+    checkpoint = network.checkpoint
     return ResultRecord(
         size=(frame.size[1], frame.size[0]),
         points=points,
         neighbours=list(frame.neighbours),
         camera=CameraRecord.of(frame.camera, frame.pose) if frame.camera else None,
         model=ModelRecord(
-            name=own.name,
-            spec=spec or own.name,
-            checkpoint=str(weights) if weights else None,
-            checkpoint_sha256=fingerprint(weights).sha256 if weights else None,
+            name=network.name,
+            spec=spec or network.name,
+            checkpoint=str(checkpoint) if checkpoint else None,
+            checkpoint_sha256=fingerprint(checkpoint).sha256 if checkpoint else None,
         ),
         method=MethodRecord(
             name=refined.asked.method,
             propagation=refined.propagation,
-            networks=[_network_record(network) for network in refined.networks],
+            networks=[_network_record(used) for used in refined.networks],
         ),
         settings=settings,
         weights=dict(refined.weights),
@@ -139,56 +139,88 @@ def versions() -> dict[str, str]:
 
 
 def _network_record(network: UsedNetwork) -> NetworkRecord:
-    """The settings of one network."""
+    """How the depth of one network was aligned and its z updated."""
     settings = asdict(network.settings)
     del settings["propagate"]  # the residual of the result is propagated, not of a network
     return NetworkRecord(name=network.name, layer=network.layer, **settings)
 
 
 def _errors_of(refined: Refined, frame: ReadFrame, *, with_baselines: bool) -> dict[str, Stages]:
-    """The errors of each stage and of linear interpolation, by each basis that the frame has."""
+    """The errors of the result, of the stages before it and of linear interpolation.
 
-    def baselines(points: SparsePoints, before: Tensor) -> Iterator[tuple[str, Tensor]]:
-        """The prediction of each baseline but the linear one that does not fail on the frame."""
-        for name in BASELINES if with_baselines else ():
-            with suppress(ModelError):  # such as a line through points that are all equally far
-                if name != LINEAR:
-                    yield name, BASELINES[name](points, before)
+    Args:
+        refined: The refined frame.
+        frame: The frame as it was read.
+        with_baselines: Whether every classical completion is scored, too.
 
+    Returns:
+        Errors by basis (`GT`, `HELD_OUT`, `VALIDATION`, `USED`), of those that the frame has; then
+        by stage.
+    """
     errors = dict[str, Stages]()
-    validation = refined.validation
-    held_out = frame.held_out
     before = torch.from_numpy(refined.before)
     after = torch.from_numpy(refined.depth)
-    maps = {BEFORE: before, AFTER: after}
-    beside = dict[str, Tensor]()
-    if frame.gt is not None or len(held_out):
-        beside[LINEAR] = linear(frame.points)
-    # Against the truth, all others are scored on the pixels where the result is known.
+    own_stages = {BEFORE: before, AFTER: after}
+    linear_stage = dict[str, Tensor]()
+    if frame.gt is not None or len(frame.held_out):
+        linear_stage[LINEAR] = linear(frame.points)
+    # Against the truth, the result is scored where the truth is known, and all others on the pixels
+    # of these where the result is known.
     if frame.gt is not None:
         gt = torch.from_numpy(frame.gt)
-        known = torch.where(after > 0, gt, 0)
-        stages = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
-        scored = maps | stages | beside | dict(baselines(frame.points, before))
+        gt_of_result = torch.where(after > 0, gt, 0)
+        inner_stages = {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
+        stages = own_stages | inner_stages | linear_stage
+        if with_baselines:
+            stages |= _baselines(frame.points, before)
         errors[GT] = {
-            name: score(depth, gt if name == AFTER else known).to_json()
-            for name, depth in scored.items()
+            name: score(depth, gt if name == AFTER else gt_of_result).to_json()
+            for name, depth in stages.items()
         }
-    errors[HELD_OUT] = _at_points(held_out, maps | beside)
+    errors[HELD_OUT] = _errors_at_points(frame.held_out, own_stages | linear_stage)
     # At validation points, each is predicted without them.
+    validation = refined.validation
     if validation is not None:
-        others = baselines(validation.kept, validation.network)
-        predicted = {name: validation.points.sample(depth) for name, depth in others}
+        predicted = dict(validation.predicted)  # (N,) at the validation points
+        if with_baselines:
+            for name, depth in _baselines(validation.kept, validation.network).items():
+                predicted[name] = validation.points.sample(depth)
         errors[VALIDATION] = {
-            name: {"mae": validation.error(at), "points": len(validation.points)}
-            for name, at in (dict(validation.predicted) | predicted).items()
+            name: {"mae": validation.error(at_points), "points": len(validation.points)}
+            for name, at_points in predicted.items()
         }
-    errors[USED] = _at_points(refined.used, maps)
+    errors[USED] = _errors_at_points(refined.used, own_stages)
     return {basis: stages for basis, stages in errors.items() if stages}
 
 
-def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
-    """The errors of depth maps (H, W) at points of the same image, where both are known."""
+def _baselines(points: SparsePoints, before: Tensor) -> dict[str, Tensor]:
+    """The depth (H, W) of each classical completion but the linear one, by its name.
+
+    Those that fail on the frame are left out.
+
+    Args:
+        points: The points that are completed.
+        before: (H, W) metres, the aligned depth of the network.
+    """
+    completed = dict[str, Tensor]()
+    for name in BASELINES:
+        if name == LINEAR:
+            continue
+        with suppress(ModelError):  # such as a line through points that are all equally far
+            completed[name] = BASELINES[name](points, before)
+    return completed
+
+
+def _errors_at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
+    """The errors of depth maps at points of the same image, where both are known.
+
+    Args:
+        points: The points, of which there may be none.
+        maps: (H, W) metres each, by the stage.
+
+    Returns:
+        Empty unless the depth is known at some points both before and after.
+    """
     stages: Stages = {}
     for name, depth in maps.items():
         error = (points.sample(depth) - points.depth)[points.known_in(depth)].double()
@@ -202,13 +234,19 @@ def _at_points(points: SparsePoints, maps: dict[str, Tensor]) -> Stages:
 
 
 def _improved_fraction(refined: Refined, frame: ReadFrame) -> float | None:
-    """The fraction of the pixels with ground truth, else of held-out points, whose error fell."""
-    before, after, gt = refined.before, refined.depth, frame.gt
+    """The fraction of the pixels with ground truth, else of held-out points, whose error fell.
+
+    None without any.
+    """
+    before = refined.before
+    after = refined.depth
+    gt = frame.gt
+    # Without ground truth, the same at the held-out points where the result is known, (N,) each.
     if gt is None:
-        maps = torch.from_numpy(before), torch.from_numpy(after)
-        held_out = frame.held_out
-        points = held_out.select(held_out.known_in(maps[1]))
-        before, after = (points.sample(depth).numpy() for depth in maps)
+        after_map = torch.from_numpy(after)
+        points = frame.held_out.select(frame.held_out.known_in(after_map))
+        before = points.sample(torch.from_numpy(before)).numpy()
+        after = points.sample(after_map).numpy()
         gt = points.depth.numpy()
     gains = gain(before, after, gt)
     known = gains[np.isfinite(gains)]

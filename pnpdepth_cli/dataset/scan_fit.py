@@ -23,38 +23,45 @@ from pnpdepth_cli.points import Size
 from pnpdepth_cli.sensors.edge_fit import EdgeMap, Jumps, edge_map, jumps_of
 from pnpdepth_cli.sensors.projection import points_in_image
 
+# How far a scan may be turned and moved.
 _MOST_TURN_DEG = 9.0
-"""About the camera's x and y."""
+"""Largest turn about the camera's x and y that is searched."""
 _LEAST_TURN_DEG = 1.0
-"""Below, a calibration is taken for inexact."""
+"""Smallest turn that is told; below, a calibration is taken for inexact."""
 _MOST_ROLL_DEG = 10.0
-"""About the camera's axis."""
+"""Largest turn about the camera's axis that is searched."""
 _MOST_AHEAD_M = 3.0
-"""0.1 s at 30 m/s."""
+"""Largest way along the camera's axis that is searched: 0.1 s at 30 m/s."""
 _LEAST_AHEAD_M = 0.5
-"""0.1 s at 5 m/s."""
-_TALLEST = 1 / 3
-"""Of the image's height, by which points are shifted at most."""
+"""Smallest way that is told: 0.1 s at 5 m/s."""
+_MOST_DOWN = 1 / 3
+"""Fraction of the image's height by which points are shifted at most."""
 _ROLLS_DEG = np.arange(-5.0, 5.1, 0.5)
 """Turns about the camera's axis that are tried with each turn about x and y."""
+
+# An image that was resized.
 _RESIZED = 0.1
-"""Log ratio of the image's size and twice the principal point, of an image that was resized."""
+"""Log ratio of the image's size and twice the principal point, from which an image was resized."""
 _SAME_RATIO = 0.12
-"""Difference of the two sides' such log ratios, where an image was resized."""
-_ABOUT = np.linspace(0.88, 1.12, 97)
-"""Times that ratio, as principal points are not in the middle."""
+"""Difference of these log ratios across and down, up to which one factor explains both."""
+_AROUND_FACTOR = np.linspace(0.88, 1.12, 97)
+"""Multiples of the ratio that are tried, as principal points are not exactly in the middle."""
 
+# The search. A pose is (4,): degrees about the camera's x, y and z, and metres ahead.
 _COARSE = 0.4
-"""Of the largest weight, of jumps that are looked at first."""
+"""Fraction of the largest weight, from which jumps of depth are in the quick search."""
 _AS_IT_IS = np.zeros(4)
-"""A pose: degrees about the camera's x, y and z, and metres ahead."""
+"""The pose that moves nothing."""
 _INEXACT = np.array([0.5, 0.5, 0.5, 0.3])
-"""Such a pose, which a right calibration may be off."""
+"""The pose that a right calibration may be off, of either sign."""
 _PEAKS = 3
-"""Best shifts, from which turns are looked for."""
+"""Best shifts, from which turns are searched."""
+_ROUNDS = 3
+"""Times that all coordinates of a pose are climbed, at most."""
 _GOOD = 5.0
-"""Score from which axes, cameras and mirrors are not looked at."""
+"""Score of the scan as it is, from which axes, cameras and mirrors are not tried."""
 
+# The verdict. Scores are in standard deviations by chance.
 _SOME_JUMPS = 60
 """Jumps of depth; fewer tell nothing."""
 _MANY_JUMPS = 250
@@ -64,7 +71,7 @@ _BY_CHANCE = 2.5
 
 
 class _Needed(NamedTuple):
-    """What a reading needs to be told.
+    """What another reading of the scan needs, at least, so that a person is told of it.
 
     The more readings of a kind there are, the better is the best of them by chance. All numbers are
     from right and wrong inputs made of KITTI's frames for object detection and depth completion by
@@ -72,7 +79,8 @@ class _Needed(NamedTuple):
     """
 
     score: float
-    more: float  # than the scan as it is
+    more: float
+    """By how much the score must exceed that of the scan as it is."""
 
 
 _NEEDED = {
@@ -83,7 +91,7 @@ _NEEDED = {
     "other": _Needed(score=4.5, more=1.5),
     "size": _Needed(score=4.5, more=1.5),
 }
-# By scans of less than many jumps:
+"""By the kind of reading."""
 _NEEDED_OF_FEW = {
     "turn": _Needed(score=7.0, more=4.5),
     "roll": _Needed(score=6.0, more=3.0),
@@ -92,14 +100,18 @@ _NEEDED_OF_FEW = {
     "other": _Needed(score=5.0, more=2.5),
     "size": _Needed(score=5.0, more=2.5),
 }
+"""The same of scans with fewer than `_MANY_JUMPS`."""
 
 
 class _Fit(NamedTuple):
-    """A reading of the scan, and how well it belongs to the image."""
+    """Another way to read the scan, such as turned, and how well it belongs to the image so."""
 
     kind: str
-    score: float  # in standard deviations by chance
+    """A key of `_NEEDED`."""
+    score: float
+    """Standard deviations by chance."""
     text: str
+    """What the reading is, as a line for a person ends."""
 
 
 def fit_warning(
@@ -113,13 +125,13 @@ def fit_warning(
     """Returns a warning if the image's edges contradict how the scan is projected, or none.
 
     Args:
-        scan: (N, 3) of the scanner.
-        own: The calibration that projects it.
-        others: Further calibrations, such as those of other cameras, by what they are.
-        rgb: (H, W, 3) in 0…1.
-        is_whole: Whether it has the returns of a scanner. The jumps of other clouds are known as
-            inexactly as their points are far apart. So few of them tell nothing, and many may fit
-            no better than by chance.
+        scan: (N, 3) metres in the scanner's coordinates.
+        own: The calibration that projects the scan.
+        others: Further calibrations, such as those of other cameras, by what gives them.
+        rgb: (H, W, 3) in 0…1, the image.
+        is_whole: Whether the points are the returns of a scanner. The jumps of other clouds are
+            known as inexactly as their points are far apart. So few of them tell nothing, and many
+            may fit no better than by chance.
     """
     # Too few jumps of depth tell nothing.
     size = (rgb.shape[0], rgb.shape[1])
@@ -155,43 +167,60 @@ def fit_warning(
 
 
 class _Judge:
-    """Scores readings of one scan in standard deviations by chance."""
+    """Scores of other readings of one scan, in standard deviations by chance.
+
+    A pose is (4,): degrees about the camera's x, y and z, and metres ahead.
+    """
 
     def __init__(self, rgb: NDArray[np.float32], camera: Camera, jumps: Jumps) -> None:
+        """Finds what chance is, and how well the scan as it is belongs to the image.
+
+        Args:
+            rgb: (H, W, 3) in 0…1, the image.
+            camera: The camera that the scan is projected by.
+            jumps: Where depth jumps in the scan, in that camera's coordinates.
+        """
         self.edges: EdgeMap = edge_map(rgb)
         self.camera = camera
         self.jumps = jumps
-        self.largest = jumps.largest(_COARSE)
-        # Chance is the score of all shifts.
+        self.largest_jumps = jumps.largest(_COARSE)
+        # Chance is the correlation with the edges at all shifts of the image.
         focal_px = float(camera.intrinsics[0, 0])
         across_px = math.tan(math.radians(_MOST_TURN_DEG)) * focal_px
-        down_px = min(across_px, _TALLEST * rgb.shape[0])
+        down_px = min(across_px, _MOST_DOWN * rgb.shape[0])
         xy, weights = jumps.projected(camera)
         self.shifted = self.edges.shifted(xy, weights, (down_px, across_px))
         self.chance = float(self.shifted.mean())
-        self.spread = float(self.shifted.std()) + 1e-9
+        self.spread = float(self.shifted.std()) + 1e-9  # above 0, of an image without edges
         # No calibration is exact: the scan as it is may be off by so little.
         self.as_it_is, self.base = self._as_it_is()
 
     def of_pixels(self, xy: Floats, weights: Floats) -> float:
-        """The score of weights (N, 3) at pixels (N, 2)."""
+        """The score of weights (N, 3), as `Jumps.projected` gives them, at pixels (N, 2)."""
         return (self.edges.score(xy, weights) - self.chance) / self.spread
 
     def of_pose(self, pose: Floats) -> float:
-        """The score of the scan turned about the camera's x, y, z by degrees, and m ahead."""
-        return self.of_pixels(*_at_pose(self.jumps, pose).projected(self.camera))
+        """The score of the scan moved to a pose (4,)."""
+        xy, weights = _at_pose(self.jumps, pose).projected(self.camera)
+        return self.of_pixels(xy, weights)
 
     def of_pose_coarsely(self, pose: Floats) -> float:
-        """The same, by the largest jumps alone."""
-        return self.of_pixels(*_at_pose(self.largest, pose).projected(self.camera))
+        """The score of the scan moved to a pose (4,), by its largest jumps alone: a quick one."""
+        xy, weights = _at_pose(self.largest_jumps, pose).projected(self.camera)
+        return self.of_pixels(xy, weights)
 
     def climb(self, start: Floats, steps: Floats) -> tuple[float, Floats]:
-        """The best score around a pose, which the largest jumps find, and its pose."""
+        """The best score around a pose (4,), and its pose, which the largest jumps find.
+
+        Args:
+            start: The pose.
+            steps: Steps (4,) of its coordinates; one of 0 stays as it is.
+        """
         _, pose = _climb(self.of_pose_coarsely, start, steps)
         return self.of_pose(pose), pose
 
     def _as_it_is(self) -> tuple[float, Floats]:
-        """The best score of a pose as inexact as a calibration may be, and the pose."""
+        """The best score of a pose (4,) as inexact as a calibration may be, and that pose."""
 
         def score(pose: Floats) -> float:
             if (np.abs(pose) > _INEXACT).any():
@@ -204,30 +233,37 @@ class _Judge:
 
 
 def _at_pose(jumps: Jumps, pose: Floats) -> Jumps:
-    """The jumps turned about the camera's x, y, z by degrees, and m ahead."""
+    """The jumps turned about the camera's x, y, z by degrees pose[:3], and pose[3] metres ahead."""
     turn = Rotation.from_euler("xyz", pose[:3], degrees=True).as_matrix()
     return jumps.moved(Extrinsics(turn, np.array([0, 0, pose[3]])))
 
 
 def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tuple[float, Floats]:
-    """The highest score around `start` (K,), coordinate by coordinate, and where it is."""
-    best = score(start)
-    at = start
-    for _ in range(3):
-        before = best
+    """The highest score around a place (K,), coordinate by coordinate; and where it is, (K,).
+
+    Args:
+        score: Function of a place that is to be high.
+        start: The place.
+        steps: Steps (K,) of its coordinates; one of 0 stays as it is.
+    """
+    best_score = score(start)
+    best = start
+    for _ in range(_ROUNDS):
+        score_before = best_score
         for axis in np.flatnonzero(steps):
             for sign in (-1, 1):
+                # In one direction, as long as the score rises.
                 while True:
-                    tried = at.copy()
+                    tried = best.copy()
                     tried[axis] += sign * steps[axis]
-                    value = score(tried)
-                    if value <= best:
+                    tried_score = score(tried)
+                    if tried_score <= best_score:
                         break
-                    best = value
-                    at = tried
-        if best == before:
+                    best_score = tried_score
+                    best = tried
+        if best_score == score_before:
             break
-    return best, at
+    return best_score, best
 
 
 def _readings(
@@ -237,7 +273,15 @@ def _readings(
     others: Mapping[str, Calibration],
     size: Size,
 ) -> Iterator[_Fit]:
-    """All readings but the scan as it is."""
+    """Yields the readings but the scan as it is, with their scores.
+
+    Args:
+        judge: Scores of the scan.
+        scan: (N, 3) metres in the scanner's coordinates.
+        own: The calibration that projects the scan.
+        others: Further calibrations, by what gives them.
+        size: (H, W) of the image.
+    """
     yield from _turned(judge)
     yield from _rolled(judge)
     yield from _of_another_time(judge)
@@ -254,29 +298,34 @@ def _readings(
     jumps = None if resized is None else _jumps(scan, resized, size)
     if resized is not None and jumps is not None:
         xy, weights = jumps.projected(resized.camera)
-        scores = [judge.of_pixels((xy + 0.5) * about - 0.5, weights) for about in _ABOUT]
+        # Pixels scale about the image's corner, which is at -0.5.
+        scores = [judge.of_pixels((xy + 0.5) * near - 0.5, weights) for near in _AROUND_FACTOR]
         best = int(np.argmax(scores))
-        factor *= float(_ABOUT[best])
+        factor *= float(_AROUND_FACTOR[best])
         text = f"with the intrinsics × {factor:.3g}, as of an image that was resized"
         yield _Fit("size", scores[best], text)
 
 
 def _turned(judge: _Judge) -> Iterator[_Fit]:
-    """The best turns about the camera's x and y, which are shifts of the image at first."""
-    focal_x = float(judge.camera.intrinsics[0, 0])
-    focal_y = float(judge.camera.intrinsics[1, 1])
+    """Yields the best turns about the camera's x and y, which are shifts of the image at first."""
+    # The angles of all shifts, whose middle is no shift: (rows, 1) down and (1, columns) right.
+    focal_x_px = float(judge.camera.intrinsics[0, 0])
+    focal_y_px = float(judge.camera.intrinsics[1, 1])
     rows = np.arange(judge.shifted.shape[0]) - judge.shifted.shape[0] // 2
     columns = np.arange(judge.shifted.shape[1]) - judge.shifted.shape[1] // 2
-    down_deg = np.degrees(np.arctan(rows / judge.edges.scale / focal_y))[:, None]
-    right_deg = np.degrees(np.arctan(columns / judge.edges.scale / focal_x))[None, :]
+    down_deg = np.degrees(np.arctan(rows / judge.edges.scale / focal_y_px))[:, None]
+    right_deg = np.degrees(np.arctan(columns / judge.edges.scale / focal_x_px))[None, :]
     # The best shifts that are no small ones, and none of them beside another.
-    left = np.where(np.hypot(down_deg, right_deg) < _LEAST_TURN_DEG, -np.inf, judge.shifted)
+    is_small = np.hypot(down_deg, right_deg) < _LEAST_TURN_DEG
+    remaining = np.where(is_small, -np.inf, judge.shifted)
     for _ in range(_PEAKS):
-        row, column = np.unravel_index(left.argmax(), left.shape)
+        row, column = np.unravel_index(remaining.argmax(), remaining.shape)
+        # With x right, y down and z ahead, a negative turn about x moves points down, and a
+        # positive one about y moves them right.
         about_x = -float(down_deg[row, 0])
         about_y = float(right_deg[0, column])
-        near = np.hypot(down_deg + about_x, right_deg - about_y) < _LEAST_TURN_DEG
-        left = np.where(near, -np.inf, left)
+        is_beside = np.hypot(down_deg + about_x, right_deg - about_y) < _LEAST_TURN_DEG
+        remaining = np.where(is_beside, -np.inf, remaining)
         # From there, turns about all three axes.
         rolls = [np.array([about_x, about_y, roll, 0]) for roll in _ROLLS_DEG]
         pose = max(rolls, key=judge.of_pose_coarsely)
@@ -291,7 +340,7 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
 
 
 def _rolled(judge: _Judge) -> Iterator[_Fit]:
-    """The best turn about the camera's axis."""
+    """Yields the best turn about the camera's axis, unless it is small."""
     angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, 0.5)
     starts = [
         base + np.array([0, 0, sign * angle, 0])
@@ -306,7 +355,7 @@ def _rolled(judge: _Judge) -> Iterator[_Fit]:
 
 
 def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
-    """The best way along the camera's axis."""
+    """Yields the best way along the camera's axis, unless it is short."""
     ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, 0.25)
     starts = [
         base + np.array([0, 0, 0, sign * way])
@@ -323,44 +372,55 @@ def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
 
 
 def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
-    """The image mirrored and turned, as EXIF says or rows are stored."""
+    """Yields the image mirrored and turned, as EXIF says or as rows are stored.
+
+    The points are put where the mirrored image has them. Their weights are x·x, y·y and x·y of the
+    direction of a jump of depth: a mirror changes the sign of x·y, and an exchange of x and y
+    exchanges the first two.
+    """
     height, width = size
     xy, weights = judge.jumps.projected(judge.camera)
-    left = width - 1 - xy[:, 0]
-    up = height - 1 - xy[:, 1]
-    opposite = weights * np.array([1, 1, -1])
-    changed = [
-        ("with the image mirrored", np.column_stack([left, xy[:, 1]]), opposite),
-        ("with the image's rows in reverse", np.column_stack([xy[:, 0], up]), opposite),
-        ("with the image turned by 180°", np.column_stack([left, up]), weights),
+    x, y = xy.T
+    from_right = width - 1 - x
+    from_bottom = height - 1 - y
+    mirrored = weights * np.array([1, 1, -1])
+    readings = [
+        ("with the image mirrored", np.column_stack([from_right, y]), mirrored),
+        ("with the image's rows in reverse", np.column_stack([x, from_bottom]), mirrored),
+        ("with the image turned by 180°", np.column_stack([from_right, from_bottom]), weights),
     ]
     if height == width:  # of other images the size tells
         exchanged = weights[:, [1, 0, 2]]
-        across = exchanged * np.array([1, 1, -1])
-        changed += [
-            ("with the image's rows and columns exchanged", xy[:, ::-1], exchanged),
-            ("with the image turned by 90°", np.column_stack([xy[:, 1], left]), across),
-            ("with the image turned by -90°", np.column_stack([up, xy[:, 0]]), across),
-            ("with the image mirrored and turned by 90°", np.column_stack([up, left]), exchanged),
+        turned = exchanged * np.array([1, 1, -1])
+        readings += [
+            ("with the image's rows and columns exchanged", np.column_stack([y, x]), exchanged),
+            ("with the image turned by 90°", np.column_stack([y, from_right]), turned),
+            ("with the image turned by -90°", np.column_stack([from_bottom, x]), turned),
+            (
+                "with the image mirrored and turned by 90°",
+                np.column_stack([from_bottom, from_right]),
+                exchanged,
+            ),
         ]
-    for text, pixels, of_pixels in changed:
-        yield _Fit("mirror", judge.of_pixels(pixels, of_pixels), text)
+    for text, pixels, pixel_weights in readings:
+        yield _Fit("mirror", judge.of_pixels(pixels, pixel_weights), text)
 
 
 def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
-    """The calibration of the image (H, W) if it was resized, and by what; None if it was not.
+    """The calibration of the image (H, W) if it was resized, and the factor of its intrinsics.
 
     An image that was resized has its principal point elsewhere than in its middle, by one factor in
-    both directions.
+    both directions. If it was not resized: None and 1.
     """
-    centre = own.camera.intrinsics[:2, 2] + 0.5
-    if centre.min() <= 0:
+    centre_px = own.camera.intrinsics[:2, 2] + 0.5  # from the image's corner
+    if centre_px.min() <= 0:
         return None, 1.0
-    across = size[1] / (2 * centre[0])
-    down = size[0] / (2 * centre[1])
+    across = size[1] / (2 * centre_px[0])
+    down = size[0] / (2 * centre_px[1])
     factor = math.sqrt(across * down)
     if abs(math.log(across / down)) > _SAME_RATIO or abs(math.log(factor)) < _RESIZED:
         return None, 1.0
+    # The intrinsics of an image resized by the factor, about its corner.
     intrinsics = own.camera.intrinsics.copy()
     intrinsics[:2] *= factor
     intrinsics[:2, 2] += 0.5 * factor - 0.5
@@ -368,33 +428,40 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
 
 
 def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
-    """Calibrations of other axes of the scan, of the inverse pose, and the others."""
+    """Calibrations by which the scan may be meant, by what a person is told of each.
+
+    They are those of other axes of the scan, of the inverse of the scanner's pose, and `others`.
+    """
     scanner = own.known_scanner
     readings = {"with the extrinsics inverted": replace(own, scanner=scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (
             "with y of the scan negated, as of left-handed ones (CARLA, Unity)",
-            np.diag([1.0, -1, 1]),
+            np.diag([1.0, -1.0, 1.0]),
         ),
         ("with z of the scan negated", np.diag([1.0, 1.0, -1.0])),
         ("with x and y of the scan exchanged", np.eye(3)[[1, 0, 2]]),
         ("with the scan turned by 180° about z", np.diag([-1.0, -1.0, 1.0])),
     ):
-        changed = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
-        readings[text] = replace(own, scanner=scanner @ changed)
+        other_axes = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
+        readings[text] = replace(own, scanner=scanner @ other_axes)
     return readings | dict(others)
 
 
 def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) -> dict[str, int]:
-    """Returns how many points of a scan (N, 3) are in the image (H, W), by other axes of it."""
-    found = dict[str, int]()
+    """Returns how many points of a scan (N, 3) are in the image (H, W) by other axes of the scan.
+
+    They are counted by what a person is told of the axes, such as "with z of the scan negated".
+    """
+    counts = dict[str, int]()
     for text, reading in _other_readings(own, {}).items():
-        seen = reading.known_scanner.apply(scan)
-        found[text] = len(points_in_image(seen, reading.camera, size)[0])
-    return found
+        xyz = reading.known_scanner.apply(scan)
+        seen, _ = points_in_image(xyz, reading.camera, size)
+        counts[text] = len(seen)
+    return counts
 
 
 def _jumps(scan: NDArray[np.floating], reading: Calibration, size: Size) -> Jumps | None:
-    """The jumps of depth of the scan (N, 3) that are in the image (H, W)."""
+    """The jumps of depth of the scan (N, 3) that are in the image (H, W); None of too few."""
     return jumps_of(scan, reading.camera, reading.known_scanner, size)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_size
 from pnpdepth_cli.dataset.frame_files import ScanOptions
-from pnpdepth_cli.dataset.plausible import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
+from pnpdepth_cli.dataset.scan_returns import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
 from pnpdepth_cli.file_record import FileRecord
@@ -38,32 +38,41 @@ from pnpdepth_cli.sensors.projection import (
     project_velodyne,
 )
 
+_FARTHEST_SCANNER_M = 20.0
+"""Distance of a scanner from its camera; farther apart are the origins of maps."""
+_KITTI_CAMERAS = 4
+"""Cameras of KITTI; if a calibration has more, they are not tried."""
+
+# Extrinsics that may be inverted.
 _MORE_IF_INVERTED = 3.0
 """Times as many points in the image with inverted extrinsics, from which there is a warning."""
 _NEXT_TO_NONE = 0.05
-"""Of the points in the image with inverted extrinsics; fewer with those given are an error."""
+"""Fraction of the points in the image with inverted extrinsics; fewer with those that are given are
+an error."""
 _THIN = 0.5
-"""Largest variance of a scan's rays along its thin direction, of that along the next one."""
+"""Largest variance of a scan's rays along its thin direction, as a fraction of the next one."""
+
+# Intrinsics of another image.
 _AHEAD_DEG = 15.0
 """Angle to the camera's axis below which points are expected in the image."""
 _MOST_OUTSIDE = 1 / 3
-"""Of the points ahead; more outside the image give a warning."""
-_FARTHEST_SCANNER_M = 20.0
-"""From its camera; farther apart are the origins of maps."""
+"""Fraction of the points ahead that may be outside the image without a warning."""
+
+# The camera of images that may be rectified.
 _CLEARLY_BETTER = 1.0
-"""In standard deviations by chance, of a camera that replaces the one that is named."""
+"""Standard deviations of the score by chance, by which another camera replaces the usual one."""
 _CHANCE_PX = 80.0
-"""Shifts by which the spread by chance is known."""
+"""Largest shift of the points, across and down, whose scores tell chance."""
+_LEAST_INSIDE = 0.5
+"""Fraction of the jumps of depth that a camera puts into the image, at least, to be compared."""
+
+# Heights that tell a scan in another unit.
 _HIGH_M = 4.5
 """Height above the ground from which a scanner is on no vehicle; scanners on trucks are at 4 m."""
 _ON_VEHICLES_M = (0.15, 4.0)
-"""Heights of scanners on vehicles and robots."""
+"""The smallest and the largest height of scanners on vehicles and robots."""
 _UNITS = {"feet": 3.28084, "decimetres": 10.0, "inches": 39.3701}
 """Numbers per metre."""
-_CAMERAS = 4
-"""Of KITTI; more of a calibration are not tried."""
-_FEW_INSIDE = 0.5
-"""Of the most points in the image; a camera with fewer is ruled out."""
 
 
 class _Cloud(NamedTuple):
@@ -72,12 +81,13 @@ class _Cloud(NamedTuple):
     xyz: NDArray[np.floating]
     """(N, 3) in the scanner's coordinates."""
     source: str
-    """What was read, for a person."""
+    """Format of the file, for a person."""
     of_scanner: bool
-    """Whether they were measured from their origin."""
+    """Whether a scanner at the origin of the coordinates measured the points."""
     dropped: dict[str, int]
     """Number of stored points that are no returns, by the reason."""
     notes: list[str]
+    """Lines for a person."""
 
 
 def read_scan_points(
@@ -91,22 +101,24 @@ def read_scan_points(
     of_integers: str = "",
     search: bool = True,
 ) -> SparseDepth:
-    """Returns the points of a scan that are visible in an image.
+    """Returns the points of a scan that are visible in an image, with depth z in metres.
 
     Args:
         path: The scan.
         options: The calibration, and whether occluded points stay.
-        size: (H, W) of the image; None for the calibration's.
+        size: (H, W) of the image. None: the calibration states it.
         image: File of the image; its edges tell whether it is rectified, where the calibration
-            leaves that open.
-        rgb: The image (H, W, 3) in 0…1, if its file has been read.
-        scale: Numbers of the scan per metre that the user states.
-        of_integers: The other file of the frame whose integers that scale is of, if there is one.
+            leaves that open. None: there is none.
+        rgb: (H, W, 3) in 0…1, the image, if its file has been read.
+        scale: Numbers of the scan per metre that the user or the data set states.
+        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
+            frame's other file, or `plausible.OF_DATA_SET`. Empty: it is stated of these numbers.
         search: Whether it is searched how image and scan belong together.
 
     Raises:
         InputError: A file cannot be read, or calibration and image do not fit together.
         NoPointsError: No point is visible.
+        UsageError: There is no calibration, or it has no pose of the scanner.
     """
     # The calibration must be of the image.
     calibration, calib = _calibration_of(path, options)
@@ -116,34 +128,35 @@ def read_scan_points(
     warnings = check_size(calib, calibration.camera, size, image)
     # The returns of the scan, in metres.
     cloud = _read_cloud(path, calibration, scale, of_integers)
-    # Of several cameras, that of the image. The image is read where its edges tell something.
-    may_differ = bool(calibration.rectified)
-    if image is not None and rgb is None and (may_differ or search):
+    # Of a raw and rectified cameras, that of the image. It is read where its edges tell something.
+    may_be_rectified = bool(calibration.rectified)
+    if image is not None and rgb is None and (may_be_rectified or search):
         rgb = read_rgb(image).values
-    if may_differ:
+    if may_be_rectified:
         frames = [] if image is None or rgb is None else [(rgb, cloud.xyz)]
         calibration, note = choose_camera(calibration, frames)
         warnings.append(note)
     # The extrinsics must be of this scanner and camera.
-    of_extrinsics, seem_inverted = _extrinsics_warnings(cloud, calibration, options, calib, size)
-    warnings += of_extrinsics
+    pose_notes, seem_inverted = _extrinsics_notes(cloud, calibration, options, calib, size)
+    warnings += pose_notes
     # The points are projected, and what seems wrong is warned of.
     points = _project(cloud, calibration, size, keep_occluded=options.keep_occluded)
-    seen = calibration.known_scanner.apply(cloud.xyz)
-    warnings += _outside_warning(seen, calibration.camera, size)
+    xyz_of_camera = calibration.known_scanner.apply(cloud.xyz)
+    warnings += _outside_warning(xyz_of_camera, calibration.camera, size)
     is_searched = search and not calibration.rectified and not seem_inverted
     if is_searched and image is not None and rgb is not None:
         others = _other_cameras(options, image)
         warnings += _edge_warning(cloud, points, calibration, others, options, rgb)
+        # The height tells another unit, unless the unit is stated.
         if cloud.of_scanner and (scale is None or of_integers):
             warnings += _height_note(cloud.xyz @ calibration.known_scanner.rotation.T)
     # What a person should know, and what a record keeps.
     camera = calibration.camera
     reading = Reading(f"{cloud.source} of {len(cloud.xyz):,} points, {camera.source}")
     notes = [f"sparse: {describe_range(points.depth, reading)}", *cloud.notes]
-    lost = describe_dropped(points.dropped)
-    if lost:
-        notes.append(f"sparse: dropped {lost}")
+    described = describe_dropped(points.dropped)
+    if described:
+        notes.append(f"sparse: dropped {described}")
     return SparseDepth(
         points=points,
         camera=replace(camera, source=f"calibration of {path.name}"),
@@ -166,9 +179,16 @@ def read_scan_points(
 def _read_cloud(
     path: Path, calibration: Calibration, scale: float | None, of_integers: str
 ) -> _Cloud:
-    """The points of a scan that are returns, or those of a cloud that no scanner measured."""
+    """The points of a scan that are returns, or those of a cloud that no scanner measured.
+
+    Args:
+        path: The scan.
+        calibration: Calibration with the pose of the scanner.
+        scale: Numbers per metre that are stated. None: none are.
+        of_integers: Whose integers the scale is stated of; empty if it is stated of this scan.
+    """
     stored, source = read_scan(path)
-    if _of_scanner(calibration, stored):
+    if _is_of_scanner(calibration, stored):
         xyz, dropped, notes = scan_returns(path, stored, scale, of_integers=of_integers)
         return _Cloud(xyz, source, of_scanner=True, dropped=dropped, notes=notes)
     points, dropped, notes = cloud_points(path, stored, None if of_integers else scale)
@@ -179,10 +199,21 @@ def _read_cloud(
     return _Cloud(points, source, of_scanner=False, dropped=dropped, notes=notes)
 
 
-def _extrinsics_warnings(
+def _extrinsics_notes(
     cloud: _Cloud, calibration: Calibration, options: ScanOptions, calib: Path, size: Size
 ) -> tuple[list[str], bool]:
-    """Lines on the pose of the scanner, and whether it seems to be inverted."""
+    """Lines on the pose of the scanner, and whether it seems to be inverted.
+
+    Args:
+        cloud: The points of the scan.
+        calibration: Calibration with the pose of the scanner.
+        options: Options with the file of the pose, if the user gives one.
+        calib: File of the calibration, for messages.
+        size: (H, W) of the image.
+
+    Raises:
+        UsageError: The pose puts next to none of the points into the image.
+    """
     lines = list[str]()
     if options.extrinsics is not None and calibration.rectification is not SAME_PLACE:
         lines.append(
@@ -197,7 +228,7 @@ def _extrinsics_warnings(
 
 
 def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occluded: bool) -> Points:
-    """The points that the image (H, W) shows.
+    """The points that the image (H, W) shows, with depth z in metres.
 
     Raises:
         NoPointsError: There is none. It names the axes of the scan by which there are some.
@@ -212,8 +243,9 @@ def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occlud
             has_scanner=cloud.of_scanner,
         )
     except NoPointsError as error:
-        inside = points_by_reading(cloud.xyz, calibration, size)
-        text, count = max(inside.items(), key=lambda reading: reading[1])
+        counts = points_by_reading(cloud.xyz, calibration, size)
+        text = max(counts, key=lambda reading: counts[reading])
+        count = counts[text]
         if not count:
             raise
         raise NoPointsError(f"{error}; {text}, {count:,} points would be in the image") from error
@@ -227,23 +259,39 @@ def _edge_warning(
     options: ScanOptions,
     rgb: NDArray[np.float32],
 ) -> list[str]:
-    """A warning if the image's edges contradict how the points are projected."""
+    """A warning if the image's edges contradict how the points are projected, else none.
+
+    Args:
+        cloud: The points of the scan.
+        points: The points that the image shows.
+        calibration: The calibration by which they are projected.
+        others: Further calibrations of the same scan, by what gives them.
+        options: Options that say whether `points` has occluded ones.
+        rgb: (H, W, 3) in 0…1, the image.
+    """
     if cloud.of_scanner:
         return fit_warning(cloud.xyz, calibration, others, rgb)
-    # From elsewhere, hidden points of a cloud would be jumps.
+    # A cloud is compared as the camera sees it: hidden points beside nearer ones would be jumps of
+    # depth.
     visible = points
     if options.keep_occluded:
         visible = _project(cloud, calibration, points.size, keep_occluded=False)
-    seen = unproject(calibration.camera, visible.xy, visible.depth)
-    return fit_warning(seen, replace(calibration, scanner=SAME_PLACE), {}, rgb, is_whole=False)
+    xyz = unproject(calibration.camera, visible.xy, visible.depth)
+    return fit_warning(xyz, replace(calibration, scanner=SAME_PLACE), {}, rgb, is_whole=False)
 
 
 def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path]:
-    """The calibration, with a pose of the scanner, and its path."""
+    """The calibration of a scan, with a pose of the scanner, and the path of the calibration.
+
+    Raises:
+        InputError: A file cannot be read.
+        UsageError: There is no calibration, or it has no pose of the scanner.
+    """
     calib = options.calib
     if calib is None and path in model_files(path.parent):
         raise UsageError(f"{path} is of a COLMAP model; name its folder, {path.parent}")
     if calib is None:
+        # A depth map of COLMAP has a scan's suffix; its first bytes tell.
         if path.suffix.lower() == ".bin":
             check_no_colmap_map(path, read_bytes(path)[:32])
         raise UsageError(
@@ -261,8 +309,8 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
     return calibration, calib
 
 
-def _of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
-    """Whether the points were measured from their origin, by the pose and by their directions."""
+def _is_of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
+    """Whether a scanner at their origin measured points (N, 3): by its pose and by their places."""
     away_m = float(np.linalg.norm(calibration.known_scanner.translation))
     return away_m <= _FARTHEST_SCANNER_M and has_scanner(stored)
 
@@ -280,32 +328,34 @@ def choose_camera(
 
     Args:
         raw: The camera of raw images and the pose of the scanner, with the rectified cameras.
-        frames: Images (H, W, 3) in 0..1, each with a scan (N, 3).
-        topic: Topic of the images, where it is known.
+        frames: Images (H, W, 3) in 0…1, each with a scan (N, 3) in the scanner's coordinates.
+        topic: Topic of the images. Empty: they are of files, or their topic is not known.
     """
+    # The candidates, of which the first is meant by the topic or by the usual meaning.
     cameras = {
         name: Calibration(camera=camera, scanner=raw.scanner and of_raw @ raw.scanner)
         for name, (camera, of_raw) in raw.rectified.items()
     }
     candidates = cameras if "image_rect" in topic else {"K and distortion": raw} | cameras
     choice = next(iter(candidates))
-    named = candidates[choice]
+    usual = candidates[choice]
     why = f"the topic {topic}" if topic else "the usual meaning of camera_info"
     # How well jumps of depth meet edges, in the mean of the frames.
     scores = list[dict[str, float]]()
-    if named.scanner is not None and len(candidates) > 1:
+    if usual.scanner is not None and len(candidates) > 1:
         for rgb, xyz in frames:
-            of_frame = _scores(xyz, rgb, named, candidates)
-            if of_frame is not None:
-                scores.append(of_frame)
+            frame_scores = _scores(xyz, rgb, usual, candidates)
+            if frame_scores is not None:
+                scores.append(frame_scores)
     if scores:
-        mean = {
-            name: float(np.mean([of_frame[name] for of_frame in scores])) for name in candidates
+        means = {
+            name: float(np.mean([frame_scores[name] for frame_scores in scores]))
+            for name in candidates
         }
-        best = max(mean, key=lambda name: mean[name])
-        if mean[best] - mean[choice] > _CLEARLY_BETTER:
+        best = max(means, key=lambda name: means[name])
+        if means[best] - means[choice] > _CLEARLY_BETTER:
             choice = best
-        compared = ", ".join(f"{name} {score:+.2f}" for name, score in mean.items())
+        compared = ", ".join(f"{name} {score:+.2f}" for name, score in means.items())
         why = f"image edges at jumps of depth: {compared}"
     images = "rectified" if choice in cameras else "raw"
     note = f"camera: {images} images, by {choice} ({why}); --calib gives another"
@@ -315,28 +365,39 @@ def choose_camera(
 def _scores(
     scan: NDArray[np.floating],
     rgb: NDArray[np.float32],
-    named: Calibration,
+    usual: Calibration,
     candidates: Mapping[str, Calibration],
 ) -> dict[str, float] | None:
-    """The score of each calibration; 0 of one that puts few of the jumps into the image.
+    """How well each calibration puts jumps of depth onto the image's edges, by its name.
 
-    None where the points tell nothing.
+    Scores are in standard deviations by chance. A calibration that puts few of the jumps into the
+    image has 0.
+
+    Args:
+        scan: (N, 3) in the scanner's coordinates.
+        rgb: (H, W, 3) in 0…1, the image.
+        usual: The calibration by which jumps of depth are found.
+        candidates: All calibrations, by name.
+
+    Returns:
+        None where the points tell nothing.
     """
-    # The jumps of depth are those that the named camera sees.
+    # The jumps of depth are those that the usual camera sees. Chance is their score at all shifts.
     size = (rgb.shape[0], rgb.shape[1])
-    jumps = jumps_of(scan, named.camera, named.known_scanner, size)
+    jumps = jumps_of(scan, usual.camera, usual.known_scanner, size)
     if jumps is None:
         return None
     edges = edge_map(rgb)
-    shifted = edges.shifted(*jumps.projected(named.camera), (_CHANCE_PX, _CHANCE_PX))
+    xy, weights = jumps.projected(usual.camera)
+    shifted = edges.shifted(xy, weights, (_CHANCE_PX, _CHANCE_PX))
     chance = float(shifted.mean())
-    spread = float(shifted.std()) + 1e-9
-    # The others project them anew.
+    spread = float(shifted.std()) + 1e-9  # above 0, of an image without edges
+    # Each candidate projects them anew.
     scores = dict.fromkeys(candidates, 0.0)
     for name, candidate in candidates.items():
-        motion = candidate.known_scanner @ named.known_scanner.inverse()
+        motion = candidate.known_scanner @ usual.known_scanner.inverse()
         xy, weights = jumps.moved(motion).projected(candidate.camera)
-        if np.count_nonzero(in_frame(xy, size)) >= _FEW_INSIDE * len(jumps.xyz):
+        if np.count_nonzero(in_frame(xy, size)) >= _LEAST_INSIDE * len(jumps.xyz):
             scores[name] = (edges.score(xy, weights) - chance) / spread
     return scores
 
@@ -344,33 +405,55 @@ def _scores(
 def check_direction(
     scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
 ) -> list[str]:
-    """Returns a warning if the inverse of the scanner's pose fits the image (H, W) better.
+    """Returns a warning if the inverse of the scanner's pose fits the image better, else none.
 
     The inverse fits better if it puts far more points into the image. It also does if it puts more
     points into it and the camera upright in the scan, which is flatter than it is wide.
 
+    Args:
+        scan: (N, 3) metres in the scanner's coordinates.
+        camera: The camera of the image.
+        scanner: The pose that is given.
+        size: (H, W) of the image.
+
     Raises:
         UsageError: The pose puts next to none of the points into the image.
     """
-    poses = (scanner, scanner.inverse())
-    inside, inverted = (len(points_in_image(pose.apply(scan), camera, size)[0]) for pose in poses)
-    upright, upright_inverted = (_is_upright(scan, pose.rotation) for pose in poses)
-    far_more = inverted >= _MORE_IF_INVERTED * max(inside, 1)
-    if upright or inverted <= inside or not (far_more or upright_inverted):
+    inverse = scanner.inverse()
+    inside = _count_in_image(scan, camera, scanner, size)
+    inside_by_inverse = _count_in_image(scan, camera, inverse, size)
+    if inside_by_inverse <= inside or _is_upright(scan, scanner.rotation):
+        return []
+    has_far_more = inside_by_inverse >= _MORE_IF_INVERTED * max(inside, 1)
+    if not has_far_more and not _is_upright(scan, inverse.rotation):
         return []
     text = (
         f"the extrinsics put {inside:,} of {len(scan):,} scan points into the image, their inverse"
-        f" {inverted:,}; if they map the camera to the scanner, give their inverse"
+        f" {inside_by_inverse:,}; if they map the camera to the scanner, give their inverse"
     )
-    if inside < _NEXT_TO_NONE * inverted:
+    if inside < _NEXT_TO_NONE * inside_by_inverse:
         raise UsageError(text)
     return [f"warning: {text}"]
 
 
-def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: Size) -> list[str]:
-    """A warning if many points (N, 3) straight ahead of the camera are outside the image."""
-    off_axis = np.hypot(seen[:, 0], seen[:, 1])
-    ahead = seen[off_axis < np.tan(np.radians(_AHEAD_DEG)) * seen[:, 2]]
+def _count_in_image(
+    scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
+) -> int:
+    """The number of points of a scan (N, 3) that a pose of it puts into the image (H, W)."""
+    xyz, _ = points_in_image(scanner.apply(scan), camera, size)
+    return len(xyz)
+
+
+def _outside_warning(xyz: NDArray[np.float64], camera: Camera, size: Size) -> list[str]:
+    """A warning if many points straight ahead of the camera are outside the image, else none.
+
+    Args:
+        xyz: (N, 3) in the camera's coordinates.
+        camera: The camera.
+        size: (H, W) of the image.
+    """
+    off_axis = np.hypot(xyz[:, 0], xyz[:, 1])
+    ahead = xyz[off_axis < np.tan(np.radians(_AHEAD_DEG)) * xyz[:, 2]]
     outside = len(ahead) - int(np.count_nonzero(in_frame(pixels_of(camera, ahead), size)))
     if outside <= _MOST_OUTSIDE * len(ahead):
         return []
@@ -381,9 +464,15 @@ def _outside_warning(seen: NDArray[np.float64], camera: Camera, size: Size) -> l
     ]
 
 
-def _height_note(seen: NDArray[np.float64]) -> list[str]:
-    """A line if a scan (N, 3), in the camera's axes, is from as high as one in feet would be."""
-    height_m = height_above_ground(seen)
+def _height_note(xyz: NDArray[np.float64]) -> list[str]:
+    """A line if a scan is from higher above the ground than vehicles are, else none.
+
+    It names the units, such as feet, by which it would be from the height of a vehicle.
+
+    Args:
+        xyz: (N, 3) from the scanner's origin, in the camera's axes: x right, y down, z forward.
+    """
+    height_m = height_above_ground(xyz)
     if height_m is None or height_m < _HIGH_M:
         return []
     low, high = _ON_VEHICLES_M
@@ -401,20 +490,36 @@ def _height_note(seen: NDArray[np.float64]) -> list[str]:
 
 
 def _other_cameras(options: ScanOptions, image: Path) -> dict[str, Calibration]:
-    """The other cameras of a calibration of several, by what gives them."""
-    found = dict[str, Calibration]()
+    """The calibrations of all cameras of a file that has several, by the option that gives them.
+
+    There is none with extrinsics that the user states, as these are of one camera.
+
+    Args:
+        options: Options with the calibration.
+        image: File of the image, for messages.
+    """
+    cameras = dict[str, Calibration]()
     if options.extrinsics is not None:
-        return found
-    for number in range(_CAMERAS):
+        return cameras
+    for number in range(_KITTI_CAMERAS):
         with suppress(UsageError):  # there is no such camera
-            text = f"with --camera {number}"
-            found[text], _ = _calibration_of(image, replace(options, camera=number))
-    return found
+            calibration, _ = _calibration_of(image, replace(options, camera=number))
+            cameras[f"with --camera {number}"] = calibration
+    return cameras
 
 
 def _is_upright(scan: NDArray[np.floating], rotation: NDArray[np.float64]) -> bool:
-    """Whether the scan has a thin direction, and that is the camera's y."""
+    """Whether a scan has a thin direction, and that is the camera's y, up or down.
+
+    A rotating scanner sees far around it and little above and below.
+
+    Args:
+        scan: (N, 3) in the scanner's coordinates.
+        rotation: (3, 3) from the scanner's axes to the camera's.
+    """
     rays = scan / np.maximum(np.linalg.norm(scan, axis=1, keepdims=True), 1e-9)
-    variances, axes = np.linalg.eigh(rays.T @ rays / len(rays))
-    is_thin = variances[0] <= _THIN * variances[1]
-    return bool(is_thin and np.argmax(np.abs(rotation @ axes[:, 0])) == 1)
+    variances, directions = np.linalg.eigh(rays.T @ rays / len(rays))  # the thinnest is the first
+    if variances[0] > _THIN * variances[1]:
+        return False
+    thinnest = rotation @ directions[:, 0]  # x, y, z of the camera
+    return int(np.argmax(np.abs(thinnest))) == 1

@@ -50,20 +50,24 @@ StoredDepth = StoredNumbers | StoredPoints
 
 
 class StatedScale(NamedTuple):
-    """What the user, or else the layout, states of the scale of a file."""
+    """The scale of a file that the user, or else the data set's layout, states."""
 
     scale: float | None
     """Numbers per metre. None: nothing is stated."""
     of_integers: str
-    """The other file of the frame, whose integers the scale is of; or that it is the data set's.
-    Empty: it is stated of this file."""
+    """Whose integers the scale is stated of, if not of this file's numbers: path of the frame's
+    other file, or `OF_DATA_SET`. Empty: it is stated of this very file."""
 
 
 def read_stored_sparse(path: Path, scan: ScanOptions) -> StoredDepth:
-    """Returns what a file of sparse depth holds.
+    """Returns what a file of sparse depth holds: numbers, or points of a scan or a COLMAP model.
 
     It is a scan by its suffix, or if it holds x y z and there is a calibration. A calibration of
-    other sparse depth is that of the camera.
+    other sparse depth is that of the camera. A folder is a COLMAP model.
+
+    Args:
+        path: The file, or the folder of a COLMAP model.
+        scan: The calibration, and what else the user and the data set state of a scan.
 
     Raises:
         InputError: The file cannot be read.
@@ -74,6 +78,7 @@ def read_stored_sparse(path: Path, scan: ScanOptions) -> StoredDepth:
     suffix = path.suffix.lower()
     if suffix in SCAN_ONLY_SUFFIXES:
         return StoredPoints(path=path, kind="scan")
+    # A list with a calibration may hold x y z; if a pose of a scanner is stated, it does.
     numbers = load_numbers(path)
     if scan.calib is not None and suffix in _LIST_SUFFIXES:
         is_stated = scan.extrinsics is not None
@@ -87,7 +92,11 @@ def read_stored_sparse(path: Path, scan: ScanOptions) -> StoredDepth:
 
 
 def read_stored_truth(path: Path, image: ImageSource | None) -> StoredDepth:
-    """Returns what a file of the ground truth of an image holds: a scan by its suffix, or a map.
+    """Returns what a file of ground truth holds: points of a scan by its suffix, or a map.
+
+    Args:
+        path: The file.
+        image: The image. None: there is none. Depth without a header has its size (ETH3D).
 
     Raises:
         InputError: The file cannot be read.
@@ -98,7 +107,7 @@ def read_stored_truth(path: Path, image: ImageSource | None) -> StoredDepth:
 
 
 def is_float(stored: StoredDepth) -> bool:
-    """Returns whether a file is a scan, or a map or list of floats."""
+    """Returns whether a file holds floats: a scan, or a map or list whose numbers are floats."""
     if isinstance(stored, StoredPoints):
         return stored.kind == "scan"
     return not holds_integers(stored.file)
@@ -107,10 +116,15 @@ def is_float(stored: StoredDepth) -> bool:
 def scale_of_sparse(
     files: FrameFiles, options: ReadOptions, truth: StoredDepth | None
 ) -> StatedScale:
-    """Returns what is stated of the scale of the sparse depth, beside this ground truth.
+    """Returns the scale that is stated of the sparse depth, and whether it is of its numbers.
 
     `--depth-scale` is of both files of a frame, but of the integers alone if one of them holds
     integers. What a layout states is of integers only.
+
+    Args:
+        files: The files of the frame, with the scales that the data set states.
+        options: Options with `--depth-scale`, which goes before.
+        truth: What the file of the ground truth holds. None: there is none.
     """
     if options.depth_scale is None:
         return _scale_of_layout(files, files.sparse_scale)
@@ -124,7 +138,13 @@ def scale_of_sparse(
 def scale_of_truth(
     files: FrameFiles, options: ReadOptions, sparse: StoredDepth | None
 ) -> StatedScale:
-    """Returns what is stated of the scale of the ground truth, beside this sparse depth."""
+    """Returns the scale that is stated of the ground truth, and whether it is of its numbers.
+
+    Args:
+        files: The files of the frame, with the scales that the data set states.
+        options: Options with `--depth-scale`, which goes before.
+        sparse: What the file of the sparse depth holds. None: there is none.
+    """
     if options.depth_scale is None:
         return _scale_of_layout(files, files.gt_scale)
     has_codes = isinstance(sparse, StoredNumbers) and holds_integers(sparse.file)
@@ -132,5 +152,10 @@ def scale_of_truth(
 
 
 def _scale_of_layout(files: FrameFiles, scale: float | None) -> StatedScale:
-    """The scale that the data set has, or that its list states of this very file."""
+    """The scale that a data set states: a list of this very file, a layout of integers only.
+
+    Args:
+        files: The files of the frame.
+        scale: Numbers per metre that the data set states of one of them. None: it states none.
+    """
     return StatedScale(scale, "" if files.scales_stated else OF_DATA_SET)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -62,3 +64,33 @@ def test_the_time_of_a_scan_may_be_that_of_its_end(tmp_path: Path) -> None:
     later = time_warning(image, scans[4])
     assert later is not None
     assert "nearer" in later
+
+
+def test_the_folder_of_depth_is_listed_once_for_all_frames_of_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = [tmp_path / f"rgb/{100 + step / 30:.6f}.png" for step in range(20)]
+    depths = [tmp_path / f"depth/{100.025 + step / 30:.6f}.png" for step in range(20)]
+    touch(*images, *depths)
+    listed = list[Path]()
+    list_folder = Path.iterdir
+
+    def counted(folder: Path) -> Iterator[Path]:
+        listed.append(folder)
+        return list_folder(folder)
+
+    monkeypatch.setattr(Path, "iterdir", counted)
+    warnings = [time_warning(image, depth) for image, depth in zip(images, depths, strict=True)]
+    assert None not in warnings
+    assert listed == [tmp_path / "depth"]
+
+
+def test_a_folder_that_grew_is_listed_again(tmp_path: Path) -> None:
+    image = tmp_path / "rgb/100.000000.png"
+    depth = tmp_path / "depth/100.070000.png"
+    touch(image, depth)
+    assert "nearer" not in str(time_warning(image, depth))
+    touch(tmp_path / "depth/100.010000.png")
+    changed_ns = depth.parent.stat().st_mtime_ns + 1_000_000_000
+    os.utime(depth.parent, ns=(changed_ns, changed_ns))
+    assert "100.010000.png is nearer" in str(time_warning(image, depth))
