@@ -62,12 +62,12 @@ def command(
     groups, else computed with random permutations.
     """
     from pnpdepth_cli.cli.printing import check_tables, print_notes, print_table, write_tables
-    from pnpdepth_cli.commands.compare import (
-        compare,
+    from pnpdepth_cli.commands.compare import compare
+    from pnpdepth_cli.commands.comparisons.comparison_plot import plot_comparison
+    from pnpdepth_cli.commands.comparisons.comparison_tables import (
         comparison_table,
         comparison_values,
         methods_table,
-        plot_comparison,
     )
 
     # All that can be wrong is found before anything is compared.
