@@ -78,10 +78,10 @@ def command(
         plot_comparison(comparison, plot, overwrite=overwrite)
     print_notes(comparison.notes)
     # The comparison, as tables and as JSON.
-    to_stdout = write_tables(
+    is_stdout_taken = write_tables(
         {csv: comparison_values(comparison).csv(), latex: methods_table(comparison).latex()}
     )
     if as_json:
         print_json(comparison.to_json())
-    elif not to_stdout:
+    elif not is_stdout_taken:
         print_table(comparison_table(comparison))

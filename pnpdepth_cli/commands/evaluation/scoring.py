@@ -144,7 +144,7 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     # The measures, also of a standard deviation in the same unit.
     scores = _measure(depth, truth, request)
     if result.sigma is not None and fit is None:
-        sigma = result.of_size(result.sigma, depth)
+        sigma = result.read_beside(result.sigma, depth)
         scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
     scores |= _counts_and_agreement(prediction.values, depth, truth, given)
     scores["factor"] = None

@@ -108,7 +108,7 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
     yield message("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", info)
     yield message("/camera/depth/image", "sensor_msgs/msg/Image", _image(unknown, "32FC1"))
     if frame.result.sigma is not None:
-        sigma = frame.result.of_size(frame.result.sigma, depth).astype(np.float32)
+        sigma = frame.result.read_beside(frame.result.sigma, depth).astype(np.float32)
         yield message("/camera/depth/sigma", "sensor_msgs/msg/Image", _image(sigma, "32FC1"))
     # The points that were used, and the cloud of the depth, in the camera's coordinates.
     points = _points_used(frame, notes)
