@@ -61,6 +61,7 @@ MAY_IMPORT = {
 IN_COMMANDS = {
     "requests": set[str](),
     "shared": {"requests"},
+    "comparisons": {"requests", "shared"},
     "evaluation": {"requests", "shared"},
     "exports": {"shared"},
     "refinement": {"requests", "shared"},

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from click.core import ParameterSource
@@ -29,12 +29,21 @@ if TYPE_CHECKING:
     from pnpdepth_cli.commands.many_frames.summary import BatchSummary
 
 DEFAULT = "default"
-"""A value that leaves the option out."""
+"""A value of `--vary` that leaves the option out."""
 _GROUPS = ("Network", "Method", "Sequences")
 """Groups of the help whose options can be varied, besides --sample."""
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*]')
 """Characters that a folder's name cannot have, on some system."""
 _STOPPING = b"\nfinishing the current frame; press Ctrl-C again to stop at once\n"
+
+
+class _Combination(NamedTuple):
+    """A value of each option that `--vary` names, for one run of a study."""
+
+    texts: dict[str, str]
+    """The values as the user wrote them, by the option's name."""
+    parameters: dict[str, object]
+    """The same as the command takes them, by its parameter's name; `default` is left out."""
 
 
 @click.command(
@@ -116,76 +125,87 @@ def command(context: click.Context, /, vary: tuple[str, ...], **values: Any) -> 
     missing or whose settings or files have changed. OUTPUT/summary.json and OUTPUT/summary.csv list
     all frames; the record NAME.json beside a result says how it was made.
     """
+    # A run for each combination of varied values; one run if nothing is varied.
     requests = [
-        _request_of(values | varied, folder, texts)
-        for folder, (texts, varied) in _combinations(context, vary).items()
+        _request_of(values | combination.parameters, folder, combination.texts)
+        for folder, combination in _combinations(context, vary).items()
     ]
     summaries: list[BatchSummary] = []
-    said = set[str]()
-    with _finishing_on_interrupt() as pressed:
+    printed = set[str]()
+    with _finishing_on_interrupt() as is_interrupted:
         for number, request in enumerate(requests, start=1):
             if len(requests) > 1:
                 say(f"run {number:,} of {len(requests):,}: {request.output.name}")
-            summary, stopped = _run(request, pressed, said)
+            summary, is_stopped = _run(request, is_interrupted, printed)
             summaries.append(summary)
-            if stopped or pressed():
+            if is_stopped or is_interrupted():
                 break
-    if stopped or len(summaries) < len(requests):
+    # The exit code: interrupted, some frames failed, or done.
+    if is_stopped or len(summaries) < len(requests):
         raise click.exceptions.Exit(INTERRUPTED)
     counts = sum((Counter(summary.counts) for summary in summaries), Counter[str]())
-    if bad := counts["chosen_not_done"]:
+    not_done = counts["chosen_not_done"]
+    if not_done:
         from pnpdepth_cli.commands.shared.tables import count_of
 
         raise FramesFailedError(
-            f"{bad:,} of {count_of(counts['chosen'], 'frame')} failed or diverged; the reasons are"
-            f" in {values['output']}{'/*' if vary else ''}/summary.csv"
+            f"{not_done:,} of {count_of(counts['chosen'], 'frame')} failed or diverged; the reasons"
+            f" are in {values['output']}{'/*' if vary else ''}/summary.csv"
         )
 
 
 def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> BatchRequest:
-    """Returns the request of these options, some varied, with the frames of a bag unpacked.
+    """Returns the request of a run, with the frames of a bag unpacked.
 
-    The folder, below the output, is that of the results.
+    Args:
+        values: Values of all parameters of the command but `vary`; they are taken out of it.
+        folder: Name of the run's own folder below the output and the report; empty without
+            `--vary`, so that these folders themselves are its.
+        varied: Values that `--vary` gives the run's options, as the user wrote them.
     """
-    own = options.take_options(BatchRequest, values)
-    own |= {name: values.pop(name) for name in ("source", "output")}
-    request = BatchRequest(refine=options.request_of(values), varied=varied, **own)
+    of_batch = options.take_options(BatchRequest, values)
+    of_batch |= {name: values.pop(name) for name in ("source", "output")}
+    request = BatchRequest(refine=options.request_of(values), varied=varied, **of_batch)
     if request.is_of_bag:
         # Imported where it is used: what writes frames takes 90 ms.
         from pnpdepth_cli.commands.frames import unpack
 
         request = unpack(request, say)
-    html = request.html and request.html / folder
+    html = None if request.html is None else request.html / folder
     return replace(request, output=request.output / folder, html=html)
 
 
 def _run(
-    request: BatchRequest, pressed: Callable[[], bool], said: set[str]
+    request: BatchRequest, is_interrupted: Callable[[], bool], printed: set[str]
 ) -> tuple[BatchSummary, bool]:
-    """Returns the batch's summary, which it prints, and whether the batch was stopped.
+    """Returns the batch's summary, which it prints, and whether frames are left, as it was stopped.
 
-    Notes that an earlier run of the study printed, which are in `said`, are not printed again.
+    Args:
+        request: The batch.
+        is_interrupted: Function that is asked before each frame whether the batch is to stop.
+        printed: Notes that earlier runs of the study printed, and that are not printed again;
+            gets those of this run.
     """
     from pnpdepth_cli.cli.printing import print_batch
     from pnpdepth_cli.commands.batch import run_batch
     from pnpdepth_cli.commands.shared.tables import count_of
 
     def say_once(line: str) -> None:
-        if line not in said:
+        if line not in printed:
             say_above_bar(line)
-        said.add(line)
+        printed.add(line)
 
     with progress_bar("batch", "frame") as show:
-        listener = Listener(say_once, show, pressed)
+        listener = Listener(say_once, show, is_interrupted)
         summary = run_batch(request, listener)
-    print_batch(summary, said)
+    print_batch(summary, printed)
     if request.html is not None:
         say(f"wrote {request.html / 'index.html'}")
-    stopped = listener.done < listener.to_do
-    if stopped:
+    is_stopped = listener.done < listener.to_do
+    if is_stopped:
         count = f"{listener.done:,} of {count_of(listener.to_do, 'frame')}"
         say(f"stopped after {count}; run the same command to continue")
-    return summary, stopped
+    return summary, is_stopped
 
 
 @contextmanager
@@ -194,62 +214,76 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
     pressed = threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
+        """Notes the first signal; the next one ends the command."""
         if pressed.is_set():
             raise KeyboardInterrupt
         pressed.set()
+        # File descriptor 2 is stderr. Python's own stderr is buffered, and may be in use now. Where
+        # it is closed, nobody reads the line.
         with suppress(OSError):
-            os.write(2, _STOPPING)  # not through the buffered stderr, which may be in use
+            os.write(2, _STOPPING)
 
-    before = signal.signal(signal.SIGINT, handle)
+    previous = signal.signal(signal.SIGINT, handle)
     try:
         yield pressed.is_set
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
 
 
-def _combinations(
-    context: click.Context, varied: Sequence[str]
-) -> dict[str, tuple[dict[str, str], dict[str, object]]]:
-    """The values of all combinations of `--vary`, by the folder of the results.
+def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _Combination]:
+    """The combinations of the values of `--vary`, by the name of their folder.
 
-    They are as the user wrote them, by the option's name, and by the command's parameter.
+    Without `--vary` there is one: of no values, with an empty name. Combinations that give the same
+    result, as they differ in what has no effect, are one.
+
+    Args:
+        context: Context of the command.
+        varied: Texts NAME=VALUE,VALUE,… of one option each.
+
+    Raises:
+        UsageError: An option cannot be varied, a value is none of it, or one comes twice.
     """
+    # The options, and the values of each.
     varying = [_option(context, text.partition("=")[0]) for text in varied]
     axes = [text.partition("=")[2].split(",") for text in varied]
     if any("" in axis for axis in axes):
         raise UsageError("--vary must be NAME=VALUE,VALUE with no value empty")
     if any(len({*axis}) < len(axis) for axis in axes) or len({*varying}) < len(varying):
         raise UsageError("--vary: an option or a value comes twice; leave one out")
-    combinations = dict[str, tuple[dict[str, str], dict[str, object]]]()
+    # Every value of each with every value of the others.
+    names = [option.opts[-1].removeprefix("--") for option in varying]
+    combinations = dict[str, _Combination]()
     for words in itertools.product(*axes):
-        texts = dict[str, str]()
-        values = dict[str, object]()
-        names = [option.opts[-1].removeprefix("--") for option in varying]
-        without_updates = dict(zip(names, words, strict=True)).get("iterations") == "0"
-        for name, option, word in zip(names, varying, words, strict=True):
-            # Without updates of z, runs that differ in these are one.
-            if without_updates and name in OF_UPDATES:
-                continue
-            texts[name] = word
-            if word != DEFAULT:
-                taken = (word,) if option.multiple else word
-                values[str(option.name)] = option.type_cast_value(context, taken)
-        folder = ",".join(f"{n}={_NOT_IN_NAMES.sub('-', text)}" for n, text in texts.items())
-        if combinations.get(folder, (texts, values)) != (texts, values):
+        texts = dict(zip(names, words, strict=True))
+        # Without updates of z, runs that differ in their settings are one.
+        if texts.get("iterations") == "0":
+            texts = {name: word for name, word in texts.items() if name not in OF_UPDATES}
+        parameters = dict[str, object]()
+        for name, option in zip(names, varying, strict=True):
+            if texts.get(name, DEFAULT) != DEFAULT:
+                value = (texts[name],) if option.multiple else texts[name]
+                parameters[str(option.name)] = option.type_cast_value(context, value)
+        combination = _Combination(texts, parameters)
+        folder = ",".join(f"{name}={_NOT_IN_NAMES.sub('-', word)}" for name, word in texts.items())
+        if combinations.get(folder, combination) != combination:
             raise UsageError(f"--vary: two values have the folder {folder}; leave one out")
-        combinations[folder] = texts, values
+        combinations[folder] = combination
     return combinations
 
 
 def _option(context: click.Context, name: str) -> click.Option:
-    """The option that can be varied by this name."""
+    """The option of this name, without its dashes.
+
+    Raises:
+        UsageError: It cannot be varied, or is given besides.
+    """
     command = context.command
     assert isinstance(command, options.GroupedCommand)
     flags = ["--sample", *(flag for group in _GROUPS for flag in command.groups[group])]
     if f"--{name}" not in flags:
-        known = ", ".join(flag.removeprefix("--") for flag in flags)
-        raise UsageError(f"--vary {name}: choose from {known}")
-    option = next(found for found in command.params if found.opts[-1] == f"--{name}")
+        names = ", ".join(flag.removeprefix("--") for flag in flags)
+        raise UsageError(f"--vary {name}: choose from {names}")
+    option = next(parameter for parameter in command.params if parameter.opts[-1] == f"--{name}")
     assert isinstance(option, click.Option)
     if context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE:
         raise UsageError(f"--{name} is varied; leave it out besides")

@@ -62,12 +62,12 @@ def command(
     groups, else computed with random permutations.
     """
     from pnpdepth_cli.cli.printing import check_tables, print_notes, print_table, write_tables
-    from pnpdepth_cli.commands.compare import (
-        compare,
+    from pnpdepth_cli.commands.compare import compare
+    from pnpdepth_cli.commands.comparisons.comparison_plot import plot_comparison
+    from pnpdepth_cli.commands.comparisons.comparison_tables import (
         comparison_table,
         comparison_values,
         methods_table,
-        plot_comparison,
     )
 
     # All that can be wrong is found before anything is compared.
@@ -78,10 +78,10 @@ def command(
         plot_comparison(comparison, plot, overwrite=overwrite)
     print_notes(comparison.notes)
     # The comparison, as tables and as JSON.
-    to_stdout = write_tables(
+    is_stdout_taken = write_tables(
         {csv: comparison_values(comparison).csv(), latex: methods_table(comparison).latex()}
     )
     if as_json:
         print_json(comparison.to_json())
-    elif not to_stdout:
+    elif not is_stdout_taken:
         print_table(comparison_table(comparison))

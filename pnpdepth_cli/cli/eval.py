@@ -82,11 +82,12 @@ def command(
     with progress_bar("eval", "frame") as show:
         evaluation = evaluate(request, on_frame=show)
     print_notes([f"protocol {request.describe()}", *evaluation.notes])
-    to_stdout = write_tables({csv: frames_table(evaluation).csv()})
+    is_stdout_taken = write_tables({csv: frames_table(evaluation).csv()})
     if as_json:
         print_json(evaluation.to_json())
-    elif not to_stdout:
+    elif not is_stdout_taken:
         print_table(means_table(evaluation))
     frames = evaluation.counts["frames"]
-    if failed := frames - evaluation.counts["scored"]:
-        raise FramesFailedError(f"{failed:,} of {frames:,} frames were not scored")
+    unscored = frames - evaluation.counts["scored"]
+    if unscored:
+        raise FramesFailedError(f"{unscored:,} of {frames:,} frames were not scored")

@@ -43,9 +43,13 @@ def command(model: str, checkpoint: Path | None, every: bool, as_json: bool) -> 
 
 
 def _cells(layer: MeasuredLayer) -> tuple[str, ...]:
+    """The texts of a layer's row: – for what there is not, a problem in the last column."""
     if layer.problem is not None:
-        return (layer.name, "–", *[""] * 3, layer.problem.partition(": ")[2] or layer.problem)
-    in_z, in_depth = layer.field_in_z, layer.field_in_output
+        # The message begins with the layer's name and a colon, where it has one.
+        reason = layer.problem.partition(": ")[2] or layer.problem
+        return (layer.name, "–", "", "", "", reason)
+    in_z = layer.field_in_z
+    in_depth = layer.field_in_output
     return (
         layer.name,
         "×".join(map(str, layer.shape or ())),

@@ -27,10 +27,11 @@ layer or checkpoint · 5 refinement diverged · 6 device or memory · 7 some fra
 130 interrupted. Networks in .py files are code and are run."""
 
 _TRIM_THRESHOLD = -1
+"""Parameter of mallopt, as in malloc.h: free bytes at the end of the heap that stay there."""
 _MMAP_MAX = -4
-"""Parameters of mallopt, as in malloc.h."""
+"""Parameter of mallopt, as in malloc.h: how many large blocks may lie outside of the heap."""
 _KEPT_BYTES = 1 << 30
-"""Free bytes at the end of the heap that are not given back."""
+"""Free bytes at the end of the heap that are not given back: 1 GiB."""
 
 _LONGEST = 2000
 """Most characters of a message; a longer one loses its middle."""
@@ -122,7 +123,11 @@ def _let_idle_threads_sleep() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Returns the exit code. Every error becomes one line on stderr, a bug its traceback too."""
+    """Returns the exit code. Every error becomes one line on stderr, a bug its traceback too.
+
+    Args:
+        arguments: Words of the command line behind `pnpdepth`.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
@@ -141,9 +146,11 @@ def run(arguments: list[str]) -> int:
         return _end("interrupted", INTERRUPTED)
     except OSError as error:
         reason = error.strerror or str(error)
-        full = error.errno in _OUTPUT_ERRORS
-        named = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-        return _end(named + reason, (errors.OutputError if full else errors.InputError).exit_code)
+        if error.filename is not None:
+            reason = f"{os.fsdecode(error.filename)}: {reason}"
+        is_of_output = error.errno in _OUTPUT_ERRORS
+        ours = errors.OutputError if is_of_output else errors.InputError
+        return _end(reason, ours.exit_code)
     except Exception as error:
         if errors.is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)
@@ -160,7 +167,8 @@ def _end(message: object, code: int) -> int:
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:  # it is full
+    # Nothing more can be written there, and Python must not try it again when it ends.
+    except OSError:
         sys.stdout = None
     text = printable(message)
     if len(text) > _LONGEST:

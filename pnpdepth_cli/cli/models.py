@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
@@ -32,16 +33,20 @@ def command(context: click.Context, as_json: bool) -> None:
     from pnpdepth_cli.commands.shared.tables import Table
 
     columns = ("name", "takes", "size", "gives", "params", "weights", "defaults")
-    rows = [
-        (
-            *(network[key] for key in ("name", "input_kind", "size", "output_kind")),
-            f"{network['parameters']:,}",
-            "shipped" if network["checkpoint"] else "yours",
-            "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}".format(**network),
-        )
-        for network in listed
-    ]
-    print_table(Table(title="networks", columns=columns, rows=rows))
+    print_table(Table(title="networks", columns=columns, rows=[*map(_cells, listed)]))
+
+
+def _cells(network: Mapping[str, object]) -> tuple[object, ...]:
+    """The row of a network, of its values by `list_models`; weights are shipped or the user's."""
+    return (
+        network["name"],
+        network["input_kind"],
+        network["size"],
+        network["output_kind"],
+        f"{network['parameters']:,}",
+        "shipped" if network["checkpoint"] else "yours",
+        "layer {layer}, K {iterations}, lr {lr}, {loss}, {update}".format(**network),
+    )
 
 
 @command.command("check", short_help="Load a network, run it and cut it at its layers.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,8 @@ class _File(click.Path):
 
 
 FILE = _File(path_type=Path)
-_WITHOUT = (None, False, 0, math.inf)
-"""Defaults that are no value to show."""
+_NOT_SHOWN = (None, False, 0, math.inf)
+"""Defaults that the help does not show: nothing, off, or no limit."""
 _NAME_COLUMN = 22
 """Characters of the column of names in the help."""
 NETWORK = ("--model", "--checkpoint", "--normalise", "--device")
@@ -41,13 +40,13 @@ Decorator = Callable[[Command], Command]
 
 def click_option(declared: Field[Any]) -> Decorator:
     """Returns the click option of a field that `pnpdepth_cli.settings.option` made."""
-    default = declared.default
-    details = {"type": _type_of(declared), "default": default, **declared.metadata}
-    for ours in ("flag", "choices", "least", "most"):
-        details.pop(ours, None)
+    details = {"type": _type_of(declared), "default": declared.default, **declared.metadata}
+    # Entries of the field's metadata that are no arguments of click.
+    for name in ("flag", "choices", "least", "most"):
+        details.pop(name, None)
     if declared.type == "bool":
         details["is_flag"] = True
-    details.setdefault("show_default", default not in _WITHOUT)
+    details.setdefault("show_default", declared.default not in _NOT_SHOWN)
     return click.option(flag_of(declared), declared.name, **details)
 
 
@@ -64,20 +63,37 @@ class _Names(click.Choice):  # type: ignore[type-arg]
 
 
 def _type_of(declared: Field[Any]) -> Any:
-    limits = declared.metadata.get("least"), declared.metadata.get("most")
+    """What click makes of the option's text: names, a number in its limits, or the field's type.
+
+    None leaves the type to click; the option then states its own, or is a text.
+    """
     if "choices" in declared.metadata:
         return _Names(declared.metadata["choices"])
-    if limits != (None, None):
-        return click.IntRange(*limits)
-    pairs = {"tuple[float, float]": (float, float), "tuple[int, int]": (int, int)}
-    plain = {"int": int, "float": float, "str": str, "bool": bool, "Path": FILE}
-    # Of several types the last, as in `float | str | None`.
-    named = str(declared.type).removesuffix(" | None").rpartition(" | ")[2]
-    return (pairs | plain).get(named)
+    least = declared.metadata.get("least")
+    most = declared.metadata.get("most")
+    if least is not None or most is not None:
+        return click.IntRange(least, most)
+    types = {
+        "int": int,
+        "float": float,
+        "str": str,
+        "bool": bool,
+        "Path": FILE,
+        "tuple[float, float]": (float, float),
+        "tuple[int, int]": (int, int),
+    }
+    # Of several types the last but None, as in `float | str | None`; a text can hold each of them.
+    name = str(declared.type).removesuffix(" | None").rpartition(" | ")[2]
+    return types.get(name)
 
 
 def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator:
-    """Returns a decorator that adds the options of dataclasses, but those of some fields."""
+    """Returns a decorator of a command that adds the options of dataclasses.
+
+    Args:
+        groups: Dataclasses with fields that `pnpdepth_cli.settings.option` made.
+        without: Names of fields whose options are left out.
+    """
 
     def decorate(command: Command) -> Command:
         declared = [field for group in groups for field in options_of(group)]
@@ -90,10 +106,15 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
 
 
 def refinement(*, without: Collection[str] = ()) -> Decorator:
-    """Returns a decorator that adds the options of a `RefineRequest`, but those of some fields."""
+    """Returns a decorator of a command that adds all options of a refinement.
+
+    Args:
+        without: Names of fields, of `RefineRequest` and its groups, whose options are left out.
+    """
     groups = (ScanOptions, ReadOptions, Settings, RefineRequest)
 
     def decorate(command: Command) -> Command:
+        # --model may be given several times here, for which it has an option of its own.
         return models(options_of_groups(*groups, without=["model", *without])(command))
 
     return decorate
@@ -143,17 +164,27 @@ def sparse_files(command: Command) -> Command:
 
 
 def take_options(group: type, values: dict[str, Any]) -> dict[str, Any]:
-    """Returns the options of this group by name; they are removed from `values`."""
+    """Returns the values of a group's options by their field; they are removed from `values`.
+
+    Args:
+        group: Dataclass with fields that `pnpdepth_cli.settings.option` made.
+        values: Values of a command's parameters by their name.
+    """
     names = [field.name for field in options_of(group)]
     return {name: values.pop(name) for name in names if name in values}
 
 
-def request_of(values: dict[str, Any], **others: Any) -> RefineRequest:
-    """Returns the request of the options of `refinement`, some of which are removed, and others."""
+def request_of(values: dict[str, Any]) -> RefineRequest:
+    """Returns the request of a command with the options of `refinement`.
+
+    Args:
+        values: Values of the command's parameters by their name, all of them fields of the request
+            or its groups; those of scans and networks are removed.
+    """
     scan = ScanOptions(**take_options(ScanOptions, values))
     first, *more = values.pop("model")
     models = {"model": first, "more_models": tuple(more)}
-    return RefineRequest().with_fields(scan=scan, **models, **values, **others)
+    return RefineRequest().with_fields(scan=scan, **models, **values)
 
 
 class GroupedCommand(click.Command):
@@ -185,7 +216,10 @@ class GroupedCommand(click.Command):
                 return [member]
             return [flag for flag in map(flag_of, options_of(member)) if flag not in named]
 
-        self.groups = {title: [*chain(*map(flags, of))] for title, of in groups.items()}
+        self.groups = {
+            title: [flag for member in members for flag in flags(member)]
+            for title, members in groups.items()
+        }
         self.common = {*common, *_HELP}
         self.params.append(
             click.Option(
@@ -199,18 +233,29 @@ class GroupedCommand(click.Command):
         )
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Writes one section per group."""
-        options = {o.opts[-1]: o for o in self.get_params(ctx) if isinstance(o, click.Option)}
-        shown = options if ctx.meta.get(_SHOW_ALL) else self.common & {*options}
-        for title, names in {**self.groups, "Help": _HELP}.items():
-            records = [options[name].get_help_record(ctx) for name in names if name in shown]
-            if rows := [record for record in records if record is not None]:
+        """Writes a section for each group, with the options that are shown."""
+        parameters = self.get_params(ctx)
+        options = {
+            parameter.opts[-1]: parameter  # by the long name
+            for parameter in parameters
+            if isinstance(parameter, click.Option)
+        }
+        is_all_shown = bool(ctx.meta.get(_SHOW_ALL))
+        for title, flags in {**self.groups, "Help": _HELP}.items():
+            records = [
+                options[flag].get_help_record(ctx)
+                for flag in flags
+                if flag in options and (is_all_shown or flag in self.common)
+            ]
+            rows = [record for record in records if record is not None]  # None: a hidden option
+            if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows, col_max=_NAME_COLUMN)
 
 
 def _show_all(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    if value and not context.resilient_parsing:
+    """Prints the help with all options and ends the command; click's callback of --help-all."""
+    if value and not context.resilient_parsing:  # click parses so for completion, which is silent
         context.meta[_SHOW_ALL] = True
         click.echo(context.get_help(), color=context.color)
         context.exit()

@@ -30,12 +30,24 @@ _WIDE = 1000
 _NAMED = 3
 """Names of frames that are listed with a warning or note."""
 _COLOURS = {"": "", "bold": "bold", "dim": "dim", "good": "green", "bad": "red"}
+"""rich's style of each style of a cell."""
 
 
 def check_tables(
     *named: Path | None, inputs: Sequence[Path], overwrite: bool, as_json: bool
 ) -> None:
-    """Raises UsageError or OutputError for files of tables, or `-`, that cannot be written."""
+    """Raises an error for files of tables that cannot be written.
+
+    Args:
+        named: Files that the user named for --csv and --latex; `-` is stdout, None was not named.
+        inputs: Files that are read, which no table may replace.
+        overwrite: Whether existing files may be replaced.
+        as_json: Whether JSON goes to stdout.
+
+    Raises:
+        UsageError: Two of them go to stdout, or to one file.
+        OutputError: A file exists and may not be replaced, is an input, or lies in no folder.
+    """
     files = [path for path in named if path not in (None, _STDOUT)]
     if named.count(_STDOUT) + as_json > 1:
         raise UsageError("only one of --json, --csv - and --latex - can go to stdout")
@@ -45,7 +57,11 @@ def check_tables(
 
 
 def write_tables(texts: Mapping[Path | None, str]) -> bool:
-    """Writes each text to its file, if that is named. Returns whether one went to stdout."""
+    """Writes the texts. Returns whether one went to stdout.
+
+    Args:
+        texts: Texts by the file to write; `-` is stdout, and the text of None is not written.
+    """
     for path, text in texts.items():
         if path == _STDOUT:
             click.echo(text.encode("utf-8", "backslashreplace"), nl=False)
@@ -90,15 +106,17 @@ def print_refinement(record: FrameRecord) -> None:
     if result.improved_fraction is not None:
         where = "scored pixels" if GT in record.errors else "held-out points"
         say(f"improved: {result.improved_fraction:.1%} of the {where}")
-    # Updates, times and files.
-    parts = [_times(result.seconds)]
-    parts.append(f"peak {result.peak_memory_mb['process']:,.0f} MB")
-    updates = len(result.loss) - 1
+    # Updates, times and memory, on one line.
+    facts = []
+    updates = len(result.loss) - 1  # the first loss is that before any update
     if updates > 0:
         settings = result.settings
         how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
-        parts.insert(0, f"{tables.count_of(updates, 'update')} of z ({how})")
-    say(" · ".join(parts))
+        facts.append(f"{tables.count_of(updates, 'update')} of z ({how})")
+    facts.append(_times(result.seconds))
+    facts.append(f"peak {result.peak_memory_mb['process']:,.0f} MB")
+    say(" · ".join(facts))
+    # The files.
     say(f"wrote {'  '.join(result.outputs.values())}")
     if result.depth_scale is not None:
         say(
@@ -107,16 +125,21 @@ def print_refinement(record: FrameRecord) -> None:
 
 
 def _times(seconds: Mapping[str, float]) -> str:
-    """Such as `read 0.04 s, load network 4.10 s (import 2.02, weights 0.61, layer 0.90)`."""
+    """The times as `read 0.04 s, load network 4.10 s (import 2.02, weights 0.61, layer 0.90)`.
+
+    Args:
+        seconds: Seconds by stage, and by `STAGE: PART` those of a part of a stage.
+    """
     texts = []
     for stage, spent in seconds.items():
-        if ": " in stage:  # a part of another
+        if ": " in stage:  # a part, which stands in the brackets of its stage
             continue
         text = f"{stage} {spent:.2f} s"
+        beginning = f"{stage}: "
         parts = [
-            f"{name.partition(': ')[2]} {spent_on:.2f}"
+            f"{name.removeprefix(beginning)} {spent_on:.2f}"
             for name, spent_on in seconds.items()
-            if name.startswith(f"{stage}: ")
+            if name.startswith(beginning)
         ]
         if parts:
             text += f" ({', '.join(parts)})"
@@ -124,35 +147,40 @@ def _times(seconds: Mapping[str, float]) -> str:
     return ", ".join(texts)
 
 
-def print_batch(summary: BatchSummary, said: set[str]) -> None:
+def print_batch(summary: BatchSummary, printed: set[str]) -> None:
     """Prints the end of `pnpdepth batch`: mean errors before and after, counts, files.
 
-    Notes that are in `said` are not printed again; those that are printed are added to it.
+    Args:
+        summary: The batch's summary.
+        printed: Notes that were printed before, and are not printed again; gets those of this
+            batch.
     """
     counts = summary.counts
     for table in tables.means_tables(summary.errors, summary.unit, summary.titles, summary.columns):
         print_table(table, err=True)
-    print_notes([note for note in summary.notes if note not in said])
-    said.update(summary.notes)
+    print_notes([note for note in summary.notes if note not in printed])
+    printed.update(summary.notes)
     # Counts of frames.
-    parts = [f"{counts['done']:,} of {tables.count_of(counts['frames'], 'frame')} done"]
-    for kind in ("diverged", "failed", "pending", "with_warnings"):
-        if counts[kind]:
-            parts.append(f"{counts[kind]:,} {kind.replace('_', ' ')}")
+    texts = [f"{counts['done']:,} of {tables.count_of(counts['frames'], 'frame')} done"]
+    for status in ("diverged", "failed", "pending", "with_warnings"):
+        if counts[status]:
+            texts.append(f"{counts[status]:,} {status.replace('_', ' ')}")
     if counts["compared"]:
         worse = f"{counts['worse']:,} of {counts['compared']:,}"
-        parts.append(f"{worse} worse than linear interpolation")
-    say(", ".join(parts))
-    # Warnings and notes of several frames, each once, weights and files.
+        texts.append(f"{worse} worse than linear interpolation")
+    say(", ".join(texts))
+    # A warning or note of several frames is one line, which names the first of them.
     for note, names in summary.frame_notes.items():
-        first = ", ".join(tables.short_names(names[:_NAMED]))
-        first += ", …" if len(names) > _NAMED else ""
+        some = ", ".join(tables.short_names(names[:_NAMED]))
+        if len(names) > _NAMED:
+            some += ", …"
         kind = "warning" if note.startswith("warning") else "note"
         count = tables.count_of(len(names), "frame")
-        line = f"{kind} in {count} ({first}): {note.removeprefix(f'{kind}: ')}"
-        if line not in said:
+        line = f"{kind} in {count} ({some}): {note.removeprefix(f'{kind}: ')}"
+        if line not in printed:
             say(line)
-        said.add(line)
+        printed.add(line)
+    # Weights and files.
     if summary.weights:
         say(f"mean weights in the result: {tables.mean_weights_text(summary.weights)}")
     say(f"wrote {summary.output}/summary.json  {summary.output}/summary.csv")

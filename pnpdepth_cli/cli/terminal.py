@@ -19,10 +19,11 @@ from pnpdepth_cli.settings import Settings, flag_of, options_of
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-_SETTING = re.compile(r"`(\w+)`")
+_IN_BACKTICKS = re.compile(r"`(\w+)`")
 _FLAGS = {
     field.name: flag_of(field) for field in (*options_of(Settings), *options_of(RefineRequest))
 }
+"""How the command line spells each setting."""
 _LINE_EVERY_S = 60.0
 """Seconds between lines of progress where there is no terminal."""
 _SHOWN_AFTER_S = 1.0
@@ -36,10 +37,12 @@ def printable(text: object) -> str:
 
     Messages that the Python API shares have the names of settings in backticks.
     """
-    text = _SETTING.sub(lambda found: _FLAGS.get(found[1], found[0]), str(text))
-    return "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
-    )
+    spelt = _IN_BACKTICKS.sub(lambda match: _FLAGS.get(match[1], match[0]), str(text))
+    characters = [
+        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+        for character in spelt
+    ]
+    return "".join(characters)
 
 
 def say(text: object) -> None:
@@ -58,6 +61,10 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Yields `show(done, total)`, which draws a bar for work of more than a second.
 
     Not on a terminal, it prints a line per minute. The time counts from the first call of `show`.
+
+    Args:
+        title: Name of the work, in front of the bar.
+        unit: Noun of what is counted, such as `frame`.
     """
     bar: tqdm[None] | None = None
     began = printed_at = 0.0
@@ -71,9 +78,14 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         if bar is None:
             tqdm.monitor_interval = 0  # without its thread, image libraries can be silenced
             bar = tqdm(
-                desc=title, unit=unit, total=total, disable=None, dynamic_ncols=True, leave=False,
+                desc=title,
+                unit=unit,
+                total=total,
+                disable=None,  # draws nothing where stderr is no terminal
+                dynamic_ncols=True,
+                leave=False,  # the bar is gone at the end, and its line is free
                 delay=_SHOWN_AFTER_S,
-            )  # fmt: skip
+            )
             began = printed_at = now
         # Where there is no terminal, a line now and then.
         if bar.disable and done and now - printed_at >= _LINE_EVERY_S:

@@ -178,7 +178,7 @@ def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArr
                 f"{frame.depth} has no standard deviation beside it; --max-sigma needs the file"
                 " that `pnpdepth refine --uncertainty` writes"
             )
-        keep &= frame.of_size(frame.sigma, depth) <= request.max_sigma * depth
+        keep &= frame.read_beside(frame.sigma, depth) <= request.max_sigma * depth
     return np.where(keep, depth, np.float32(0))
 
 

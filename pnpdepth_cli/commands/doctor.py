@@ -29,7 +29,7 @@ def examine(*, clear_cache: bool = False) -> dict[str, list[str]]:
         clear_cache: Whether what was decided about networks in earlier runs is forgotten first.
 
     Raises:
-        OutputError: That is not allowed.
+        OutputError: The files of what was decided cannot be removed.
     """
     if clear_cache:
         decisions.forget()
@@ -46,7 +46,8 @@ def examine(*, clear_cache: bool = False) -> dict[str, list[str]]:
 
 
 def _packages() -> Iterator[str]:
-    """The required packages, and those of each extra, with their versions."""
+    """Yields a text for each required package and each of an extra, with its version."""
+    # A line of the package's metadata is such as `rosbags>=0.10; extra == "ros"`.
     for line in metadata.requires("pnpdepth") or []:
         name = re.split(r"[^\w.-]", line)[0]
         extra = re.search(r"extra == ['\"]([\w-]+)", line)
@@ -60,6 +61,7 @@ def _packages() -> Iterator[str]:
 
 
 def _devices() -> list[str]:
+    """A text for the processor, and for each GPU of CUDA."""
     capability = torch.backends.cpu.get_cpu_capability()
     cpu = f"cpu: {torch.get_num_threads()} threads, {capability}"
     numbers = range(torch.cuda.device_count())
@@ -67,20 +69,23 @@ def _devices() -> list[str]:
 
 
 def _cache() -> str:
-    """What was decided about networks, and is kept for the next run."""
+    """How much is kept of what was decided about networks, for the next run."""
     files = decisions.kept_files()
     size = sum(path.stat().st_size for path in files)
     return f"decisions about {count_of(len(files), 'network')}, {size / 1000:.1f} kB"
 
 
 def _self_test() -> str:
-    """Refines a slanted plane with `compact`. Returns what came out."""
+    """Refines a slanted plane with `compact`; returns whether it passed, the time and the error."""
+    # A plane 2 to 4 m away, of whose pixels a hundredth is measured; its image shows the depth.
     y, x = np.mgrid[:96, :128]
     depth = (2 + x / 100 + y / 200).astype(np.float32)
-    known = np.random.default_rng(0).random(depth.shape) < 0.01
+    is_measured = np.random.default_rng(0).random(depth.shape) < 0.01
     rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=2)
+    # Its refinement, and the error.
     start = time.perf_counter()
-    refined = pnpdepth_cli.refine(pnpdepth_cli.load_network("compact"), rgb, depth * known)
+    network = pnpdepth_cli.load_network("compact")
+    refined = pnpdepth_cli.refine(network, rgb, depth * is_measured)
     seconds = time.perf_counter() - start
     error = float(np.abs(refined.depth - depth).mean())
     verdict = "passed" if error < _WRONG_M else "FAILED: the depth is wrong"

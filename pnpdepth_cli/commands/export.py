@@ -13,11 +13,15 @@ from pnpdepth_cli.commands.exports import Export, ExportFrame
 from pnpdepth_cli.commands.requests import check_outputs
 from pnpdepth_cli.commands.shared.results import ResultFrame, result_frames
 from pnpdepth_cli.commands.shared.tables import count_of
-from pnpdepth_cli.dataset.frame_files import name_problem
+from pnpdepth_cli.dataset.frame_files import ImageSource, name_problem
 from pnpdepth_cli.errors import InputError, OutputError
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
 from pnpdepth_cli.io.rgb import sizes_of
 from pnpdepth_cli.points import MODEL_UNITS
+
+_LEAST_SCALE = 1e-9
+_LARGEST_SCALE = 1e9
+"""Units of depth per unit of a COLMAP model, outside of which no real one is."""
 
 
 def export_results(
@@ -29,7 +33,7 @@ def export_results(
     unknown: str = "keep",
     show: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[str, list[str]]:
-    """Writes the files; returns what they hold in words, and notes, lines for a person.
+    """Writes the files of a program; returns what they hold in words, and lines for a person.
 
     Args:
         results: A folder that `refine` or `batch` wrote, or a depth file in it.
@@ -46,13 +50,19 @@ def export_results(
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder")
     # The results, all in one unit.
-    found = [_frame(result, export, output) for result in result_frames(results)]
-    frames = [replace(frame, unknown=unknown) for frame in found]
-    units = sorted({f"{f.result.record.unit} (unit-scale {f.unit_scale:g})" for f in frames})
+    frames = [
+        replace(_frame(result, export, output), unknown=unknown)
+        for result in result_frames(results)
+    ]
+    units = sorted(
+        {f"{frame.result.record.unit} (unit-scale {frame.unit_scale:g})" for frame in frames}
+    )
     if len(units) > 1:
         raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
-    # Files of different names, none of which is there.
-    copied = [f for f in frames if export.copies_images and f.image_path != f.image]
+    # Files of different names, none of which is there. Images in the folder stay where they are.
+    copied = list[ExportFrame]()
+    if export.copies_images:
+        copied = [frame for frame in frames if frame.image_path != frame.image]
     written = [*(frame.image_path for frame in copied), *export.files(output, frames)]
     if len(set(written)) < len(written):
         raise InputError(f"{results}: two frames have one image name; refine them again")
@@ -66,13 +76,27 @@ def export_results(
         for frame in copied:
             frame.copy_image()
         notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
-    of_model = export.in_model_units and frames[0].unit_scale != 1
-    unit = MODEL_UNITS if of_model else frames[0].result.record.unit
+    # In which unit, as the files themselves do not say it.
+    unit = frames[0].result.record.unit
+    if export.in_model_units and frames[0].unit_scale != 1:
+        unit = MODEL_UNITS
     return f"{count_of(len(frames), 'frame')} in {unit}", notes
 
 
 def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
-    record, image, (camera, pose) = result.record, result.image, result.camera_and_pose
+    """The result with its image, camera and pose, as an export needs it.
+
+    Args:
+        result: The depth file, and what lies beside it.
+        export: The export, which may need a pose.
+        output: The output folder; an image that is not in it gets a place there.
+
+    Raises:
+        InputError: The record lacks what is needed or is damaged, or the depth is of a part of the
+            image.
+    """
+    image = result.image
+    camera, pose = result.camera_and_pose
     # What the program needs must be in the record.
     if camera is None:
         raise InputError(
@@ -84,19 +108,24 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
     if export.needs_pose and pose is None:
         raise InputError(f"{result.depth} lacks a pose in its record; `batch --poses` gives it")
     # The scale and the name of the record must be usable.
-    size = result.size or (0, 0)
-    sparse = record.inputs.get("sparse")
-    scale = (sparse and sparse.unit_scale) or 1.0
-    own = image.name if isinstance(image, Path) else f"{PurePosixPath(result.name).name}.png"
-    name = (sparse and sparse.image) or (PurePosixPath(result.name).parent / own).as_posix()
-    if not 1e-9 < scale < 1e9 or name_problem(name) or not name.isprintable():
+    sparse = result.record.inputs.get("sparse")
+    scale = 1.0
+    name = _image_name(result, image)
+    if sparse is not None:
+        scale = sparse.unit_scale or scale
+        name = sparse.image or name  # as the COLMAP model has it
+    is_scale_usable = _LEAST_SCALE < scale < _LARGEST_SCALE
+    is_name_usable = name_problem(name) is None and name.isprintable()
+    if not is_scale_usable or not is_name_usable:
         raise InputError(f"{result.depth}: the record beside it is damaged; refine it again")
     # The depth must be of the whole image.
+    size = result.size or (0, 0)
     if isinstance(image, Path) and size not in sizes_of(image):
         raise InputError(
             f"{result.depth} is not of the size of {image}; refine the whole image (--protocol"
             " whole)"
         )
+    # An image inside the output folder is used where it is.
     path = output / "images" / name
     folder = Path(os.path.realpath(output))
     if isinstance(image, Path) and Path(os.path.realpath(image)).is_relative_to(folder):
@@ -111,3 +140,13 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         pose=pose,
         unit_scale=scale,
     )
+
+
+def _image_name(result: ResultFrame, image: ImageSource) -> str:
+    """The image below a folder of images: in the folder that the result's name has, with slashes.
+
+    A frame of a video gets the name of its result, as a PNG.
+    """
+    frame = PurePosixPath(result.name)
+    file_name = image.name if isinstance(image, Path) else f"{frame.name}.png"
+    return (frame.parent / file_name).as_posix()

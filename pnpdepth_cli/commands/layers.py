@@ -23,20 +23,26 @@ _SYNTHETIC_SIZE = (240, 320)
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredLayer:
-    """A layer and what a cut there costs and reaches; all but the name is None with a problem.
+    """A layer, and what a cut there costs and reaches; all but the name is None with a problem.
 
-    stride: network pixels per element of z; None if z has no two spatial axes. cost_behind:
-    fraction of the network's floating-point operations behind the cut, which every update repeats.
-    Fields: rows and columns that one point influences, see `influential_fields`.
+    z is the output of the layer.
     """
 
     name: str
+    """Name of the submodule."""
     shape: tuple[int, ...] | None = None
+    """Shape of z."""
     stride: float | None = None
+    """Rows of the network's input for each row of z. None: z has no two spatial axes."""
     cost_behind: float | None = None
+    """Fraction of the network's floating-point operations behind the cut, which every update
+    repeats. None: they cannot be counted."""
     field_in_z: tuple[int, int] | None = None
+    """Rows and columns of z that the gradient of one sparse point reaches. None: unknown."""
     field_in_output: tuple[int, int] | None = None
+    """Rows and columns of the output that change when that part of z does. None: unknown."""
     problem: str | None = None
+    """Why the network cannot be cut here. None: it can."""
 
 
 def list_layers(
@@ -58,7 +64,8 @@ def list_layers(
 
     Raises:
         UsageError: The definition lists no layers.
-        ModelError, DeviceError: As in loading.
+        ModelError: The network cannot be loaded or run.
+        DeviceError: The memory does not suffice.
     """
     # The layers to measure.
     network = load_network(model, checkpoint)
@@ -75,10 +82,11 @@ def list_layers(
         arguments = network.synthetic_arguments(frame)
         with torch.no_grad(), FlopCounterMode(display=False) as whole:
             network.depth_of(network.module(*arguments))
+        whole_flops = whole.get_total_flops()
         fields = fields_of(network, arguments, names)
         for done, name in enumerate(names, start=1):
-            flops = whole.get_total_flops()
-            measured.append(_measure(network, name, arguments, frame, flops, fields.get(name)))
+            field = fields.get(name)
+            measured.append(_measure(network, name, arguments, frame, whole_flops, field))
             on_layer(done, len(names))
     return measured
 
@@ -91,6 +99,16 @@ def _measure(
     whole_flops: int,
     field: Field | None,
 ) -> MeasuredLayer:
+    """The layer with its z and its costs, or with the reason why the network is not cut there.
+
+    Args:
+        network: The network.
+        name: Name of the layer.
+        arguments: What the network takes for the frame.
+        frame: Size of the frame, and of the network's input.
+        whole_flops: Floating-point operations of a whole pass.
+        field: What one point influences through the layer. None: that is not known.
+    """
     try:
         with Split(network.module, name) as split, torch.no_grad():
             z = split.front(*arguments)

@@ -20,29 +20,35 @@ _SYNTHETIC_SIZE = (240, 320)
 
 
 def list_models() -> list[dict[str, object]]:
-    """Returns every network that can be named: values of `ModelDefinition`, and parameters."""
+    """Returns an entry for each network that can be named: its definition, size and defaults."""
     by_name = {definition.name: definition for definition in all_definitions().values()}
     return [_describe(definition) for definition in by_name.values()]
 
 
 def _describe(definition: ModelDefinition) -> dict[str, object]:
-    # On the meta device counting needs no memory.
+    """The entry of a network, in JSON's own types.
+
+    Raises:
+        ModelError: The network cannot be built.
+    """
+    # On the meta device counting parameters needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
     defaults = definition.defaults.closed()
     path = definition.checkpoint
     stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
-        **{key: getattr(definition, key) for key in stated},
+        **{name: getattr(definition, name) for name in stated},
         "size": _size(definition.size),
         "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
         "layer": definition.default_layer,
-        **{key: getattr(defaults, key) for key in ("iterations", "lr", "loss", "update")},
+        **{name: getattr(defaults, name) for name in ("iterations", "lr", "loss", "update")},
     }
 
 
 def _size(size: Fixed | Multiple | Near) -> str:
+    """The sizes of images that a network takes, in a few words."""
     if isinstance(size, Fixed):
         return f"{size.height}×{size.width} ({size.fit})"
     if isinstance(size, Near):
@@ -51,6 +57,7 @@ def _size(size: Fixed | Multiple | Near) -> str:
 
 
 def _parameters_of(module: torch.nn.Module) -> int:
+    """The number of a network's parameters."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -85,27 +92,28 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
     height, width = _SYNTHETIC_SIZE if rgb is None else rgb.shape[-2:]
     frame = FrameMap.fit(definition.size, height, width)
     with out_of_memory_is_a_device_error(network.device):
+        # One pass, and one with a cut at each layer.
         arguments = network.synthetic_arguments(frame, rgb)
         notes = [*network.notes, *network.verify(arguments)]
-        if "rgb" in definition.input_kind and definition.normalisation is None:
-            notes.append("input: rgb range 'unit' is assumed; --normalise of refine states one")
-        # One pass, and one with a cut at each layer.
         with torch.no_grad():
             raw = network.raw_of(network.module(*arguments))
-        known = raw[raw.isfinite()]
-        if not len(known):
-            notes.append(
-                "warning: the prediction is inf or NaN at every pixel; are the network's weights,"
-                " its input range (`normalise`) and precision right?"
-            )
         layers = {name: _check_layer(network, name, arguments, raw) for name in definition.layers}
+    # What the user should know of its input and output.
+    if "rgb" in definition.input_kind and definition.normalisation is None:
+        notes.append("input: rgb range 'unit' is assumed; --normalise of refine states one")
+    finite = raw[raw.isfinite()]
+    if not len(finite):
+        notes.append(
+            "warning: the prediction is inf or NaN at every pixel; are the network's weights,"
+            " its input range (`normalise`) and precision right?"
+        )
     return {
         "name": definition.name,
         "input": list(frame.network),
         "output": list(raw.shape[-2:]),
         "output_kind": definition.output_kind,
         "output_scale": definition.output_scale,
-        "range": [float(known.min()), float(known.max())] if len(known) else [],
+        "range": [float(finite.min()), float(finite.max())] if len(finite) else [],
         "parameters": _parameters_of(network.module),
         "layers": layers,
         "notes": notes,
@@ -113,13 +121,21 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
 
 
 def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
-    """ "ok", or why the network cannot be cut at the layer."""
+    """ "ok", or why the network cannot be cut at the layer.
+
+    Args:
+        network: The network.
+        name: Name of the layer.
+        arguments: What the network takes for a frame.
+        whole: (1, 1, h, w) what it returns for them without a cut, as it returns it.
+    """
     try:
         with Split(network.module, name) as split:
             with torch.no_grad():
                 z = split.front(*arguments)
             z.requires_grad_(True)
             raw = network.known_of(split.rear(z))
+            # What is not finite is 0 in both, as NaN equals nothing.
             if not torch.equal(raw.detach(), whole.nan_to_num()):
                 return "the cut network gives something else than the whole one"
             gradient = gradient_at(z, raw.sum())

@@ -22,7 +22,19 @@ def project_scan(
     depth_scale: float | None = None,
     overwrite: bool = False,
 ) -> Written:
-    """Writes the scan's points that the camera of the image sees; returns what was written."""
+    """Writes the scan's points that the camera of the image sees; returns what was written.
+
+    Args:
+        scan: The scan, in the scanner's coordinates.
+        image: The image, which is drawn on.
+        output: File of the sparse depth.
+        options: The calibration of the two.
+        depth_scale: Numbers of the scan per metre. None: as the file says.
+        overwrite: Whether existing files are replaced.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
     files = sparse_outputs(
         output, (scan, image, options.calib, options.extrinsics), overwrite, drawn=True
     )

@@ -30,7 +30,21 @@ def sample_depth(
     depth_scale: float | None = None,
     overwrite: bool = False,
 ) -> Written:
-    """Writes points of a dense depth map; returns what was written."""
+    """Writes points of a dense depth map; returns what was written.
+
+    Args:
+        depth: File of the dense depth.
+        output: File of the sparse depth.
+        pattern: Which pixels are sampled, and how many.
+        image: Image of the same view, for the pattern "features".
+        seed: Random seed of the pattern.
+        depth_scale: Numbers of the dense depth per metre. None: as the file says.
+        overwrite: Whether existing files are replaced.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
+    """
+    # The files that are read.
     files = sparse_outputs(output, (depth, image), overwrite)
     dense, notes = read_dense(depth, depth_scale)
     inputs = {"depth": record_of(depth)}
@@ -38,6 +52,7 @@ def sample_depth(
     if image is not None:
         inputs["image"] = record_of(image, kind="image")
         rgb = read_rgb(image).values
+    # The points; an image may have fewer corners than are asked for.
     points = sample_points(dense, pattern, seed, image=rgb)
     wanted = pattern.wanted(int(np.count_nonzero(dense)))
     if pattern.kind == "features" and len(points) < wanted:

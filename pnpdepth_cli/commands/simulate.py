@@ -34,16 +34,32 @@ def simulate_scan(
 ) -> Written:
     """Writes the points of a sensor at the camera's place; returns what was written.
 
-    The sensor is one by name, or of so many beams between two elevations, degrees.
+    The sensor is one by name, or of so many beams between two elevations.
+
+    Args:
+        depth: File of the dense depth of the scene.
+        calib: Calibration of the camera that the depth is of.
+        output: File of the sparse depth.
+        sensor: Name of the sensor, one of `choices.SENSORS`. None: `beams` and `vertical_fov`.
+        beams: Number of beams.
+        vertical_fov: Elevations of the uppermost and the lowest beam, degrees.
+        seed: Random seed of the sensor's noise.
+        depth_scale: Numbers of the dense depth per metre. None: as the file says.
+        overwrite: Whether existing files are replaced.
+
+    Raises:
+        PnpDepthError: An input or output is at fault; then nothing is written.
     """
+    # The sensor, and the files that are read.
     lidar = lidar_of(sensor, beams, vertical_fov)
     files = sparse_outputs(output, (depth, calib), overwrite)
     dense, notes = read_dense(depth, depth_scale)
-    calibration = read_calibration(calib)
-    notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
-    points = simulate_lidar(dense, calibration.camera, lidar, seed)
+    camera = read_calibration(calib).camera
+    notes += check_size(calib, camera, (dense.shape[0], dense.shape[1]), depth)
+    # The points, with what decided them.
+    points = simulate_lidar(dense, camera, lidar, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{lidar.name}, seed {seed}'))}")
     settings = {"command": "simulate", "sensor": plain(asdict(lidar)), "seed": seed}
-    read_as = FileRecord(path=str(calib), kind="calibration", read_as=calibration.camera.source)
-    inputs = {"depth": record_of(depth), "calibration": read_as}
+    calibration = FileRecord(path=str(calib), kind="calibration", read_as=camera.source)
+    inputs = {"depth": record_of(depth), "calibration": calibration}
     return write_sparse_files(files, points, settings, inputs, notes)

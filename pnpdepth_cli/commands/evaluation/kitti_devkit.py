@@ -34,6 +34,8 @@ def fill_background(depth: Floats) -> Floats:
     column = np.arange(depth.shape[1])
     rows = np.flatnonzero((depth > 0).any(axis=1))
     for row in rows:
+        # Of each column the known ones at its left and right, itself if it is known; outside of the
+        # outermost one both are that.
         known = np.flatnonzero(depth[row] > 0)
         left = np.searchsorted(known, column, side="right") - 1
         right = np.searchsorted(known, column)
@@ -51,31 +53,36 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     Args:
         predicted: (H, W) metres, 0 where unknown.
         gt: (H, W) metres, 0 where unknown; some of it known.
+
+    Returns:
+        Values by the keys of `measures.DEVKIT_MEASURES`.
     """
-    # the scored pixels, down each column as the kit walks
-    known = gt.T > 0
-    p, g = fill_background(predicted).T[known], gt.T[known]
-    error = np.abs(g - p)
+    # The scored pixels (N,), down each column as the kit walks, which transposing gives.
+    is_scored = gt.T > 0
+    depth = fill_background(predicted).T[is_scored]
+    truth = gt.T[is_scored]
+    error = np.abs(truth - depth)
     with np.errstate(invalid="ignore"):
         # logarithms rounded once to single precision, as C's logf nearly always does
-        log_g = np.log(g, dtype=np.float64).astype(np.float32)
-        log_p = np.log(p, dtype=np.float64).astype(np.float32)
-        log_error = log_g - log_p
-        inverse = np.abs(1.0 / g.astype(np.float64) - 1.0 / p.astype(np.float64)).astype(np.float32)
-        # the errors in the kit's order
-        count = np.float32(len(g))
+        log_truth = np.log(truth, dtype=np.float64).astype(np.float32)
+        log_depth = np.log(depth, dtype=np.float64).astype(np.float32)
+        log_error = log_truth - log_depth
+        inverse = 1.0 / truth.astype(np.float64) - 1.0 / depth.astype(np.float64)
+        inverse_error = np.abs(inverse).astype(np.float32)
+        # The errors in the order of DEVKIT_MEASURES, which is the kit's.
+        count = np.float32(len(truth))
         log_squares = _sum(log_error**2) / count
         log_total = _sum(log_error)
         values = (
             _sum(error) / count,
             np.sqrt(_sum(error * error) / count),
-            _sum(inverse) / count,
-            np.sqrt(_sum(inverse**2) / count),
+            _sum(inverse_error) / count,
+            np.sqrt(_sum(inverse_error**2) / count),
             _sum(np.abs(log_error)) / count,
             np.sqrt(log_squares),
             np.sqrt(log_squares - log_total * log_total / (count * count)),
-            _sum(error / g) / count,
-            _sum(error * error / (g * g)) / count,
+            _sum(error / truth) / count,
+            _sum(error * error / (truth * truth)) / count,
         )
     return {m.key: float(value) for m, value in zip(DEVKIT_MEASURES, values, strict=True)}
 
@@ -86,5 +93,6 @@ def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _sum(values: NDArray[np.floating]) -> Floats:
+    """The sum over the first axis, in single precision and in order, as the kit adds up."""
     # cumsum adds one after the other; sum would add in pairs
     return np.asarray(np.cumsum(values, axis=0, dtype=np.float32)[-1])

@@ -32,16 +32,20 @@ class ExportFrame:
     """A refined frame."""
 
     result: ResultFrame
+    """The depth file, and what lies beside it."""
     image: ImageSource
+    """The image that was refined: a file, or a frame of a video."""
     image_path: Path
     """The image in the output folder, or where it is copied to: programs read it there."""
     image_name: str
     """Path of the image below the folder of images, as COLMAP names it, with slashes."""
     size: tuple[int, int]
-    """(H, W)."""
+    """(H, W) of the depth and the image."""
     camera: Camera
+    """The camera in pixels of the image."""
     pose: Pose | None
-    """Pose in the unit of the result. None: unknown."""
+    """(3, 4) from the camera's coordinates to the world's, in the unit of the result. None:
+    unknown."""
     unit_scale: float
     """Units of the depth per unit of the COLMAP model; 1 without a model."""
     unknown: str = "keep"
@@ -53,7 +57,7 @@ class ExportFrame:
         return PurePosixPath(self.image_name).with_suffix("").as_posix()
 
     def valid_depth(self) -> NDArray[np.float32]:
-        """Returns the (H, W) depth, 0 where it is unknown or not valid."""
+        """Returns the (H, W) depth in the result's unit, 0 where it is unknown or not valid."""
         depth, valid = self.result.read()
         return np.where(valid, depth, np.float32(0))
 
@@ -68,7 +72,7 @@ class ExportFrame:
                 pixels = np.rint(255 * read_image(self.image)).astype(np.uint8)
                 Image.fromarray(pixels).save(temporary, "PNG")
 
-    def placed(self) -> Pose:
+    def known_pose(self) -> Pose:
         """Returns the pose. Raises InputError if it is unknown."""
         if self.pose is None:
             raise InputError(
@@ -77,12 +81,20 @@ class ExportFrame:
         return self.pose
 
     def start_points(self, frames: int) -> PointCloud:
-        """Returns the frame's share of the points to begin with, in the world's coordinates."""
+        """Returns the frame's share of the points to begin with, in the world's coordinates.
+
+        Args:
+            frames: Number of frames, of which each has an equal share of `_START_POINTS`.
+
+        Raises:
+            InputError: The pose is unknown.
+        """
         rgb = image_of_size(self.image, self.size)
         clouds = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
+        # Every n-th point of all, as many as the share.
         step = max(1, sum(len(cloud.xyz) for cloud in clouds) * frames // _START_POINTS)
-        columns = (np.concatenate(column)[::step] for column in zip(*clouds, strict=True))
-        return PointCloud(*columns).transform(self.placed())
+        fields = (np.concatenate(field)[::step] for field in zip(*clouds, strict=True))
+        return PointCloud(*fields).transform(self.known_pose())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +102,13 @@ class Export:
     """How depth is written for a program."""
 
     needs_pose: bool
+    """Whether every frame must have a pose."""
     files: Callable[[Path, Sequence[ExportFrame]], list[Path]]
+    """Function of the output folder and the frames: returns the files that `write` will write."""
     write: Callable[[Path, Sequence[ExportFrame], Callable[[], None]], list[str]]
-    """Writes them, calls the function after each frame, and returns notes. Raises PnpDepthError.
-    The folders of the files are there."""
+    """Function of the output folder, the frames and a callback: writes the files, calls back after
+    each frame, and returns lines for a person. The folders of the files are there. Raises
+    PnpDepthError."""
     in_model_units: bool = True
     """Whether the files are in units of the COLMAP model, if there is one; else in those of the
     results."""
@@ -102,7 +117,12 @@ class Export:
 
 
 def distortion_note(frames: Sequence[ExportFrame], taker: str) -> list[str]:
-    """Returns a warning if images are distorted, for a program that takes undistorted ones."""
+    """Returns a warning if images are distorted, for a program that takes undistorted ones.
+
+    Args:
+        frames: The frames.
+        taker: Name of the program.
+    """
     count = sum(frame.camera.has_lens for frame in frames)
     if not count:
         return []

@@ -19,23 +19,32 @@ from pnpdepth_cli.sensors.point_cloud import depth_normals
 
 
 def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:
+    """The file of a frame's map in COLMAP's workspace; its kind is "depth" or "normal"."""
     return folder / "stereo" / f"{kind}_maps" / f"{frame.image_name}.geometric.bin"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    """The maps of all frames, and COLMAP's list of images unless there is one already."""
     maps = [_map(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
-    listed = folder / "stereo" / "fusion.cfg"  # image_undistorter may have written it already
-    return maps if listed.exists() else [*maps, listed]
+    image_list = _image_list(folder)
+    return maps if image_list.exists() else [*maps, image_list]
+
+
+def _image_list(folder: Path) -> Path:
+    """The list of the images that COLMAP fuses; its image_undistorter writes one as well."""
+    return folder / "stereo" / "fusion.cfg"
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    """Writes the depth and normal maps, in units of the model; see `Export.write`."""
     for frame in frames:
         depth = frame.valid_depth()
         _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera))
         _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
         done()
-    for listed in _files(folder, frames)[2 * len(frames) :]:
-        write_text(listed, "".join(f"{frame.image_name}\n" for frame in frames))
+    image_list = _image_list(folder)
+    if image_list in _files(folder, frames):
+        write_text(image_list, "".join(f"{frame.image_name}\n" for frame in frames))
     return distortion_note(frames, "COLMAP's fusion")
 
 
@@ -44,6 +53,7 @@ def _write_map(path: Path, values: NDArray[np.floating]) -> None:
     height, width, channels = values.shape
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{width}&{height}&{channels}&".encode())
+        # One channel after the other, each row by row.
         file.write(np.ascontiguousarray(values.transpose(2, 0, 1)).astype("<f4").tobytes())
 
 

@@ -30,61 +30,71 @@ from pnpdepth_cli.io.file_bytes import write_json
 from pnpdepth_cli.io.formats import LARGEST_CODE
 
 _CODES = 2**16
+"""What 3DGS divides the codes of a 16-bit PNG by."""
 _PARAMETERS = "depth_params.json"
 _OURS = b"# Of pnpdepth export: the refined images, points of their depth\n"
+"""First line of the files of a model that an earlier export wrote, and that may be replaced."""
 _NEAREST_PERCENTILE = 99.9
 """Percentile of an image's inverse depth, so that few near pixels do not set the scale."""
 
 
 def _depth_image(folder: Path, frame: ExportFrame) -> Path:
+    """The PNG of a frame's inverse depth."""
     return folder / "inverse_depths" / f"{frame.stem}.png"
 
 
 def _model(folder: Path) -> Path:
+    """The folder in which 3DGS looks for the COLMAP model."""
     return folder / "sparse" / "0"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    """The inverse depth of all frames, its scale, and the model unless there is one already."""
     names = [_PARAMETERS]
     if _needs_model(folder, frames):
-        names += [f"{name}.txt" for name in MODEL_PARTS]
-    depths = (_depth_image(folder, frame) for frame in frames)
+        names += [f"{part}.txt" for part in MODEL_PARTS]
+    depths = [_depth_image(folder, frame) for frame in frames]
     return [*depths, *(_model(folder) / name for name in names)]
 
 
 def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
-    """Whether no other's model is in sparse/0/, and one without distortion can be made."""
-    usable = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
-    there = model_files(_model(folder))
-    return usable and (not there or there[0].read_bytes().startswith(_OURS))
+    """Whether a model is written: it can be made, and none but one of ours is in sparse/0/.
+
+    It can be made if all poses are known and no image is distorted, as 3DGS has no lenses.
+    """
+    can_be_made = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
+    present = model_files(_model(folder))
+    return can_be_made and (not present or present[0].read_bytes().startswith(_OURS))
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    """Writes inverse depth, its scale, and a model if it needs one; see `Export.write`."""
     # One scale for the inverse depth of all frames.
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:
         raise InputError("no frame has a pixel with known depth; refine them again")
     if _needs_model(folder, frames):
         _write_model(_model(folder), frames)
-    # Depth and image of each frame.
+    # The inverse depth of each frame. Code 0 is infinitely far, so every pixel has 1 or more.
     largest = scale * LARGEST_CODE / _CODES
     masked = clipped = 0
     for frame in frames:
         inverse, valid = _inverse(frame)
         masked += int((~valid).sum())
         clipped += int((inverse > largest).sum())
-        fitting = np.clip(inverse, scale / _CODES, largest).astype(np.float32)
+        in_range = np.clip(inverse, scale / _CODES, largest).astype(np.float32)
         if frame.unknown == "zero":
-            fitting = np.where(valid, fitting, np.float32(0))
-        write_depth(_depth_image(folder, frame), fitting, scale=_CODES / scale)
+            in_range = np.where(valid, in_range, np.float32(0))
+        write_depth(_depth_image(folder, frame), in_range, scale=_CODES / scale)
         done()
     # What the program reads the codes with.
     parameters = {"scale": float(scale), "offset": 0.0}
     write_json(_model(folder) / _PARAMETERS, {frame.stem: parameters for frame in frames})
+    # What was changed, and what the program lacks.
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
         depth = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
-        if frames[0].unknown == "zero":
+        if frames[0].unknown == "zero":  # the same for all frames
             depth = "0, which 3DGS reads as infinitely far"
         notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
     if not model_files(_model(folder)):
@@ -96,7 +106,10 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(H, W) inverse depth in units of the model, and where the depth is known and valid."""
+    """(H, W) inverse depth in units of the model, and (H, W) where the depth is known and valid.
+
+    Unknown pixels have the inverse depth of the nearest known one; 0 if no pixel is known.
+    """
     depth, valid = frame.result.read()
     known = depth > 0
     if not known.any():
@@ -108,27 +121,38 @@ def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]
 
 
 def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
-    """Writes cameras, poses, and points of the depth as text of COLMAP, in units of the model."""
-    lines = {name: [_OURS.decode()] for name in MODEL_PARTS}
+    """Writes cameras, images with poses, and points of the depth as text of COLMAP.
+
+    Lengths are in units of the model. Camera, image and frame have one number, from 1.
+
+    Args:
+        folder: The folder of the model.
+        frames: The frames, whose poses are known and whose cameras have no lens.
+    """
+    lines = {part: [_OURS.decode()] for part in MODEL_PARTS}
     for number, frame in enumerate(frames, 1):
-        cloud = frame.start_points(len(frames))
-        pose = frame.placed()
-        unit = frame.unit_scale
+        # The camera; COLMAP counts pixels from the image's corner, not from a pixel's centre.
         (fx, _, cx), (_, fy, cy), _ = frame.camera.intrinsics
         height, width = frame.size
-        # COLMAP counts pixels from the image's corner, and its poses lead to the camera
         lens = f"{fx} {fy} {cx + 0.5} {cy + 0.5}"
-        x, y, z, w = Rotation.from_matrix(pose[:, :3].T).as_quat()
-        shift = " ".join(map(str, -pose[:, :3].T @ pose[:, 3] / unit))
         lines["cameras"].append(f"{number} PINHOLE {width} {height} {lens}\n")
+        # The image; COLMAP's poses lead from the world to the camera. Its second line, of points
+        # in the image, is empty.
+        unit = frame.unit_scale
+        pose = frame.known_pose()
+        to_camera = pose[:, :3].T
+        x, y, z, w = Rotation.from_matrix(to_camera).as_quat()
+        shift = " ".join(map(str, -to_camera @ pose[:, 3] / unit))
         lines["images"].append(f"{number} {w} {x} {y} {z} {shift} {number} {frame.image_name}\n\n")
+        # The points, with a colour and no error.
+        cloud = frame.start_points(len(frames))
         colours = () if cloud.rgb is None else cloud.rgb
         for point, (red, green, blue) in zip(cloud.xyz / unit, colours, strict=True):
             place = " ".join(f"{value:.7g}" for value in point)
-            index = len(lines["points3D"])
-            lines["points3D"].append(f"{index} {place} {red} {green} {blue} 0\n")
-    for name, text in lines.items():
-        write_text(folder / f"{name}.txt", "".join(text))
+            point_number = len(lines["points3D"])
+            lines["points3D"].append(f"{point_number} {place} {red} {green} {blue} 0\n")
+    for part, text in lines.items():
+        write_text(folder / f"{part}.txt", "".join(text))
 
 
 EXPORT = Export(needs_pose=False, files=_files, write=_write, copies_images=True)

@@ -33,8 +33,11 @@ from pnpdepth_cli.sensors.lens import unproject
 from pnpdepth_cli.sensors.point_cloud import cloud_from_depth
 
 _BAG = "results"
+"""Name of the bag's file without its ending."""
 _WORLD = "world"
+"""frame_id of the poses' coordinates."""
 _CAMERA = "camera"
+"""frame_id of the camera's coordinates."""
 _STEP_NS = 100_000_000
 """Time between frames whose names hold no time."""
 _TIME = re.compile(r"(?:^|[^\d._])(\d{1,10})[._](\d{6,9})$")
@@ -45,16 +48,21 @@ _LENSES = {
 }
 """ROS' models of each lens, and how many coefficients they have."""
 _FLOAT32 = 7
-"""Of sensor_msgs/PointField."""
+"""Number of the type float32 in sensor_msgs/PointField."""
+_SAME = 1e-6
+"""Relative difference up to which depths in metres count as the same; float32 has 1e-7."""
 
 _Fields = dict[str, Any]
+"""Fields of a ROS message by name, without its header."""
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    """The bag and its metadata, whatever the frames are."""
     return [folder / f"{_BAG}.mcap", folder / "metadata.yaml"]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    """Writes the bag, its frames in the order of their times; see `Export.write`."""
     times_ns, notes = _times(frames)
 
     def outgoing() -> Iterator[OutgoingMessage]:
@@ -74,9 +82,14 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _times(frames: Sequence[ExportFrame]) -> tuple[list[int], list[str]]:
-    """Nanoseconds of each frame, and a note where they are not those of the names."""
-    found = [_TIME.search(frame.result.name) for frame in frames]
-    times_ns = [int(Decimal(f"{time[1]}.{time[2]}").scaleb(9)) for time in found if time]
+    """Nanoseconds of each frame, from 1970, by its name; and notes.
+
+    Where a name holds no time, all frames have made-up times at equal distances, and a note says
+    so.
+    """
+    matches = [_TIME.search(frame.result.name) for frame in frames]
+    # Decimal, as a float of seconds since 1970 is exact to 240 ns only.
+    times_ns = [int(Decimal(f"{match[1]}.{match[2]}").scaleb(9)) for match in matches if match]
     if len(times_ns) == len(frames):
         return times_ns, []
     note = f"stamps: the names of the frames hold no times; {1e-9 * _STEP_NS:g} s apart"
@@ -84,7 +97,16 @@ def _times(frames: Sequence[ExportFrame]) -> tuple[list[int], list[str]]:
 
 
 def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[OutgoingMessage]:
-    """Yields the messages of a frame; what is left out is told in `notes`."""
+    """Yields the messages of a frame.
+
+    Args:
+        frame: The frame.
+        time_ns: Stamp of all its messages, nanoseconds from 1970.
+        notes: Lines for a person; gets one on what is left out.
+
+    Raises:
+        InputError: ROS has no model of the camera's lens.
+    """
     seconds, nanoseconds = divmod(time_ns, 10**9)
     header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": _CAMERA}
 
@@ -104,11 +126,12 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
     yield message("/camera/image", "sensor_msgs/msg/Image", _image(pixels, "rgb8"))
     # Depth and its standard deviation.
     depth = frame.valid_depth()
-    unknown = np.where(depth > 0, depth, np.float32(np.nan))
+    nan_where_unknown = np.where(depth > 0, depth, np.float32(np.nan))
+    depth_image = _image(nan_where_unknown, "32FC1")
     yield message("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", info)
-    yield message("/camera/depth/image", "sensor_msgs/msg/Image", _image(unknown, "32FC1"))
+    yield message("/camera/depth/image", "sensor_msgs/msg/Image", depth_image)
     if frame.result.sigma is not None:
-        sigma = frame.result.of_size(frame.result.sigma, depth).astype(np.float32)
+        sigma = frame.result.read_beside(frame.result.sigma, depth).astype(np.float32)
         yield message("/camera/depth/sigma", "sensor_msgs/msg/Image", _image(sigma, "32FC1"))
     # The points that were used, and the cloud of the depth, in the camera's coordinates.
     points = _points_used(frame, notes)
@@ -121,38 +144,52 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
 
 
 def _transform(pose: NDArray[np.float64]) -> _Fields:
+    """The fields of a TransformStamped from the world to the camera, of the camera's (3, 4) pose.
+
+    ROS means by it what the pose is: where the camera's coordinates lie in the world's.
+    """
     x, y, z, w = Rotation.from_matrix(pose[:, :3]).as_quat().tolist()
-    shift = dict(zip("xyz", pose[:, 3].tolist(), strict=True))
-    turn = {"x": x, "y": y, "z": z, "w": w}
-    return {"child_frame_id": _CAMERA, "transform": {"translation": shift, "rotation": turn}}
+    translation = dict(zip("xyz", pose[:, 3].tolist(), strict=True))
+    rotation = {"x": x, "y": y, "z": z, "w": w}
+    return {
+        "child_frame_id": _CAMERA,
+        "transform": {"translation": translation, "rotation": rotation},
+    }
 
 
 def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
-    """The fields of a CameraInfo of images that are not rectified. InputError for other lenses."""
-    given = [*camera.distortion]
-    while given and not given[-1]:
-        given.pop()
+    """The fields of a CameraInfo of images (H, W) that are not rectified.
+
+    Raises:
+        InputError: ROS has no model of the lens with so many coefficients.
+    """
+    # Zeros at the end of the coefficients say nothing, and may be cut or added.
+    coefficients = [*camera.distortion]
+    while coefficients and not coefficients[-1]:
+        coefficients.pop()
     models = _LENSES.get(camera.lens, ())
-    model = next(((name, count) for name, count in models if len(given) <= count), None)
+    model = next(((name, count) for name, count in models if len(coefficients) <= count), None)
     if model is None:
         raise InputError(
-            f"ROS knows no lens {camera.lens} with {len(given)} coefficients; refine undistorted"
-            " images"
+            f"ROS knows no lens {camera.lens} with {len(coefficients)} coefficients; refine"
+            " undistorted images"
         )
     name, count = model
+    zeros = [0.0] * (count - len(coefficients))
     projection = np.column_stack([camera.intrinsics, np.zeros(3)])
     return {
         "height": size[0],
         "width": size[1],
         "distortion_model": name,
-        "d": np.array([*given, *[0.0] * (count - len(given))]),
+        "d": np.array([*coefficients, *zeros]),
         "k": camera.intrinsics.ravel(),
-        "r": np.eye(3).ravel(),
+        "r": np.eye(3).ravel(),  # no rectification
         "p": projection.ravel(),
     }
 
 
 def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
+    """The fields of an Image of pixels (H, W) or (H, W, C), little-endian, rows without padding."""
     rows = np.ascontiguousarray(pixels.reshape(len(pixels), -1))
     data = rows.astype(rows.dtype.newbyteorder("<"), copy=False).view(np.uint8)
     return {
@@ -165,10 +202,16 @@ def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
 
 
 def _cloud(xyz: NDArray[np.floating], rgb: NDArray[np.uint8] | None = None) -> _Fields:
-    """The fields of a PointCloud2 with x y z, and a packed colour 0x00RRGGBB where it is given."""
-    names = [*"xyz"] if rgb is None else [*"xyz", "rgb"]
-    kinds = [np.dtype("<f4")] * 3 + [np.dtype("<u4")] * (len(names) - 3)
-    points = np.zeros(len(xyz), np.dtype(list(zip(names, kinds, strict=True))))
+    """The fields of a PointCloud2 with x y z, and a packed colour 0x00RRGGBB where it is given.
+
+    Args:
+        xyz: (N, 3) in the camera's coordinates.
+        rgb: (N, 3) colours.
+    """
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    if rgb is not None:
+        kinds.append(("rgb", "<u4"))
+    points = np.zeros(len(xyz), np.dtype(kinds))
     for column, name in enumerate("xyz"):
         points[name] = xyz[:, column]
     if rgb is not None:
@@ -177,7 +220,7 @@ def _cloud(xyz: NDArray[np.floating], rgb: NDArray[np.uint8] | None = None) -> _
     fields = [
         # RViz and PCL expect colours to be named as floats
         {"name": name, "offset": 4 * place, "datatype": _FLOAT32, "count": 1}
-        for place, name in enumerate(names)
+        for place, (name, _) in enumerate(kinds)
     ]
     data = np.frombuffer(points.tobytes(), np.uint8)
     return {
@@ -192,9 +235,14 @@ def _cloud(xyz: NDArray[np.floating], rgb: NDArray[np.uint8] | None = None) -> _
 
 
 def _files_of_points(frame: ExportFrame, sparse: FileRecord) -> FrameFiles:
-    """The files of a frame from which its points were read."""
+    """The files of a frame from which its points were read.
+
+    Args:
+        frame: The frame.
+        sparse: What its record says of the file of its sparse depth.
+    """
     source = Path(sparse.path)
-    is_sampled = sparse.kind == "sampled"
+    is_sampled = sparse.kind == "sampled"  # from ground truth, which is then the file
     return FrameFiles(
         name=frame.result.name,
         image=frame.image,
@@ -209,7 +257,7 @@ def _files_of_points(frame: ExportFrame, sparse: FileRecord) -> FrameFiles:
 
 
 def _options_of_points(sparse: FileRecord) -> ReadOptions:
-    """The options by which the points of a frame were read."""
+    """The options by which the points of a frame were read, as its record says of their file."""
     scan = ScanOptions(
         calib=None if sparse.calibration is None else Path(sparse.calibration),
         extrinsics=None if sparse.extrinsics is None else Path(sparse.extrinsics),
@@ -222,40 +270,47 @@ def _options_of_points(sparse: FileRecord) -> ReadOptions:
 
 
 def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | None:
-    """(N, 3) the frame's own points that were used, read again as its record says.
+    """(N, 3) the frame's own points that were used, in the camera's coordinates.
 
-    None, with a note, where their files are gone or give other points.
+    They are read again as the frame's record says. None without a record; None, with a note, where
+    their files are gone or give other points than then.
+
+    Args:
+        frame: The frame.
+        notes: Lines for a person; gets one on points that are left out.
     """
     sparse = frame.result.record.inputs.get("sparse")
     result = frame.result.record.result
     if sparse is None or result is None:
         return None
-    points = result.points
     # The files are read as the record says.
     seed = result.settings.get("seed") or 0
     holdout = result.settings.get("holdout") or 0.0
     try:
-        read = read_frame(
+        frame_now = read_frame(
             _files_of_points(frame, sparse),
             _options_of_points(sparse),
             seed=int(seed),
             holdout=float(holdout),
         )
+    # PnpDepthError: a file is gone or damaged. ValueError: a number in the record is none.
     except (PnpDepthError, ValueError) as error:
         notes.append(f"warning: {frame.result.name}: its points are left out: {error}")
         return None
     # They must be the points of the record: as many, from the same nearest to the same farthest.
-    used = read.points
-    ends = (float(read.own.depth.min()), float(read.own.depth.max()))
-    wanted = points.used - (points.moved or 0)
-    if len(used) != wanted or not np.allclose(ends, (points.nearest, points.farthest), rtol=1e-6):
+    points = frame_now.points
+    ends = (float(frame_now.own.depth.min()), float(frame_now.own.depth.max()))
+    recorded = result.points
+    wanted = recorded.used - (recorded.moved or 0)  # without those of neighbouring frames
+    wanted_ends = (recorded.nearest, recorded.farthest)
+    if len(points) != wanted or not np.allclose(ends, wanted_ends, rtol=_SAME):
         notes.append(
             f"warning: {frame.result.name}: its points are left out, as {sparse.path} gives others"
-            f" now: {len(used):,} from {ends[0]:g} to {ends[1]:g}, not {wanted:,} from"
-            f" {points.nearest:g} to {points.farthest:g}"
+            f" now: {len(points):,} from {ends[0]:g} to {ends[1]:g}, not {wanted:,} from"
+            f" {wanted_ends[0]:g} to {wanted_ends[1]:g}"
         )
         return None
-    xyz = unproject(frame.camera, used.xy.numpy().astype(np.float64), used.depth.numpy())
+    xyz = unproject(frame.camera, points.xy.numpy().astype(np.float64), points.depth.numpy())
     return xyz.astype(np.float32)
 
 

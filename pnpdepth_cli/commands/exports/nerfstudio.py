@@ -26,6 +26,7 @@ from pnpdepth_cli.io.scans import write_cloud
 _FACTORS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Units of a code, of which the first is taken that all depths of the frames fit in."""
 _START = "start.ply"
+"""The points that splatting begins with."""
 _LENSES = {
     "radial-tangential": ("OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4")),
     "fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
@@ -34,15 +35,18 @@ _LENSES = {
 
 
 def _depth_image(frame: ExportFrame) -> str:
+    """The frame's depth file, below the output folder."""
     return f"depths/{frame.stem}.png"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
+    """The depth of all frames, the start points and transforms.json."""
     names = [*map(_depth_image, frames), _START, "transforms.json"]
     return [folder / name for name in names]
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
+    """Writes depth, start points, cameras and poses; see `Export.write`."""
     # The program takes lenses of one kind.
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:
@@ -52,18 +56,19 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         )
     # Units of a code: Nerfstudio's default, or as many as the farthest depth needs.
     farthest = max(float(frame.valid_depth().max()) for frame in frames)
-    fitting = [factor for factor in _FACTORS if np.rint(farthest / factor) <= LARGEST_CODE]
-    if not fitting:
+    large_enough = [factor for factor in _FACTORS if np.rint(farthest / factor) <= LARGEST_CODE]
+    if not large_enough:
         raise InputError(f"a depth of {farthest:.4g} is none of a scene; refine the frames again")
-    factor = fitting[0]
-    # Depth, points and image of each frame.
-    entries, start = [], []
+    factor = large_enough[0]
+    # Depth, points and entry of each frame.
+    entries = []
+    start_points = []
     for frame in frames:
         entries.append(_entry(folder, frame))
-        start.append(frame.start_points(len(frames)))
+        start_points.append(frame.start_points(len(frames)))
         write_depth(folder / _depth_image(frame), frame.valid_depth(), scale=1 / factor)
         done()
-    write_cloud(folder / _START, start)
+    write_cloud(folder / _START, start_points)
     # Cameras and poses.
     content = {
         "camera_model": _LENSES[lenses[0]][0],
@@ -74,7 +79,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
         "frames": entries,
     }
     write_json(folder / "transforms.json", content)
-    if factor == _FACTORS[0]:
+    if factor == _FACTORS[0]:  # Nerfstudio's default, which needs no option
         return []
     unit = frames[0].result.record.unit
     return [
@@ -84,20 +89,24 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
-    """The frame's entry in transforms.json."""
+    """The frame's entry in transforms.json, which lies in the folder: files, pose and camera.
+
+    Raises:
+        InputError: The program has no lens with so many coefficients, or the pose is unknown.
+    """
     # The coefficients of the lens, if the program has all of them.
     camera = frame.camera
     _, names = _LENSES[camera.lens]
-    values = dict(zip(names, camera.distortion, strict=False))
+    coefficients = dict(zip(names, camera.distortion, strict=False))
     if any(camera.distortion[len(names) :]):
         raise InputError(
             f"{frame.image}: Nerfstudio knows no lens {camera.lens} with"
             f" {len(camera.distortion)} coefficients; undistort images first"
         )
     image = os.path.relpath(os.path.realpath(frame.image_path), os.path.realpath(folder))
-    # The pose, with Nerfstudio's axes: y up, z backwards.
+    # The pose, with Nerfstudio's axes: y up, z backwards, the opposite of ours.
     matrix = np.eye(4)
-    matrix[:3] = frame.placed()
+    matrix[:3] = frame.known_pose()
     matrix[:3, 1:3] *= -1
     # Principal points count from the image's corner.
     intrinsics = camera.intrinsics
@@ -112,7 +121,7 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
         "fl_y": intrinsics[1, 1],
         "cx": intrinsics[0, 2] + 0.5,
         "cy": intrinsics[1, 2] + 0.5,
-        **{name: values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")},
+        **{name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")},
     }
 
 

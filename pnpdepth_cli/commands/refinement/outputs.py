@@ -46,12 +46,18 @@ LARGEST_VIEW = 200_000
 _RAY_NODES = 64
 """Nodes of the grid of directions along the longer side: exact to 1e-4 of it for strong lenses."""
 
+_LEAST_RATIO = 1.001
+"""Least ratio of the farthest depth of a 3D view to the nearest, so that codes differ."""
+
 
 def plan_outputs(request: RefineRequest) -> Outputs:
-    """Returns the paths of the results: `-o FILE.exr` for the depth alone, a folder for all.
+    """Returns the files of the result by kind: the depth alone for `-o FILE.exr`, all in a folder.
+
+    Without -o, the folder is named after the image, or the first other input.
 
     Raises:
         OutputError: One exists and may not be replaced, or is one of the inputs.
+        UsageError: A standard deviation is asked for, and a file is named and no folder.
     """
     # Where results go without -o.
     files = request.files
@@ -93,9 +99,16 @@ def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -
     """Returns the frame with 0 where no points support its depth, if that is asked for.
 
     Where it is not, a note tells how much of a scan's image lies outside of its points.
+
+    Args:
+        request: What is asked for.
+        inputs: The frame as it was read.
+        frame: The refined frame.
     """
+    # Depth is supported where it is valid; that is known if it was asked for.
     if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, depth=np.where(frame.valid, frame.depth, np.float32(0)))
+    # A mask says it already, and points of other sensors leave no large part of an image out.
     source = inputs.sources["sparse"]
     is_scan = source.kind == "scan" or scan_pattern(frame.used.xy, frame.used.size)
     if frame.valid is not None or not is_scan:
@@ -113,9 +126,10 @@ def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -
 def write_outputs(
     outputs: Outputs, inputs: ReadFrame, frame: Refined, made_by: tuple[str, str]
 ) -> dict[str, FigureRecord]:
-    """Writes the depth and its images; returns the figures by kind.
+    """Writes the depth and its images; returns where the panels of the images lie, by kind.
 
-    An improvement map needs ground truth, or points that the result has not seen.
+    An improvement map needs ground truth, or points that the result has not seen; without them it
+    is not written.
 
     Args:
         outputs: The files by kind.
@@ -133,51 +147,55 @@ def write_outputs(
         write_mask(outputs["valid"], frame.valid)
     # Images for a person.
     figures = {}
+    unit = inputs.unit
     if "preview" in outputs:
         xy = inputs.own.xy.numpy()
         depth = inputs.own.depth.numpy()
         figures["preview"] = preview(
-            image, xy, depth, frame.before, frame.depth, outputs["preview"], inputs.unit, made_by
+            image, xy, depth, frame.before, frame.depth, outputs["preview"], unit, made_by
         )
     path = outputs.get("improvement")
-    unit = inputs.unit
     if path is not None and inputs.gt is not None:
         figures["improvement"] = improvement(
             image, frame.before, frame.depth, inputs.gt, path, unit
         )
-    elif path is not None and (points := _unseen_points(inputs, frame)) is not None:
-        figures["improvement"] = improvement_at_points(image, points, inputs.size, path, unit)
+    elif path is not None:
+        unseen = _unseen_points(inputs, frame)
+        if unseen is not None:
+            figures["improvement"] = improvement_at_points(image, unseen, inputs.size, path, unit)
     if "view" in outputs and inputs.camera is not None:
         _write_view(outputs["view"], inputs, frame, inputs.camera)
     return figures
 
 
 def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
-    """The held-out points, else the validation points, with the depths there; None without any."""
-    held_out, validation = inputs.held_out, frame.validation
-    # Held-out points have no part in the result; validation points choose and weigh its experts.
+    """The held-out points, else the validation points, with the depths there; None without any.
+
+    Held-out points have no part in the result; validation points choose and weigh its experts, but
+    the depths that are compared there were made without them.
+    """
+    held_out = inputs.held_out
+    validation = frame.validation
     if len(held_out):
-        maps = (
-            torch.from_numpy(frame.before),
-            torch.from_numpy(frame.depth),
-            linear(inputs.points),
-        )
-        before, after, between = (held_out.sample(depth).numpy() for depth in maps)
         points = held_out
         what = "held-out points"
+        before = held_out.sample(torch.from_numpy(frame.before))
+        after = held_out.sample(torch.from_numpy(frame.depth))
+        interpolated = held_out.sample(linear(inputs.points))
     elif validation is not None and len(validation.points):
-        stages = (BEFORE, AFTER, LINEAR)
-        before, after, between = (validation.predicted[stage].numpy() for stage in stages)
         points = validation.points
         what = "validation points"
+        before = validation.predicted[BEFORE]
+        after = validation.predicted[AFTER]
+        interpolated = validation.predicted[LINEAR]
     else:
         return None
     return PointErrors(
         xy=points.xy.numpy(),
         truth=points.depth.numpy(),
-        before=before,
-        after=after,
-        linear=between,
+        before=before.numpy(),
+        after=after.numpy(),
+        linear=interpolated.numpy(),
         what=what,
     )
 
@@ -188,13 +206,20 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined, camera: Camera) -
     Every depth is cut at its edges, as a cloud is, on one grid. An image of more pixels than
     `LARGEST_VIEW` is thinned to every n-th row and column. In the JSON, depths are base64 of
     uint16, 0 = unknown, else logarithmic over `range`.
+
+    Args:
+        path: The JSON file.
+        inputs: The frame as it was read.
+        frame: The refined frame.
+        camera: The camera in pixels of the image.
     """
     # Depths without the points between surfaces, on a grid of few enough pixels.
     height, width = inputs.size
     stride = math.ceil(math.sqrt(height * width / LARGEST_VIEW))
     thinned = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     maps = {"before": frame.before, "after": frame.depth}
-    maps |= {} if inputs.gt is None else {"gt": inputs.gt}
+    if inputs.gt is not None:
+        maps["gt"] = inputs.gt
     depths = {}
     for name, depth in maps.items():
         keep = frame.valid if name == "after" else None
@@ -202,7 +227,7 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined, camera: Camera) -
     # Their range, and the rays of the camera.
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     near, far = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
-    far = max(far, near * 1.001)
+    far = max(far, near * _LEAST_RATIO)
     rays = _rays(camera, (height, width))
     write_json(
         path,
@@ -213,34 +238,50 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined, camera: Camera) -
             "range": [near, far],
             "middle": float(np.median(known)) if len(known) else 1.0,
             "farthest": far,
-            "spacing": stride / float(camera.intrinsics[0, 0]),
+            "spacing": stride / float(camera.intrinsics[0, 0]),  # of points at depth 1
             "unit": inputs.unit,
-            "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _text(rays, "<f4")},
-            "depths": {name: _text(_codes(d, near, far), "<u2") for name, d in depths.items()},
-            "colours": _text(_colours(inputs.image, frame)[thinned], "|u1"),
+            "rays": {"size": [rays.shape[1], rays.shape[0]], "values": _base64(rays, "<f4")},
+            "depths": {
+                name: _base64(_codes(depth, near, far), "<u2") for name, depth in depths.items()
+            },
+            "colours": _base64(_colours(inputs.image, frame)[thinned], "|u1"),
         },
     )
 
 
 def _codes(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.float64]:
-    """1…65535, logarithmic from near to far; 0 where unknown."""
+    """1…65535, logarithmic from `near` to `far`, of depth in between; 0 where it is 0, unknown."""
     known = depth > 0
     position = np.log(np.where(known, depth, near) / near) / math.log(far / near)
     return np.where(known, 1 + np.rint(position * (LARGEST_CODE - 1)), 0)
 
 
 def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
-    """(rows, columns, 2) x/z and y/z at the nodes of a grid from the first to the last pixel."""
-    rows, columns = (np.linspace(0, n - 1, 2 + _RAY_NODES * (n - 1) // max(size)) for n in size)
+    """(rows, columns, 2) x/z and y/z at the nodes of a grid from the first to the last pixel.
+
+    A viewer interpolates between the nodes; `_RAY_NODES` says how many there are.
+
+    Args:
+        camera: The camera in pixels of the image.
+        size: (H, W) of the image.
+    """
+    rows, columns = (
+        np.linspace(0, side - 1, 2 + _RAY_NODES * (side - 1) // max(size)) for side in size
+    )
     xy = np.stack(np.meshgrid(columns, rows), axis=-1)
     return rays_of(camera, xy.reshape(-1, 2)).reshape(xy.shape)
 
 
 def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.uint8]:
-    """(H, W, 3) of the image, or of the depth where there is none."""
+    """(H, W, 3) 0…255 of the image (H, W, 3) in 0…1, or of the depth where there is no image."""
     if image is not None:
         return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return depth_scale(frame.depth).paint(frame.depth)
+
+
+def _base64(values: NDArray[np.number], kind: str) -> str:
+    """The values in base64, row by row, as numbers of a kind such as `<f4`, NumPy's name of it."""
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
 
 
 def _text(values: NDArray[np.number], kind: str) -> str:

@@ -37,14 +37,16 @@ def load_method(
         UsageError: The request combines what cannot be combined.
         ModelError: The network cannot be loaded.
     """
-    own = load_network(request.model, request.checkpoint, request.device)
+    # The user's networks; the range of the input that a user states is that of the first.
+    network = load_network(request.model, request.checkpoint, request.device)
     others = [load_network(model, None, request.device) for model in request.more_models]
     return Method(
-        [with_input_range(own, request.normalise), *others],
+        [with_input_range(network, request.normalise), *others],
         request.method,
         first,
         more,
         validated=request.baselines,
+        # Where depth is supported is found with its standard deviation.
         uncertainty=request.uncertainty or request.unknown == "zero",
         keep_measured=request.keep_measured,
     )

@@ -34,9 +34,10 @@ def write_refined(
     batch: BatchState | None = None,
     folder: Path | None = None,
 ) -> FrameRecord:
-    """Scores the refined frame and writes it in place of an earlier result, its record last.
+    """Scores the refined frame and writes it in place of an earlier result; returns its record.
 
-    The record is the same from run to run, except `seconds` and `peak_memory_mb`.
+    The record is written last, so that it names no file that is not there. It is the same from run
+    to run, except `seconds` and `peak_memory_mb`.
 
     Args:
         request: How the frame was refined.
@@ -47,26 +48,19 @@ def write_refined(
         seconds: Seconds by what they were spent on; gets those of writing.
         batch: What the record keeps for the batch that the frame is of.
         folder: Output folder of that batch, which the record's paths start from.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
+    # Depth as the file can hold it, and scores of that.
     scale = integer_scale(inputs.own, inputs.depth_scale)
     frame = without_unknown(request, inputs, frame)
     frame = within_range(frame, outputs["depth"], scale)
-    # What the record says but for the files.
-    files = request.files
-    first = files.image_file or files.sparse
-    of_networks = [note for member in method.members for note in member.network.notes]
-    record = record_of_frame(
-        frame,
-        inputs,
-        name=files.name or (first.stem if first else ""),
-        group=files.group,
-        notes=(*inputs.notes, *of_networks),
-        with_baselines=request.baselines,
-    )
+    record = _score(request, method, inputs, frame)
     result = record_of_result(
         frame,
         inputs,
-        spec=str(files.depths[0]) if frame.networks[0].is_map else request.model,
+        spec=str(request.files.depths[0]) if frame.networks[0].is_map else request.model,
         holdout=request.holdout,
     )
     make_folder(outputs["depth"].parent, below=folder)
@@ -92,3 +86,23 @@ def write_refined(
         if "record" in outputs:
             record.write(outputs["record"])
     return record
+
+
+def _score(
+    request: RefineRequest, method: Method, inputs: ReadFrame, frame: Refined
+) -> FrameRecord:
+    """The record of the refined frame with its errors and notes, without its result."""
+    files = request.files
+    name = files.name
+    if not name:  # as of a frame that is of no data set
+        source = files.image_file or files.sparse
+        name = "" if source is None else source.stem
+    notes_of_networks = [note for member in method.members for note in member.network.notes]
+    return record_of_frame(
+        frame,
+        inputs,
+        name=name,
+        group=files.group,
+        notes=(*inputs.notes, *notes_of_networks),
+        with_baselines=request.baselines,
+    )

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 LOCAL = "local"
 """The address of a Ray cluster of this machine's devices, which ends with the command."""
 _ADDRESS = re.compile(r"(ray://)?[^/]+:\d+")
+"""HOST:PORT or ray://HOST:PORT."""
 
 
 def parse_shard(text: str) -> tuple[int, int]:
     """Returns (I, N) of `I/N`. Raises UsageError for any other text."""
-    number, slash, of = text.partition("/")
-    if slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of):
-        return int(number), int(of)
+    index, slash, count = text.partition("/")
+    if slash and index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count):
+        return int(index), int(count)
     raise UsageError(f"--shard must be I/N with I from 1 to N, such as 1/4, got {text}")
 
 
@@ -49,8 +50,8 @@ class Listener:
     say: Callable[[str], None]  # receives a note or a warning, one line
     show: Callable[[int, int], None]  # receives how many are done or have failed, of how many
     stopped: Callable[[], bool]  # asked before each frame; True ends the batch
-    done: int = 0
-    to_do: int = 0
+    done: int = 0  # frames that are done or have failed
+    to_do: int = 0  # frames that the batch refines, those that are done among them
 
     def begin(self, to_do: int) -> None:
         """Starts counting; `to_do` frames follow."""
@@ -58,7 +59,7 @@ class Listener:
         self.show(0, to_do)
 
     def frame(self, record: FrameRecord) -> None:
-        """Counts a frame, and says why it failed if it did."""
+        """Counts a frame, and says why it diverged or failed if it did."""
         if record.status != "done":
             self.say(f"{record.status}: {record.name}: {record.message}")
         self.done += 1
@@ -170,13 +171,16 @@ class BatchRequest:
 
     @property
     def reading(self) -> ReadOptions:
-        """How the files of every frame are read, with the points that the protocol has."""
-        reading = self.refine.reading
+        """How the files of every frame are read, with the points that the protocol has.
+
+        Points that the user asks for go before those of the protocol.
+        """
+        options = self.refine.reading
         if self.protocol is None:
-            return reading
+            return options
         protocol = find_protocol(self.protocol)
-        reading = replace(reading, foreground=protocol.foreground)
-        if reading.sample is None and protocol.sample is not None:
+        options = replace(options, foreground=protocol.foreground)
+        if options.sample is None and protocol.sample is not None:
             sample = replace(parse_sample(protocol.sample), seed=protocol.seed)
-            reading = replace(reading, sample=sample)
-        return reading
+            options = replace(options, sample=sample)
+        return options

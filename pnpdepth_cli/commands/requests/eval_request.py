@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 from pnpdepth_cli import choices
@@ -84,14 +84,14 @@ class EvalRequest:
     )
 
     def __post_init__(self) -> None:
-        for flag, value, least in (
+        for flag, value, bound in (
             ("--pred-scale", self.pred_scale, 0.0),
             ("--gt-scale", self.gt_scale, 0.0),
             ("--max-depth", self.max_depth, self.rules.min_depth),
             ("--delta", self.delta, 1.0),
         ):
-            if value is not None and not (math.isfinite(value) and value > least):
-                raise UsageError(f"{flag} must be a finite number above {least:g}, got {value:g}")
+            if value is not None and not (math.isfinite(value) and value > bound):
+                raise UsageError(f"{flag} must be a finite number above {bound:g}, got {value:g}")
         inverse_factor("--gt-kind", self.gt_kind)
         if self.depth_limits is not None:
             near, far = self.depth_limits
@@ -108,15 +108,16 @@ class EvalRequest:
     @cached_property
     def rules(self) -> Protocol:
         """The protocol with what the user changes of it."""
-        own = find_protocol(self.protocol)
+        protocol = find_protocol(self.protocol)
         return replace(
-            own,
-            max_depth=own.max_depth if self.max_depth is None else self.max_depth,
-            exclude_sparse=own.exclude_sparse or self.exclude_sparse,
+            protocol,
+            max_depth=protocol.max_depth if self.max_depth is None else self.max_depth,
+            exclude_sparse=protocol.exclude_sparse or self.exclude_sparse,
         )
 
     @property
     def _thresholds(self) -> list[float]:
+        """The thresholds of δ1, δ2 and δ3."""
         return [self.delta, self.delta**2, self.delta**3]
 
     @property
@@ -126,16 +127,26 @@ class EvalRequest:
 
     @cached_property
     def measures(self) -> tuple[Measure, ...]:
-        """The measures in order, and how tables show them."""
+        """What is measured, in the order of tables, and how they show it.
+
+        The usual measures come first, then those by depth, then those that are only computed where
+        `columns` names them.
+        """
         if self.is_devkit:
             return DEVKIT_MEASURES
         usual = with_thresholds(self._thresholds)
-        of_parts = () if self.depth_limits is None else by_depth(usual, *self.depth_limits)
-        if self.protocol == "kitti":
-            in_mm = partial(replace, shown_unit="mm", shown_factor=1000.0, decimals=1)
-            usual = tuple(in_mm(m) if m.key in ("rmse", "mae") else m for m in usual)
-        named = (key for key in self.columns or () if key in choices.MEASURES)
-        return (*usual, *of_parts, *(choices.MEASURES[key] for key in named))
+        of_depths = () if self.depth_limits is None else by_depth(usual, *self.depth_limits)
+        if self.protocol == "kitti":  # whose tables have millimetres
+            usual = tuple(
+                replace(measure, shown_unit="mm", shown_factor=1000.0, decimals=1)
+                if measure.key in ("rmse", "mae")
+                else measure
+                for measure in usual
+            )
+        on_request = [
+            choices.MEASURES[key] for key in self.columns or () if key in choices.MEASURES
+        ]
+        return (*usual, *of_depths, *on_request)
 
     @property
     def scoring(self) -> dict[str, object]:
@@ -155,8 +166,11 @@ class EvalRequest:
 
     def describe(self) -> str:
         """Returns one line, such as `eigen: min_depth 0.001, max_depth 80, crop eigen, …`."""
-        changed = self.rules != find_protocol(self.protocol) or self.delta != _DELTA
-        rules = self.scoring.items()
-        texts = (f"{name} {value}" for name, value in rules if value not in (None, False, "none"))
-        name = f"{self.protocol} (changed)" if changed else self.protocol
+        is_changed = self.rules != find_protocol(self.protocol) or self.delta != _DELTA
+        name = f"{self.protocol} (changed)" if is_changed else self.protocol
+        texts = [
+            f"{rule} {value}"
+            for rule, value in self.scoring.items()
+            if value not in (None, False, "none")  # a rule that is off
+        ]
         return f"{name}: {', '.join(texts)}; mean over the images"

@@ -29,7 +29,9 @@ class RefineRequest:
     """Everything the user asks of the refinement of one frame."""
 
     files: FrameFiles = field(default_factory=FrameFiles)
+    """The image, its sparse depth and its ground truth."""
     reading: ReadOptions = field(default_factory=ReadOptions)
+    """How the files are read, as the user states it."""
     # Which network, with which weights, and where it runs.
     model: str = option(
         "compact",
@@ -79,7 +81,11 @@ class RefineRequest:
 
     @property
     def read_options(self) -> ReadOptions:
-        """How the frame's files are read. The paper's setting moves and drops nothing."""
+        """How the frame's files are read, as the method needs it.
+
+        With the paper's method no image is moved and no occluded point dropped, unless the user
+        states it.
+        """
         if not self.method.is_paper:
             return self.reading
         registration = self.reading.registration
@@ -90,26 +96,36 @@ class RefineRequest:
         )
 
     def with_fields(self, **values: Any) -> RefineRequest:
-        """Returns a copy with other values of these fields, its own or of any group."""
+        """Returns a copy with other values of these fields, its own or of any of `GROUPS`."""
         changes = {}
         for group in GROUPS:
-            own = getattr(self, group)
-            names = values.keys() & {declared.name for declared in fields(own)}
-            changes[group] = replace(own, **{name: values.pop(name) for name in names})
+            value = getattr(self, group)
+            names = values.keys() & {declared.name for declared in fields(value)}
+            changes[group] = replace(value, **{name: values.pop(name) for name in names})
         return replace(self, **changes, **values)
 
     def outputs_in(self, folder: Path, name: str) -> Outputs:
-        """Returns the files of a result in a folder; slashes in the name are subfolders."""
-        asked = {"view": self.view_3d, "sigma": self.uncertainty, "valid": self.uncertainty}
-        return {
-            kind: folder / f"{name}{end}"
-            for kind, end in endings_of(f".{self.format}").items()
-            if asked.get(kind, True)
-        }
+        """Returns the files of a result in a folder, by kind.
+
+        Args:
+            folder: The folder.
+            name: Name of the frame; a slash in it stands for a subfolder.
+        """
+        endings = endings_of(f".{self.format}")
+        if not self.view_3d:
+            del endings["view"]
+        if not self.uncertainty:
+            del endings["sigma"]
+            del endings["valid"]
+        return {kind: folder / f"{name}{ending}" for kind, ending in endings.items()}
 
 
 def endings_of(suffix: str) -> dict[str, str]:
-    """Returns the ends of the names of all files of a result, by kind; the depth has the suffix."""
+    """Returns the ends of the names of all files of a result, by kind.
+
+    Args:
+        suffix: Suffix of the depth file, such as `.png`; that of its standard deviation, too.
+    """
     return {
         "depth": f"_depth{suffix}",
         "sigma": f"_sigma{suffix}",
@@ -123,10 +139,16 @@ def endings_of(suffix: str) -> dict[str, str]:
 
 def parse_sample(text: str) -> SamplePattern:
     """Returns the pattern of `500`, `5%` or `lines:16`. Raises UsageError for any other text."""
-    kind, _, number = text.rpartition(":")
+    kind, _, amount = text.rpartition(":")
+    amount_without_space = amount.strip()
     try:
-        fraction = float(number.strip()[:-1]) / 100 if number.strip().endswith("%") else None
-        count = int(number) if fraction is None else None
+        if amount_without_space.endswith("%"):
+            count = None
+            fraction = float(amount_without_space[:-1]) / 100
+        else:
+            count = int(amount)
+            fraction = None
+    # Python's own error says nothing to a user.
     except ValueError:
-        raise UsageError(f"count {number!r} is neither a number such as 500 nor 5%") from None
+        raise UsageError(f"count {amount!r} is neither a number such as 500 nor 5%") from None
     return SamplePattern(kind=kind or "uniform", count=count, fraction=fraction)

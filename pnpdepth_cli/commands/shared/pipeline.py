@@ -25,7 +25,13 @@ def in_order(
 ) -> Generator[Result, None, None]:
     """Yields work(item) of each item in order, computed by several threads.
 
-    Only a few items are taken in advance, so memory does not grow with their number.
+    Only a few items are taken in advance, so memory does not grow with their number. An exception
+    of `work` is raised where its result would be yielded.
+
+    Args:
+        work: Function that the threads call.
+        items: What it is called with, an item a call.
+        workers: Number of threads.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:
@@ -36,6 +42,7 @@ def in_order(
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
+        # Where nobody takes the rest, or work has failed, what has not begun does not begin.
         finally:
             for future in waiting:
                 future.cancel()
@@ -43,7 +50,7 @@ def in_order(
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Adds the time spent inside to the seconds of the stage."""
+    """Adds the time spent inside to `seconds[stage]`, also if it ends with an exception."""
     start = time.perf_counter()
     try:
         yield
@@ -62,11 +69,13 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
 
 
 def _peak_resident_bytes() -> int:
-    # Linux says the peak only here; Windows through psutil; macOS not, so what is in use counts.
+    """The most memory that the process had so far; on macOS, which does not tell, what it has."""
+    # Linux tells it only here, in a line such as `VmHWM:  123456 kB`.
     status = Path("/proc/self/status")
     if status.exists():
         line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
         return int(line.split()[1]) * 1024
+    # Windows tells it through psutil.
     import psutil
 
     memory = psutil.Process().memory_info()

@@ -31,8 +31,11 @@ class ResultFrame:
     name: str
     """Path below the folder of the results, without the ending."""
     depth: Path
+    """The depth file."""
     sigma: Path | None = None
+    """The file of the depth's standard deviation. None: there is none."""
     valid: Path | None = None
+    """The mask of valid depth. None: there is none, and all known depth is valid."""
     record: FrameRecord = field(default_factory=FrameRecord)
     """The record beside the depth; an empty one where there is none."""
 
@@ -78,10 +81,18 @@ class ResultFrame:
         depth = read_depth(self.depth, scale=scale).values
         if self.valid is None:
             return depth, depth > 0
-        return depth, (depth > 0) & (self.of_size(self.valid, depth) > 0)
+        return depth, (depth > 0) & (self.read_beside(self.valid, depth) > 0)
 
-    def of_size(self, path: Path, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the mask or standard deviation in a file. Raises InputError if it is another."""
+    def read_beside(self, path: Path, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns the (H, W) mask, 0 = not valid, or standard deviation that lies beside the depth.
+
+        Args:
+            path: `valid` or `sigma`.
+            depth: (H, W) the depth, for its size.
+
+        Raises:
+            InputError: The file is of another size.
+        """
         values = read_rgb(path).values[..., 0] if path == self.valid else read_depth(path).values
         if values.shape != depth.shape:
             raise InputError(f"{path} is not of the size of {self.depth}")
@@ -108,7 +119,10 @@ def result_frames(root: Path) -> list[ResultFrame]:
 
 
 def _frame(name: str, depth: Path) -> ResultFrame:
+    """The frame of a depth file, with the record, standard deviation and mask beside it."""
+
     def beside(kind: str) -> Path | None:
+        """The file of this kind, as `endings_of` has it, if there is one."""
         path = depth.with_name(depth.stem.removesuffix(_DEPTH) + endings_of(depth.suffix)[kind])
         return path if path != depth and path.is_file() else None
 
@@ -122,7 +136,11 @@ def _frame(name: str, depth: Path) -> ResultFrame:
 
 
 def _record(path: Path | None) -> FrameRecord | None:
-    """The record in a file beside a depth file, empty if another program wrote it; None without."""
+    """The record in a file beside a depth file; None if there is no file.
+
+    The record is empty if another program wrote the file. Raises InputError for one of this program
+    that cannot be read.
+    """
     if path is None:
         return None
     content = read_json(path)

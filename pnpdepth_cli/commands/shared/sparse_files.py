@@ -36,9 +36,16 @@ class Written(NamedTuple):
 def sparse_outputs(
     output: Path, inputs: Iterable[Path | None], overwrite: bool, *, drawn: bool = False
 ) -> dict[str, Path]:
-    """Returns the files to write, by kind. Raises OutputError if one cannot be, or is an input.
+    """Returns the files to write, by kind: "sparse", "record", and "overlay" if it is drawn.
 
-    An image with the points drawn on it is one of them where it is asked for.
+    Args:
+        output: File of the sparse depth.
+        inputs: Files that are read, which no output may replace; None where one is not given.
+        overwrite: Whether existing files may be replaced.
+        drawn: Whether an image with the points drawn on it is written, too.
+
+    Raises:
+        OutputError: The suffix is of no format of sparse depth, or a file cannot be written.
     """
     if output.suffix.lower() not in SPARSE_SUFFIXES:
         raise OutputError(
@@ -60,15 +67,18 @@ def write_sparse_files(
     *,
     rgb: NDArray[np.float32] | None = None,
 ) -> Written:
-    """Writes the sparse depth and its record; also over an image (H, W, 3) in 0…1 if there is one.
+    """Writes the sparse depth, its record, and an image with the points drawn on it if asked for.
 
     Args:
-        files: The files of `sparse_outputs`.
+        files: The files of `sparse_outputs`, by kind.
         points: The sparse depth.
         settings: What decided the points, for the record.
-        inputs: The files that the points are of, for the record.
+        inputs: The files that the points are of, by what each is, for the record.
         notes: Lines for a person.
-        rgb: The image.
+        rgb: (H, W, 3) in 0…1, the image to draw on. None if no overlay was asked for.
+
+    Returns:
+        The points, the notes and the files.
     """
     # The points, and an image of them.
     make_folder(files["sparse"].parent)
@@ -97,9 +107,19 @@ def write_sparse_files(
 
 
 def read_dense(path: Path, scale: float | None) -> tuple[NDArray[np.float32], list[str]]:
-    """Returns the dense depth (H, W) in a file, 0 where unknown, and lines for a person."""
+    """Returns the dense depth (H, W) metres in a file, 0 where unknown, and lines for a person.
+
+    Args:
+        path: The depth file.
+        scale: Numbers per metre that the user states. None: as the file says.
+
+    Raises:
+        InputError: The file cannot be read, or its depths are implausible in metres.
+    """
     dense = read_depth(path, scale=scale)
+    # Empty: the scale is stated of this very file, and not of the integers of another one.
+    of_integers = ""
     values, notes = plausible_map(
-        dense.values, dense.reading, "depth", "--depth-scale", scale, of_integers=""
+        dense.values, dense.reading, "depth", "--depth-scale", scale, of_integers=of_integers
     )
     return values, [f"depth: {describe_range(values, dense.reading, noun='pixels')}", *notes]

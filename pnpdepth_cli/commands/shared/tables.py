@@ -41,6 +41,7 @@ Errors = Mapping[str, Mapping[str, Scores]]
 """Scores by basis, then by stage, as `FrameRecord.errors` has them."""
 
 _LINEAR = "linear interpolation of all points"
+"""Title of the row that others are compared with."""
 _LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -57,6 +58,9 @@ _SEPARATOR = re.compile(r"([_/\-])")
 _LEAST_SAVED = 8
 """Characters for which a name is shortened."""
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
+"""A comma between groups of three digits, which LaTeX's columns of numbers do not have."""
+_LEAST_WEIGHT = 0.005
+"""Weight of an expert below which its text would be 0 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +93,10 @@ class Table:
 
     def latex(self) -> str:
         """Returns a tabular with rules of the package booktabs; its title is a comment above."""
+        headings: list[Cell] = [(heading, "") for heading in self.headings]
         header, *rows = (
-            " & ".join(_in_latex(*cell) for cell in line) + r" \\"
-            for line in ([(heading, "") for heading in self.headings], *self.cells)
+            " & ".join(_in_latex(text, style) for text, style in row) + r" \\"
+            for row in [headings, *self.cells]
         )
         lines = (
             f"% {' '.join(self.title.split())}",
@@ -109,7 +114,8 @@ class Table:
 
 
 def _cell(value: object) -> Cell:
-    if isinstance(value, tuple):
+    """The cell of a value as a person reads it: numbers with commas, nothing for None."""
+    if isinstance(value, tuple):  # a cell already
         return value
     if isinstance(value, str):
         return value, ""
@@ -117,12 +123,13 @@ def _cell(value: object) -> Cell:
 
 
 def _plain_cell(value: object) -> object:
-    """A cell without its style; None for what is no number."""
+    """The value as a program reads it: a cell without its style, None for NaN."""
     plain = value[0] if isinstance(value, tuple) else value
     return None if isinstance(plain, float) and math.isnan(plain) else plain
 
 
 def _in_latex(text: str, style: Style) -> str:
+    """The text as LaTeX sets it, without commas in numbers; bold if that is its style."""
     text = _THOUSANDS.sub("", text).translate(_LATEX)
     return rf"\textbf{{{text}}}" if style == "bold" else text
 
@@ -143,15 +150,18 @@ def some_names(names: Iterable[str]) -> str:
 def short_names(names: Sequence[str]) -> list[str]:
     """Returns the first name in full, and others with … for what they share with it.
 
-    What is shared ends at a separator, so that numbers stay whole.
+    What is shared ends at a separator, so that numbers stay whole. All names are in full where that
+    would save little.
     """
-    parts = [_SEPARATOR.split(name) for name in names]
-    start = _shared_parts(parts)
-    end = _shared_parts([of_name[:start:-1] for of_name in parts])
+    # Parts that all names have at the start; of what is behind the next one, those at the end.
+    parts_of_names = [_SEPARATOR.split(name) for name in names]
+    start = _shared_parts(parts_of_names)
+    ends_reversed = [parts[start + 1 :][::-1] for parts in parts_of_names]
+    end = _shared_parts(ends_reversed)
     before = "…" if start else ""
     after = "…" if end else ""
-    inner = ["".join(of_name[start : len(of_name) - end]) for of_name in parts]
-    short = [f"{before}{text}{after}" for text in inner]
+    middles = ["".join(parts[start : len(parts) - end]) for parts in parts_of_names]
+    short = [f"{before}{middle}{after}" for middle in middles]
     if len(names) < 2 or len(short[0]) + _LEAST_SAVED > len(names[0]):
         return [*names]
     return [names[0], *short[1:]]
@@ -159,8 +169,12 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def _shared_parts(names: Sequence[Sequence[str]]) -> int:
     """How many parts, from the first on, are the same in all names."""
-    same = [len({*parts}) == 1 for parts in zip(*names, strict=False)]
-    return same.index(False) if False in same else len(same)
+    count = 0
+    for parts in zip(*names, strict=False):
+        if len({*parts}) > 1:
+            break
+        count += 1
+    return count
 
 
 def write_text(path: Path, text: str) -> None:
@@ -171,32 +185,49 @@ def write_text(path: Path, text: str) -> None:
 
 
 def bases_of(errors: Errors) -> list[str]:
-    """Returns what errors are shown on: ground truth and held-out points, else the best."""
-    found = [basis for basis in BASES if errors.get(basis)]
-    return [basis for basis in found if basis in (GT, HELD_OUT)] or found[:1]
+    """Returns on which points errors are shown: ground truth and held-out points, else the best.
+
+    They are keys of `measures.BASES`. The list is empty without any error.
+    """
+    bases = [basis for basis in BASES if errors.get(basis)]
+    return [basis for basis in bases if basis in (GT, HELD_OUT)] or bases[:1]
 
 
 def means_tables(
     errors: Errors, unit: str, titles: Mapping[str, str], keys: Sequence[str] | None = None
 ) -> list[Table]:
-    """Returns the mean errors of a batch on each basis; its measures have these keys."""
-    rows = {**titles, **{name: name for name in BASELINES if name not in titles}}
-    return [_table("means", basis, errors[basis], unit, rows, keys) for basis in bases_of(errors)]
+    """Returns the mean errors of a batch, a table for each basis that is shown.
+
+    Args:
+        errors: Mean errors by basis, then by stage.
+        unit: Unit of the depths.
+        titles: What each stage is, in words, in the order of the rows.
+        keys: Keys of the measures, in the order of the columns. None: the main ones.
+    """
+    baselines = {name: name for name in BASELINES if name not in titles}
+    rows = {**titles, **baselines}
+    return [
+        _errors_table("means", basis, errors[basis], unit, rows, keys) for basis in bases_of(errors)
+    ]
 
 
 def refinement_tables(record: FrameRecord) -> list[Table]:
-    """Returns the errors of a record on each basis."""
+    """Returns the errors of a refined frame, a table for each basis that is shown.
+
+    Raises:
+        InputError: The frame has no result.
+    """
     result = record.refined()
     names = " + ".join(result.method.names)
     title = f"{names}, method {result.method.name}"
     titles = stage_titles(result)
     return [
-        _table(title, basis, record.errors[basis], record.unit, titles)
+        _errors_table(title, basis, record.errors[basis], record.unit, titles)
         for basis in bases_of(record.errors)
     ]
 
 
-def _table(
+def _errors_table(
     about: str,
     basis: str,
     by_stage: Mapping[str, Scores],
@@ -204,43 +235,56 @@ def _table(
     titles: Mapping[str, str],
     keys: Sequence[str] | None = None,
 ) -> Table:
-    """A row for each stage in the order of the titles: its errors, also against linear ones."""
-    shown = [stage for stage in titles if stage in by_stage]
-    last = AFTER
-    scores = by_stage[last]
+    """A row for each stage: its errors, and its MAE against that of linear interpolation.
+
+    Args:
+        about: Beginning of the title.
+        basis: What the errors are measured on, a key of `measures.BASES`.
+        by_stage: Errors by stage; the result is among them.
+        unit: Unit of the depths.
+        titles: What each stage is, in words, in the order of the rows.
+        keys: Keys of the measures, in the order of the columns. None: the main ones.
+    """
+    result = by_stage[AFTER]
     linear = by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
-    measures = [m for m in chosen if m.key in scores and (keys or m.main)]
-    # How many pixels, points or frames they are of.
-    count = count_of(scores["points"] or 0, "point") if "points" in scores else ""
-    if "frames" in scores:
-        count = count_of(scores["frames"] or 0, "frame")
-    elif "coverage" in scores:
-        count = f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
-    remark = ", where a change proves nothing" if basis == USED else ""
-    # The rows.
+    measures = [m for m in chosen if m.key in result and (keys or m.main)]
     rows = []
-    for stage in shown:
-        own = by_stage[stage]
-        style: Style = "bold" if stage == last else ""
-        texts = [m.text(own.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
+    for stage in [stage for stage in titles if stage in by_stage]:
+        scores = by_stage[stage]
         title = titles[stage]
-        if own.get("frames") != scores.get("frames"):
-            title += f" (over {own['frames']:,} frames)"
-        against: Cell = ("", "")
-        if stage != LINEAR:
-            of_same = own.get("frames") == linear.get("frames")
-            against = change(linear.get("mae") if of_same else None, own.get("mae"))
-        rows.append([*((text, style) for text in (title, *texts)), against])
+        # A stage that not all frames have is a mean over others than the result.
+        if scores.get("frames") != result.get("frames"):
+            title += f" (over {scores['frames']:,} frames)"
+        texts = [m.text(scores.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
+        style: Style = "bold" if stage == AFTER else ""
+        row: list[Cell] = [(text, style) for text in (title, *texts)]
+        if stage == LINEAR:
+            row.append(("", ""))
+        else:
+            is_of_same_frames = scores.get("frames") == linear.get("frames")
+            linear_mae = linear.get("mae") if is_of_same_frames else None
+            row.append(change_cell(linear_mae, scores.get("mae")))
+        rows.append(row)
+    remark = ", where a change proves nothing" if basis == USED else ""
     return Table(
-        title=f"{about}: errors {BASES[basis]}{remark}, {count}",
+        title=f"{about}: errors {BASES[basis]}{remark}, {_count_text(result)}",
         columns=["", *(measure.title for measure in measures), "MAE vs linear"],
         rows=rows,
     )
 
 
+def _count_text(scores: Scores) -> str:
+    """How many frames, pixels or points the scores are of."""
+    if "frames" in scores:
+        return count_of(scores["frames"] or 0, "frame")
+    if "coverage" in scores:
+        return f"{scores['pixels']:,} pixels ({scores['coverage']:.1%} of those known)"
+    return count_of(scores["points"] or 0, "point") if "points" in scores else ""
+
+
 def stage_titles(result: ResultRecord) -> dict[str, str]:
-    """Returns what each stage of a frame is, in words.
+    """Returns what each stage of a frame is, in words, by stage in the order of the refinement.
 
     The result is no stage of its own where it is the network's last stage: then that one is named.
     """
@@ -248,22 +292,22 @@ def stage_titles(result: ResultRecord) -> dict[str, str]:
     name = method.networks[0].name
     updates = len(result.loss) - 1  # fewer than asked if they diverged
     # The steps of the user's network.
-    steps = {BEFORE: name}
+    titles = {BEFORE: name}
     if result.alignment is not None:
-        steps[BEFORE] = f"{name}, aligned with the points"
+        titles[BEFORE] = f"{name}, aligned with the points"
     if updates > 0:
-        steps[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
+        titles[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
     if method.propagation != "none":
-        steps[PROPAGATED] = f"{name}, residual propagated"
-    # What becomes of them.
+        titles[PROPAGATED] = f"{name}, residual propagated"
+    # The result: the last of these steps, if no other expert has a weight; else what is fused.
     weighted = [expert for expert, weight in result.weights.items() if weight > 0]
-    if weighted in ([], [name]):
-        _, steps[AFTER] = steps.popitem()
+    if not weighted or weighted == [name]:
+        _, titles[AFTER] = titles.popitem()
     else:
-        steps[ALONE] = f"{method.names[-1]} alone"
-        steps[AFTER] = f"fused ({weights_text(result.weights)})"
-    steps[LINEAR] = _LINEAR
-    return steps
+        titles[ALONE] = f"{method.names[-1]} alone"
+        titles[AFTER] = f"fused ({weights_text(result.weights)})"
+    titles[LINEAR] = _LINEAR
+    return titles
 
 
 def names_of_depths(result: ResultRecord) -> tuple[str, str]:
@@ -273,8 +317,10 @@ def names_of_depths(result: ResultRecord) -> tuple[str, str]:
 
 
 def weights_text(weights: Mapping[str, float]) -> str:
-    """Returns the weights of experts as text, without those below half a per cent."""
-    return ", ".join(f"{name} {w:.0%}" for name, w in weights.items() if w >= 0.005)
+    """Returns the weights of experts by their names as text, without those that would be 0 %."""
+    return ", ".join(
+        f"{name} {weight:.0%}" for name, weight in weights.items() if weight >= _LEAST_WEIGHT
+    )
 
 
 def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
@@ -285,9 +331,17 @@ def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
     )
 
 
-def change(before: float | None, after: float | None) -> Cell:
-    """Returns how much an error rose or fell in per cent, as a good or a bad cell."""
-    if not before or after is None or math.isnan(before - after):
+def change_cell(before: float | None, after: float | None) -> Cell:
+    """Returns how much an error rose or fell, in per cent of that before: a good or a bad cell.
+
+    The cell is – where an error is unknown (None or NaN), or that before is 0.
+    """
+    if before is None or after is None or before == 0 or math.isnan(before - after):
         return "–", "dim"
     rise = after / before - 1
-    return f"{rise:+.1%}", "good" if rise < 0 else "bad" if rise > 0 else "dim"
+    style: Style = "dim"
+    if rise < 0:
+        style = "good"
+    elif rise > 0:
+        style = "bad"
+    return f"{rise:+.1%}", style

@@ -23,7 +23,7 @@ def test_a_change_is_relative_and_coloured_by_whether_it_is_better() -> None:
         (1.0, 0.5, "-50.0%", "good"),
         (1.0, 1.5, "+50.0%", "bad"),
     ):
-        assert [*tables.change(before, after)] == cell
+        assert [*tables.change_cell(before, after)] == cell
 
 
 def record_of(errors: dict[str, dict[str, Scores]], *networks: str, **fields: Any) -> FrameRecord:
