@@ -212,8 +212,8 @@ def inverse_factor(option: str, kind: str | None) -> float | None:
 
     Args:
         option: Option, or column of a list, that states the kind; for messages.
-        kind: "depth" or None; "inverse", 1/depth in 1/m; or "disparity:B", disparity in pixels, with
-            B in metres × pixels.
+        kind: "depth" or None; "inverse", which is 1/depth in 1/m; or "disparity:B", which is
+            disparity in pixels, with B in metres × pixels.
 
     Returns:
         1 of "inverse", and B of "disparity:B". None for depth itself.
@@ -239,8 +239,8 @@ def inverse_factor(option: str, kind: str | None) -> float | None:
 
 
 Unmatched = tuple[Path, str]
-"""A file or folder that belongs to no frame, and the reason, as a sentence that begins with it ends.
-"""
+"""A file or folder that belongs to no frame, and the reason: the end of a sentence that its path
+begins."""
 
 
 def check_path(path: Path) -> None:

@@ -17,38 +17,51 @@ from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, check_path
-from pnpdepth_cli.dataset.layouts.layout import Layout, row
+from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, layout_of_folders
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import read_bytes
 
 __all__ = ["LAYOUTS", "Layout", "list_frames"]
 
 
-def _prefix_with_place(mark: str) -> Callable[[Path, Path, str], str]:
-    """A function that puts the place's name and a mark before the stem, if it is not the root."""
-    return lambda root, place, stem: stem if place == root else f"{place.name}{mark}{stem}"
+def _name_with_place(mark: str) -> Callable[[Path, Path, str], str]:
+    """The function of root, place and stem that names a frame by its place's folder and its stem.
+
+    Args:
+        mark: Text between the two. A frame of the root itself is named by its stem alone.
+    """
+
+    def name(root: Path, place: Path, stem: str) -> str:
+        return stem if place == root else f"{place.name}{mark}{stem}"
+
+    return name
 
 
-def _of_void(place: Path) -> Callable[[FrameFiles], FrameFiles | None]:
-    """Keeps the frames of the test split, or all where no split is listed."""
+def _test_frames_of(place: Path) -> Finish:
+    """The function that keeps the frames of VOID's test split, or all where no split is listed."""
     split = place.parent.parent / "test_image.txt"
     if place.parent.name != "data" or not split.is_file():
         return replace
+    # The split lists images as .../SEQUENCE/image/STEM.png; a place is one sequence.
     words = read_bytes(split).decode("utf-8", "replace").split()
-    wanted = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
-    return lambda frame: frame if frame.name in wanted else None
+    stems = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
+
+    def keep(frame: FrameFiles) -> FrameFiles | None:
+        return frame if frame.name in stems else None
+
+    return keep
 
 
-SEVEN_SCENES = row(
+SEVEN_SCENES = layout_of_folders(
     {"image": r"(frame-[^.]+)\.color.IMAGE", "gt": r"(frame-[^.]+)\.depth.png"},
     below="|seq-*/",
     marks=("frame-*.color.*",),
-    name=_prefix_with_place("_"),
+    name=_name_with_place("_"),
     calib="camera-intrinsics.txt",
     shared=FrameFiles(gt_scale=1000.0),
 )
 
-ARKITSCENES = row(
+ARKITSCENES = layout_of_folders(
     {
         "image": "wide|color|lowres_wide/*.png",
         "sparse": "lowres_depth/*.png",
@@ -56,24 +69,24 @@ ARKITSCENES = row(
         "gt": "highres_depth/*.png?",
     },
     below="|*/|*/*/",
-    name=_prefix_with_place("/"),
+    name=_name_with_place("/"),
     shared=FrameFiles(sparse_scale=1000.0, gt_scale=1000.0, gt_other_size=True, one_view=True),
 )
 
-DIODE = row(
+DIODE = layout_of_folders(
     {"gt": "*_depth.npy", "image": "*.png", "mask": "*_depth_mask.npy"},
     below="|*/|*/*/|*/*/*/|*/*/*/*/",
     marks=("*_depth_mask.npy", "*_depth.npy"),
 )
 
-ETH3D = row(
+ETH3D = layout_of_folders(
     {"image": "images/dslr_images/*.JPG", "gt": "ground_truth_depth/dslr_images/*.JPG"},
     below="|*/|*/*/",
     marks=("ground_truth_depth",),
-    name=_prefix_with_place("/"),
+    name=_name_with_place("/"),
 )
 
-IBIMS = row(
+IBIMS = layout_of_folders(
     {
         "image": "rgb/*.png",
         "gt": "depth/*.png",
@@ -84,16 +97,18 @@ IBIMS = row(
     shared=FrameFiles(gt_scale=65535 / 50),
 )
 
-IMAGE_DEPTH = row({"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"}, calib="calib.txt")
+IMAGE_DEPTH = layout_of_folders(
+    {"image": "image|images/**.IMAGE", "gt": "depth/**.DEPTH"}, calib="calib.txt"
+)
 
-KITTI_OBJECT = row(
+KITTI_OBJECT = layout_of_folders(
     {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin", "calib": "calib/*.txt"},
     below="|training/|testing/",
-    name=_prefix_with_place("_"),
+    name=_name_with_place("_"),
     shared=FrameFiles(camera=2),
 )
 
-PAIRS = row(
+PAIRS = layout_of_folders(
     {
         "image": "rgb/**.IMAGE",
         "sparse": "sparse/**.SPARSE",
@@ -103,16 +118,16 @@ PAIRS = row(
     calib="calib.txt",
 )
 
-SCANNET = row(
+SCANNET = layout_of_folders(
     {"image": "color/*.IMAGE", "gt": "depth/*.png"},
     below="|*/|*/*/",
     marks=("intrinsic",),
-    name=_prefix_with_place("/"),
+    name=_name_with_place("/"),
     calib="intrinsic/intrinsic_color.txt",
     shared=FrameFiles(gt_scale=1000.0, gt_other_size=True),
 )
 
-VOID = row(
+VOID = layout_of_folders(
     {
         "image": "image/*.png",
         "sparse": "sparse_depth/*.png",
@@ -122,7 +137,7 @@ VOID = row(
     below="|*/|data/*/|*/data/*/",
     marks=("sparse_depth", "ground_truth"),
     calib="K.txt",
-    more=_of_void,
+    finish_of=_test_frames_of,
     shared=FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True),
 )
 
@@ -139,7 +154,7 @@ class DataSet(NamedTuple):
 
 
 def list_frames(root: Path, name: str | None = None) -> DataSet:
-    """Returns the frames of a data set.
+    """Returns the layout and the frames of a data set, and the files that belong to no frame.
 
     Args:
         root: The data set, or a folder with several of one layout.
@@ -157,23 +172,37 @@ def list_frames(root: Path, name: str | None = None) -> DataSet:
                 " or name the layout"
             )
         layout = layouts[0]
-        found = [(path, entry) for path in folders for entry in LAYOUTS[layout].frames(path)]
-    except OSError as error:
+        entries = [
+            (folder, entry) for folder in folders for entry in LAYOUTS[layout].frames(folder)
+        ]
+    except OSError as error:  # pathlib's, of a folder that cannot be read
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{error.filename or root} cannot be read ({reason}); check it") from error
-    frames = [
-        frame if folder == root else replace(frame, name=f"{folder.name}/{frame.name}")
-        for folder, frame in found
-        if isinstance(frame, FrameFiles)
-    ]
-    lost = dict.fromkeys(entry for _, entry in found if isinstance(entry, tuple))
-    for path, _ in lost:
+    # Frames of a folder in the root have its name before theirs.
+    frames = list[FrameFiles]()
+    unmatched = dict[Unmatched, None]()  # in their order, each once
+    for folder, entry in entries:
+        if isinstance(entry, tuple):
+            unmatched[entry] = None
+        elif folder == root:
+            frames.append(entry)
+        else:
+            frames.append(replace(entry, name=f"{folder.name}/{entry.name}"))
+    for path, _ in unmatched:
         check_path(path)
-    return DataSet(layout, frames, list(lost))
+    return DataSet(layout, frames, list(unmatched))
 
 
 def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
-    """The layout of the folder, or else of those in it, by their paths; at least one."""
+    """The name of the layout of the root, by its path; or else those of the folders in it.
+
+    Args:
+        root: The folder, or file.
+        names: Names of the layouts that it may have, in the order in which they are tried.
+
+    Raises:
+        InputError: Neither the root nor a folder in it has one of these layouts.
+    """
     if not root.exists():
         raise InputError(f"{root}: no such folder; check the path")
     if root.suffix.lower() == ".r3d":
@@ -185,13 +214,13 @@ def _data_sets(root: Path, names: Sequence[str]) -> dict[Path, str]:
     inside = sorted(root.iterdir()) if root.is_dir() else []
     below = [path for path in inside if path.is_dir() and not path.name.startswith(".")]
     for folders in ([root], below):
-        found = dict[Path, str]()
+        layouts = dict[Path, str]()
         for folder in folders:
             matching = next((name for name in names if LAYOUTS[name].matches(folder)), None)
             if matching is not None:
-                found[folder] = matching
-        if found:
-            return found
+                layouts[folder] = matching
+        if layouts:
+            return layouts
     # It is none. What a folder lacks is said where one layout is wanted.
     if root.is_file():
         raise InputError(

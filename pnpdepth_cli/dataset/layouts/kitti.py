@@ -15,32 +15,41 @@ the inertial system, where the drive has oxts/ and the date calib_imu_to_velo.tx
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose, file_of
-from pnpdepth_cli.dataset.layouts.layout import Layout, Part, join_parts, row
+from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, Part, join_parts, layout_of_folders
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_inertial_pose
 from pnpdepth_cli.io.poses import read_oxts, read_poses
 from pnpdepth_cli.protocols import ODOMETRY_PART
 
 _CAMERAS = "image_0[23]"
+"""Folders of the two colour cameras."""
 _SCANS = "velodyne_points/data"
+"""Folder of a drive's scans."""
 _CALIBRATION = "calib_cam_to_cam.txt"
+"""File of the cameras' calibration, by which its folder is known."""
 _PACKETS = "oxts/data"
+"""Folder of the inertial system's packets, one a frame."""
 _INERTIAL = "calib_imu_to_velo.txt"
+"""File with the pose of the inertial system."""
 _RAW = ("", "raw/", "kitti_raw/")
 """Folders of the raw data's dates."""
 _STEM = r"(.*_sync|)(?:_(?:image|velodyne_raw|groundtruth_depth)(?=_))?(.+)"
 """Names of the selection, without the kind of file in the middle."""
 _OF_MAPS = FrameFiles(sparse_scale=256.0, gt_scale=256.0, one_view=True)
+"""What all frames of depth completion have: codes per metre, and maps of the image's view."""
 
 
-def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
-    """The pose; poses belong to frames by number, so a part of a sequence has its own."""
+def _poses_of_sequence(place: Path) -> Finish:
+    """The function that gives frames of a sequence the poses of its file, if there is one.
+
+    Poses belong to frames by number, so frames of a part of a sequence have the right ones.
+    """
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
@@ -58,21 +67,36 @@ def _of_sequence(place: Path) -> Callable[[FrameFiles], FrameFiles]:
     return with_pose
 
 
-ODOMETRY = row(
+def _name_of_sequence(_root: Path, place: Path, stem: str) -> str:
+    """The name of a frame, such as 07_000123."""
+    return f"{place.name}_{stem}"
+
+
+ODOMETRY = layout_of_folders(
     {"image": "image_2/*.IMAGE", "sparse": "velodyne/*.bin"},
     below="|sequences/*/|dataset/sequences/*/",
     marks=("calib.txt",),
-    name=lambda root, place, stem: f"{place.name}_{stem}",
+    name=_name_of_sequence,
     calib="calib.txt",
-    more=_of_sequence,
+    finish_of=_poses_of_sequence,
     shared=FrameFiles(camera=2, part=ODOMETRY_PART),
 )
 
 
 def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
-    """The data of a drive, in it or in its namesake in a folder beside; it may not exist."""
-    drives = [drive, *(base / name / drive.name for base in drive.parents[:3] for name in beside)]
-    return next((path / inside for path in drives if (path / inside).is_dir()), drives[1] / inside)
+    """The folder of some data of a drive: in it, or in its namesake in another folder.
+
+    Args:
+        drive: The folder of the drive.
+        inside: Path of the data below a drive.
+        beside: Folders with drives of the same names, below one of the three folders above.
+
+    Returns:
+        A folder that does not exist if there are no such data.
+    """
+    namesakes = [base / name / drive.name for base in drive.parents[:3] for name in beside]
+    folders = [place / inside for place in (drive, *namesakes)]
+    return next((folder for folder in folders if folder.is_dir()), namesakes[0] / inside)
 
 
 def _truth_of(drive: Path, camera: str) -> Path:
@@ -83,10 +107,11 @@ def _truth_of(drive: Path, camera: str) -> Path:
 
 def _calibration_of(drive: Path) -> Path | None:
     """The folder with the calibration of a drive. None: there is none."""
-    return next((p for p in (drive.parent, drive) if (p / _CALIBRATION).is_file()), None)
+    folders = (drive.parent, drive)
+    return next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
 
 
-_SELECTION = row(
+_SELECTION = layout_of_folders(
     {
         "image": f"image/{_STEM}.IMAGE",
         "sparse": f"velodyne_raw/{_STEM}.png",
@@ -100,9 +125,15 @@ _SELECTION = row(
 
 
 def _folders(root: Path, starts: tuple[str, ...], inside: str) -> list[Path]:
-    """The folders of cameras at one of these places."""
-    found = (path for start in starts for path in root.glob(start + inside))
-    return sorted(path for path in found if path.is_dir())
+    """The folders below a root that have a path, behind one of these starts.
+
+    Args:
+        root: The folder.
+        starts: Patterns of where the path may begin.
+        inside: Pattern of the path.
+    """
+    paths = [path for start in starts for path in root.glob(start + inside)]
+    return sorted(path for path in paths if path.is_dir())
 
 
 def _scans_of_tree(root: Path) -> list[Path]:
@@ -112,14 +143,15 @@ def _scans_of_tree(root: Path) -> list[Path]:
 
 
 def _frames_of_depth(root: Path) -> Iterator[FrameFiles | Unmatched]:
-    """The frames of the benchmark's selection, or of its tree."""
+    """Yields the frames of the benchmark's selection, or of its tree; and files of no frame."""
     if _SELECTION.matches(root):
         yield from _SELECTION.frames(root)
         return
+    # Of a tree, scans are in DRIVE/proj_depth/velodyne_raw/CAMERA, images with the raw data.
     for scans in _scans_of_tree(root):
         drive = scans.parents[2]
         camera = scans.name
-        dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)
+        dates = (f"{raw}{drive.name[:10]}" for raw in _RAW)  # a drive's name begins with its date
         images = _of_drive(drive, Path(camera, "data"), *dates)
         parts = {
             "sparse": (scans, "*.png"),
@@ -139,16 +171,16 @@ DEPTH = Layout(
 
 
 def _raw_cameras(root: Path) -> list[Path]:
-    """The cameras of drives with scans."""
+    """The folders of cameras, in drives that have scans."""
     images = _folders(root, ("", "*/", "*/*/"), f"{_CAMERAS}/data")
     return [path.parent for path in images if (path.parents[1] / _SCANS).is_dir()]
 
 
 def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
-    """The frames of raw drives, with poses where a drive has them."""
+    """Yields the frames of raw drives, with poses where a drive has them; and files of no frame."""
     for camera in _raw_cameras(root):
         drive = camera.parent
-        calibration = _calibration_of(camera.parent)
+        calibration = _calibration_of(drive)
         if calibration is None:
             yield drive, f"has no {_CALIBRATION}; put KITTI's calibration into {drive.parent}"
             continue
@@ -158,19 +190,25 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
             "gt": (_truth_of(drive, camera.name), "*.png?"),
         }
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
-        found = list(_frames_of_camera(drive, camera.name, parts, shared))
-        frames = [entry for entry in found if isinstance(entry, FrameFiles)]
-        poses = _poses_of_drive(drive, frames)
-        for entry in found:
-            yield poses.get(entry, entry) if isinstance(entry, FrameFiles) else entry
+        entries = list(_frames_of_camera(drive, camera.name, parts, shared))
+        frames = [entry for entry in entries if isinstance(entry, FrameFiles)]
+        posed = _with_poses_of_drive(drive, frames)
+        for entry in entries:
+            yield posed.get(entry, entry) if isinstance(entry, FrameFiles) else entry
 
 
-def _poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:
-    """The frames with poses of the inertial system; none where a file of them is missing.
+def _with_poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:
+    """The frames with poses of the inertial system, by the frames without.
 
-    The world is the first frame's camera, rectified.
+    The world is the first frame's camera, rectified. Empty where a file of poses is missing.
+
+    Args:
+        drive: The folder of the drive.
+        frames: Frames of one camera of it, in their order.
     """
-    packets = [drive / _PACKETS / f"{file_of(f.image).stem}.txt" for f in frames if f.image]
+    packets = [
+        drive / _PACKETS / f"{file_of(frame.image).stem}.txt" for frame in frames if frame.image
+    ]
     inertial = drive.parent / _INERTIAL
     if not packets or not all(path.is_file() for path in (*packets, inertial)):
         return {}
@@ -178,21 +216,31 @@ def _poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFile
     if scanner is None:
         return {}
     # From the camera to the inertial system, to the world, and to the first camera.
-    of_camera = (scanner @ read_inertial_pose(inertial)).inverse()
-    places = [Extrinsics(pose[:, :3], pose[:, 3]) @ of_camera for pose in read_oxts(packets)]
-    origin = places[0].inverse()
-    poses = [as_pose((origin @ place).square()[:3]) for place in places]
-    return {f: replace(f, pose=pose) for f, pose in zip(frames, poses, strict=True)}
+    camera_to_inertial = (scanner @ read_inertial_pose(inertial)).inverse()
+    camera_to_world = [
+        Extrinsics(pose[:, :3], pose[:, 3]) @ camera_to_inertial for pose in read_oxts(packets)
+    ]
+    world_to_first = camera_to_world[0].inverse()
+    poses = [as_pose((world_to_first @ pose).square()[:3]) for pose in camera_to_world]
+    return {frame: replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)}
 
 
 def _frames_of_camera(
     drive: Path, camera: str, parts: Mapping[str, Part], shared: FrameFiles
 ) -> Iterator[FrameFiles | Unmatched]:
-    for found in join_parts(parts, replace(shared, camera=int(camera[-1]))):
-        if isinstance(found, tuple):
-            yield found
+    """Yields the frames of one camera of a drive, named by the two; and files of no frame.
+
+    Args:
+        drive: The folder of the drive.
+        camera: Folder of the camera, such as image_02, which ends with its number.
+        parts: Where the files of each part are, by its field of `FrameFiles`.
+        shared: A frame whose fields all frames have.
+    """
+    for entry in join_parts(parts, replace(shared, camera=int(camera[-1]))):
+        if isinstance(entry, tuple):
+            yield entry
         else:
-            yield replace(found, name=f"{drive.name}_{found.name}_{camera}")
+            yield replace(entry, name=f"{drive.name}_{entry.name}_{camera}")
 
 
 RAW = Layout(

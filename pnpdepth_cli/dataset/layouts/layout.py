@@ -1,4 +1,8 @@
-"""What a layout is, and one made of a row: folders of files that belong together by their stem."""
+"""What a layout is, and one made of a row: folders of files that belong together by their stem.
+
+A place is a folder that holds all parts of some frames, such as one sequence of a data set: its
+images, its sparse depth, its calibration.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ _SUFFIXES = {
     "SPARSE": (*DEPTH_SUFFIXES, *SCAN_ONLY_SUFFIXES, ".csv"),
     "CALIB": (".txt", ".json", ".yaml", ".yml"),
 }
-"""What a pattern of file names may end with, for any of these."""
+"""Words that the pattern of a file name may end with, for any of these suffixes."""
 
 _NO_FIELDS = FrameFiles()
 
@@ -35,84 +39,114 @@ _NO_FIELDS = FrameFiles()
 class Layout:
     """How the files of a data set lie on disk."""
 
-    matches: Callable[[Path], object]  # true for a folder or file of this layout
+    matches: Callable[[Path], object]
+    """Returns something true for a folder or file of this layout."""
     frames: Callable[[Path], Iterable[FrameFiles | Unmatched]]
-    """The frames of a folder or file that matches, and what is in no frame."""
+    """Returns the frames of a folder or file that matches, and the files that are in no frame."""
     needs: tuple[str, ...] = ()
     """Patterns of what a place of the data set has, for errors; | between alternatives."""
-    below: str = ""  # patterns of where the places are, below the root, with | between them
+    below: str = ""
+    """Patterns of where the places are, below the root, with | between them. Empty: it is one."""
 
     def lacks(self, root: Path) -> tuple[Path, str] | None:
-        """Returns the place with the most that is needed, and what it lacks, if anything."""
-        found = (p.parent for start in self.below.split("|") for p in root.glob(f"{start}*"))
-        places = {place: lacking(place, self.needs) for place in (root, *found)}
-        place = min(places, key=lambda place: len(places[place]))
-        return (place, places[place][0].replace("|", " or ")) if places[place] else None
+        """Returns the place that lacks least, and one pattern that it lacks; None if it has all."""
+        places = [root]
+        for pattern in self.below.split("|"):
+            places += [path.parent for path in root.glob(f"{pattern}*")]
+        lacked = {place: lacking(place, self.needs) for place in places}
+        best = min(lacked, key=lambda place: len(lacked[place]))
+        if not lacked[best]:
+            return None
+        return best, lacked[best][0].replace("|", " or ")
 
+
+Finish = Callable[[FrameFiles], FrameFiles | None]
+"""Returns a frame with further fields, such as its pose, or None for one that is not wanted."""
 
 Part = tuple[Path, str]
-"""The folder of one part of a frame, and a pattern of the names of its files.
+"""The folder of one part of a frame, such as its images, and a pattern of the names of its files.
 
-The stem of a name is what * stands for, or groups of a regular expression; ** stands for paths
-below the folder. A part whose pattern ends with ? may be missing."""
+The stem of a name, by which the parts of a frame belong together, is what * stands for, or the
+groups of a regular expression. ** stands for paths below the folder. A part whose pattern ends with
+? may be missing."""
 
 
-def _video(folder: Path, names: str) -> Path | None:
-    """The video that lies there instead of the folder of images."""
-    if not names.endswith(".IMAGE") or folder.is_dir():
+def _video_of(part: Part) -> Path | None:
+    """The video beside the folder of images that a part names. None: the folder is there."""
+    folder, pattern = part
+    if not pattern.endswith(".IMAGE") or folder.is_dir():
         return None
-    paths = (folder.with_name(folder.name + suffix) for suffix in VIDEO_SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
+    for suffix in VIDEO_SUFFIXES:
+        video = folder.with_name(folder.name + suffix)
+        if video.is_file():
+            return video
+    return None
 
 
 def _exists(part: Part) -> bool:
-    """Whether the folder of a part, or the video instead of it, is there."""
-    return part[0].is_dir() or _video(*part) is not None
+    """Whether the folder of a part is there, or the video instead of it."""
+    folder, _ = part
+    return folder.is_dir() or _video_of(part) is not None
 
 
 def lacking(place: Path, needs: Iterable[str]) -> list[str]:
-    """Returns the patterns, with | between alternatives, that nothing in a place has."""
-    return [need for need in needs if not any(next(place.glob(p), None) for p in need.split("|"))]
+    """Returns those of the patterns that nothing in a place has.
+
+    Args:
+        place: A folder.
+        needs: Patterns of paths below it, with | between alternatives.
+    """
+    lacked = list[str]()
+    for need in needs:
+        is_there = any(next(place.glob(pattern), None) for pattern in need.split("|"))
+        if not is_there:
+            lacked.append(need)
+    return lacked
 
 
-def _files(folder: Path, names: str) -> tuple[dict[str, Path], list[Unmatched]]:
-    """The files of a part by stem, sorted by number, and what belongs to no frame."""
-    stem, _, suffix = names.removesuffix("?").rpartition(".")
-    suffixes = _SUFFIXES.get(suffix, (f".{suffix}",))
+def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
+    """The files of a part by their stem, in natural order, and those that share a stem."""
+    folder, pattern = part
+    stem, _, ending = pattern.removesuffix("?").rpartition(".")
+    suffixes = _SUFFIXES.get(ending, (f".{ending}",))
     if stem == "**":
         return find_files(folder, suffixes)
-    stem = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
-    endings = "|".join(map(re.escape, suffixes))
-    pattern = re.compile(f"{stem}(?:{endings})", re.IGNORECASE | re.DOTALL)
-    paths = sorted(folder.iterdir()) if folder.is_dir() else []
-    files, ambiguous = one_of_each(
-        ("".join(match.groups("")), path)
-        for path in paths
-        if (match := pattern.fullmatch(path.name)) and path.is_file()
-    )
+    # A regular expression of the whole name, whose groups are the frame's stem.
+    stem_pattern = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
+    suffix_pattern = "|".join(map(re.escape, suffixes))
+    name_pattern = re.compile(f"{stem_pattern}(?:{suffix_pattern})", re.IGNORECASE | re.DOTALL)
+    named = list[tuple[str, Path]]()
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        match = name_pattern.fullmatch(path.name)
+        if match is not None and path.is_file():
+            named.append(("".join(match.groups("")), path))
+    files, ambiguous = one_of_each(named)
     return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
 
 
 def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
-    """Yields the frames, which the first part has, named by their stems; and files of none.
+    """Yields the frames, named by the stems of the first part's files, and files of no frame.
 
-    `shared` is a frame whose fields all frames have.
+    Args:
+        parts: Where the files of each part are, by its field of `FrameFiles`, or a name that begins
+            with "mask". Every frame has the first part; images may be one video instead.
+        shared: A frame whose fields all frames have.
     """
     # The images may be a video, which has each frame by its number.
-    video = _video(*parts["image"])
+    video = _video_of(parts["image"])
     if video is not None:
-        parts = {field: parts[field] for field in parts if field != "image"}
+        parts = {field: part for field, part in parts.items() if field != "image"}
     first, *others = parts
     needed = [field for field in others if not parts[field][1].endswith("?")]
     for field in needed:
-        folder = parts[field][0]
+        folder, _ = parts[field]
         if not folder.is_dir():
             yield parts[first][0], f"has no {folder}; add it"
             return
-    files = dict[str, dict[str, Path]]()
-    for field, (folder, names) in parts.items():
-        files[field], unreadable = _files(folder, names)
-        yield from unreadable
+    files = dict[str, dict[str, Path]]()  # by part, then by stem
+    for field, part in parts.items():
+        files[field], ambiguous = _files_of(part)
+        yield from ambiguous
     # Files without a partner.
     pairs = [(first, field) for field in needed] + [(field, first) for field in others]
     for field, partner in pairs:
@@ -121,94 +155,105 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
                 yield path, f"has no partner {stem}.* in {parts[partner][0]}; add or remove one"
     # The frames.
     for stem in files[first]:
-        own = {field: found[stem] for field, found in files.items() if stem in found}
-        if not own.keys() >= set(needed):
+        paths = {field: files[field][stem] for field in files if stem in files[field]}
+        if any(field not in paths for field in needed):
             continue
-        image: Path | VideoFrame | None = own.get("image")
+        image: Path | VideoFrame | None = paths.get("image")
         if video is not None:
-            if (number := re.search(r"\d+$", stem)) is None:
-                yield own[first], f"has no number of a frame of {video} in its name"
+            number = re.search(r"\d+$", stem)
+            if number is None:
+                yield paths[first], f"has no number of a frame of {video} in its name"
                 continue
             image = VideoFrame(path=video, index=int(number[0]))
         yield replace(
             shared,
             name=stem,
             image=image,
-            sparse=own.get("sparse"),
-            sparse_mask=own.get("sparse_mask"),
-            gt=own.get("gt"),
-            calib=own.get("calib", shared.calib),
-            masks=tuple(path for field, path in own.items() if field.startswith("mask")),
+            sparse=paths.get("sparse"),
+            sparse_mask=paths.get("sparse_mask"),
+            gt=paths.get("gt"),
+            calib=paths.get("calib", shared.calib),
+            masks=tuple(path for field, path in paths.items() if field.startswith("mask")),
         )
 
 
 def _path_below(root: Path, place: Path, stem: str) -> str:
-    """The path of a frame's files below the root."""
+    """The name of a frame that is the path of its files below the root."""
     return (place.relative_to(root) / stem).as_posix()
 
 
-def row(
+def layout_of_folders(
     parts: Mapping[str, str],
     *,
     name: Callable[[Path, Path, str], str] = _path_below,
     below: str = "",
     marks: tuple[str, ...] = (),
     calib: str = "",
-    more: Callable[[Path], Callable[[FrameFiles], FrameFiles | None]] | None = None,
+    finish_of: Callable[[Path], Finish] | None = None,
     shared: FrameFiles = _NO_FIELDS,
 ) -> Layout:
     """Returns the layout of a data set whose parts lie in folders, with files of one stem.
 
     Args:
-        parts: Folder, or folders with | between them of which the first that exists counts, and
-            pattern (see `Part`) by field of `FrameFiles`. Every frame has the first part.
-        name: Function of root, place and stem that gives the name of a frame; by default it is
-            the path of its files below the root.
+        parts: Folder and pattern of the names of files (see `Part`), as one path, by field of
+            `FrameFiles`. Of several folders, with | between them, the first that exists counts.
+            Every frame has the first part.
+        name: Function of root, place and stem that gives the name of a frame.
         below: Patterns of where the places are, below the root, with | between them.
-        marks: Patterns of what else a place has. The first, or else the last needed part's folder,
-            finds a place.
-        calib: File in a place, the calibration of frames without one of their own.
-        more: Function of a place. It gives a function of a frame, named by its stem, that returns
-            it with further fields, or None for one that is not wanted.
+        marks: Patterns of what else a place has. The first of these finds the places; without any,
+            the folder of the last part that is needed does.
+        calib: File in a place, the calibration of frames without one of their own. Empty: none.
+        finish_of: Function of a place that returns the function which finishes its frames, named by
+            their stems. None: they are complete.
         shared: A frame whose fields all frames have.
     """
     # What a place of the data set has, and by what it is found.
-    needed = [_places(text) for text in parts.values() if "/" in text and not text.endswith("?")]
+    needed = [_paths_of(part) for part in parts.values() if "/" in part and not part.endswith("?")]
     needs = (*needed, *marks)
-    probe = marks[0] if marks else needed[-1].split("|")[0]
+    finder = marks[0] if marks else needed[-1].split("|")[0]
 
-    def find(root: Path) -> list[Path]:
+    def find_places(root: Path) -> list[Path]:
         """The places below a root that have all that is needed."""
-        found = {path.parent for start in below.split("|") for path in root.glob(start + probe)}
-        return sorted(place for place in found if not lacking(place, needs))
-
-    def parts_in(place: Path) -> dict[str, Part]:
-        """The parts of the frames of a place."""
-        return {field: _part(place, text) for field, text in parts.items()}
+        places = set[Path]()
+        for start in below.split("|"):
+            places |= {path.parent for path in root.glob(start + finder)}
+        return sorted(place for place in places if not lacking(place, needs))
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
-        """The frames of all places, and what is in none."""
-        for place in find(root):
-            own = place / calib if calib and (place / calib).is_file() else None
-            complete = more(place) if more else replace
-            for found in join_parts(parts_in(place), replace(shared, calib=own)):
-                if isinstance(found, tuple):
-                    yield found
-                elif (frame := complete(found)) is not None:
+        """The frames of all places, and the files of no frame."""
+        for place in find_places(root):
+            calibration = place / calib if calib and (place / calib).is_file() else None
+            finish = finish_of(place) if finish_of else replace
+            parts_of_place = {field: _part_in(place, part) for field, part in parts.items()}
+            for entry in join_parts(parts_of_place, replace(shared, calib=calibration)):
+                if isinstance(entry, tuple):
+                    yield entry
+                    continue
+                frame = finish(entry)
+                if frame is not None:
                     yield replace(frame, name=name(root, place, frame.name))
 
-    return Layout(matches=find, frames=frames, needs=needs, below=below)
+    return Layout(matches=find_places, frames=frames, needs=needs, below=below)
 
 
-def _places(text: str) -> str:
-    """Where the files of a part may lie: its folders, and videos instead of images."""
-    folders, _, names = text.rpartition("/")
-    videos = VIDEO_SUFFIXES if names.endswith(".IMAGE") else ()
-    return "|".join(folder + end for end in ("", *videos) for folder in folders.split("|"))
+def _paths_of(part: str) -> str:
+    """The folders where the files of a part may lie, with | between; and videos instead of images.
+
+    Args:
+        part: Folders, with | between them, and pattern of names, as one path.
+    """
+    folders, _, pattern = part.rpartition("/")
+    endings = ("", *VIDEO_SUFFIXES) if pattern.endswith(".IMAGE") else ("",)
+    return "|".join(folder + ending for ending in endings for folder in folders.split("|"))
 
 
-def _part(place: Path, text: str) -> Part:
-    """The part of a place in the first of its folders, or videos, that exists."""
-    folders, _, names = text.rpartition("/")
-    parts = [(place / folder, names) for folder in folders.split("|")]
-    return next(filter(_exists, parts), parts[0])
+def _part_in(place: Path, part: str) -> Part:
+    """The part in the first of its folders that a place has, or a video instead; else in the first.
+
+    Args:
+        place: The folder of all parts.
+        part: Folders, with | between them, and pattern of names, as one path.
+    """
+    folders, _, pattern = part.rpartition("/")
+    candidates = [(place / folder, pattern) for folder in folders.split("|")]
+    return next(filter(_exists, candidates), candidates[0])
