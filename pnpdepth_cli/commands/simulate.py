@@ -11,7 +11,7 @@ from pnpdepth_cli.commands.shared.sparse_files import (
     sparse_outputs,
     write_sparse_files,
 )
-from pnpdepth_cli.dataset.arrays import check_size, record_of
+from pnpdepth_cli.dataset.arrays import check_camera, record_of
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range
@@ -40,7 +40,7 @@ def simulate_scan(
     files = sparse_outputs(output, (depth, calib), overwrite)
     dense, notes = read_dense(depth, depth_scale)
     calibration = read_calibration(calib)
-    notes += check_size(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
+    notes += check_camera(calib, calibration.camera, (dense.shape[0], dense.shape[1]), depth)
     points = simulate_lidar(dense, calibration.camera, lidar, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{lidar.name}, seed {seed}'))}")
     settings = {"command": "simulate", "sensor": plain(asdict(lidar)), "seed": seed}

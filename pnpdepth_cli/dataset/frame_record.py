@@ -282,7 +282,8 @@ class FrameRecord:
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)
-        # A text that is not Unicode ends msgspec's own message in a UnicodeError.
+        # msgspec raises ValidationError, also for our ValueErrors, and lets UsageError pass. A text
+        # that is not Unicode ends its own message in a UnicodeError.
         except (msgspec.ValidationError, OverflowError, UnicodeError, UsageError) as error:
             raise InputError(
                 f"{source} is no record of a frame as this version writes it"

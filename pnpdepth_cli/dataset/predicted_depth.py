@@ -64,7 +64,8 @@ _MORE_ZEROS = 3
 _SAMPLED = 2000
 """Pixels that stand for all of a map: their depths are compared with the image's edges."""
 _LEAST_WEIGHT = 0.5 - 1e-6
-"""Weight of known pixels, from which an interpolated one is known; half of it, but for rounding."""
+"""Sum of the weights of known pixels, from which an interpolated one is known: half of all, but for
+rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +224,13 @@ def _is_video(data: bytes) -> bool:
 
 
 def _holds_depth(path: Path, data: bytes, kind: str) -> bool:
-    """Whether a PNG or TIFF has one channel of 16 bits or floats, not a picture's pixels."""
+    """Whether a PNG or TIFF has one channel of 16 bits or floats, not a picture's pixels.
+
+    Args:
+        path: The file, for messages.
+        data: Its content.
+        kind: "PNG" or "TIFF".
+    """
     with images.open_image(path, data, kind) as image:
         mode = images.raw_mode(image) if kind == "PNG" else image.mode
         return mode.startswith("I;16") or (kind == "TIFF" and mode in ("F", "I"))
@@ -307,6 +314,7 @@ class _Unknown:
     """Which pixels of a map are unknown, and a line on each reason."""
 
     def __init__(self, values: Map) -> None:
+        """No pixel of the map (H, W) is unknown at first."""
         self._values = values
         self.mask = np.zeros(values.shape, bool)
         self.notes = list[str]()
@@ -317,7 +325,12 @@ class _Unknown:
         return self._values[~self.mask]
 
     def add(self, pixels: NDArray[np.bool_], what: str) -> None:
-        """Adds pixels, (H, W) true, and a line that says what those that are new hold."""
+        """Adds pixels, and a line that counts those that are new.
+
+        Args:
+            pixels: (H, W) true for the pixels.
+            what: What they hold, as a sentence ends.
+        """
         new = pixels & ~self.mask
         count = int(np.count_nonzero(new))
         if count:
@@ -349,7 +362,12 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
 
 
 def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
-    """Adds 0 and 255, at which a picture of depth is clipped, and a warning that it has steps."""
+    """Adds 0 and 255, at which a picture of depth is clipped, and a warning that it has steps.
+
+    Args:
+        unknown: The unknown pixels, to which these are added.
+        codes: (H, W) numbers as they are stored.
+    """
     lowest = codes == 0
     highest = codes == _STEPS - 1
     levels = len(np.unique(codes[np.isfinite(codes)]))
@@ -366,6 +384,10 @@ def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
     """Adds the largest code of an integer type, and the smallest below 0: no sensor measures them.
 
     Floats have none.
+
+    Args:
+        unknown: The unknown pixels, to which these are added.
+        codes: (H, W) numbers as they are stored.
     """
     if codes.dtype.kind not in "iu":
         return
@@ -376,7 +398,12 @@ def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
 
 
 def _add_marks(unknown: _Unknown, values: Map) -> None:
-    """Adds the only number below 0; and 0, unless it is one of many numbers of both signs."""
+    """Adds the only number below 0; and 0, unless it is one of many numbers of both signs.
+
+    Args:
+        unknown: The unknown pixels, to which these are added.
+        values: (H, W) numbers by their scale.
+    """
     known = unknown.known
     below_zero = np.unique(known[known < 0])
     if len(below_zero) == 1 and known.max(initial=0) > 0:
@@ -393,7 +420,12 @@ def _add_marks(unknown: _Unknown, values: Map) -> None:
 
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
-    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity."""
+    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity.
+
+    Args:
+        unknown: The unknown pixels, to which these are added.
+        values: (H, W) numbers by their scale.
+    """
     # About one value, far from all others and mixed with them at its edges.
     known = unknown.known.astype(np.float64)
     if known.min(initial=np.inf) > 0:

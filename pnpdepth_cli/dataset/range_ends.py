@@ -214,9 +214,13 @@ def _usual_numbers(numbers: Floats, is_alike: Mask, least_count: float) -> Float
 
 
 def _clip_lines(depth: Floats, unit: str) -> list[str]:
-    """Warnings on ends that may be a clip: far more depths (N,) have its value than any other.
+    """Warnings if far more depths have the largest or the smallest value than any other.
 
     A drawing, of few values, gives none.
+
+    Args:
+        depth: (N,) known depths.
+        unit: Name of their unit.
     """
     distinct, counts = np.unique(depth.astype(np.float32), return_counts=True)
     if len(distinct) < _FEW_VALUES:

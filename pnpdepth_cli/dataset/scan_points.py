@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.dataset.arrays import check_size
+from pnpdepth_cli.dataset.arrays import check_camera
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
 from pnpdepth_cli.dataset.scan_returns import cloud_points, has_scanner, scan_returns
@@ -125,7 +125,7 @@ def read_scan_points(
     size = size or calibration.camera.size
     if size is None:
         raise InputError(f"{calib} does not give the image's size; give --image")
-    warnings = check_size(calib, calibration.camera, size, image)
+    warnings = check_camera(calib, calibration.camera, size, image)
     # The returns of the scan, in metres.
     cloud = _read_cloud(path, calibration, scale, of_integers)
     # Of a raw and rectified cameras, that of the image. It is read where its edges tell something.
@@ -220,7 +220,7 @@ def _extrinsics_notes(
             f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
             f" that {calib} rectifies with are applied"
         )
-    # KITTI's own files have one direction.
+    # KITTI's own files always have the pose in one direction.
     if options.extrinsics is None and calibration.camera.source.startswith("KITTI"):
         return lines, False
     inverted = check_direction(cloud.xyz, calibration.camera, calibration.known_scanner, size)
@@ -228,7 +228,13 @@ def _extrinsics_notes(
 
 
 def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occluded: bool) -> Points:
-    """The points that the image (H, W) shows, with depth z in metres.
+    """The points of a scan that the image shows, with depth z in metres.
+
+    Args:
+        cloud: The points of the scan.
+        calibration: The calibration, with a pose of the scanner.
+        size: (H, W) of the image.
+        keep_occluded: Whether points stay that nearer ones hide from the camera.
 
     Raises:
         NoPointsError: There is none. It names the axes of the scan by which there are some.
@@ -265,23 +271,27 @@ def _edge_warning(
         cloud: The points of the scan.
         points: The points that the image shows.
         calibration: The calibration by which they are projected.
-        others: Further calibrations of the same scan, by what gives them.
+        others: Further calibrations of the same scan, by the option that gives each.
         options: Options that say whether `points` has occluded ones.
         rgb: (H, W, 3) in 0…1, the image.
     """
     if cloud.of_scanner:
         return fit_warning(cloud.xyz, calibration, others, rgb)
-    # A cloud is compared as the camera sees it: hidden points beside nearer ones would be jumps of
-    # depth.
+    # A cloud is compared as the camera sees it: hidden points beside nearer ones are no jumps.
     visible = points
     if options.keep_occluded:
         visible = _project(cloud, calibration, points.size, keep_occluded=False)
+    # Coordinates of the camera, in which there is no scanner elsewhere.
     xyz = unproject(calibration.camera, visible.xy, visible.depth)
     return fit_warning(xyz, replace(calibration, scanner=SAME_PLACE), {}, rgb, is_whole=False)
 
 
 def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path]:
     """The calibration of a scan, with a pose of the scanner, and the path of the calibration.
+
+    Args:
+        path: The scan, for messages.
+        options: Options with the file of the calibration, and that of the pose if there is one.
 
     Raises:
         InputError: A file cannot be read.
@@ -310,7 +320,10 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
 
 
 def _is_of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
-    """Whether a scanner at their origin measured points (N, 3): by its pose and by their places."""
+    """Whether a scanner at the origin of the points (N, 3) measured them.
+
+    It did not if the calibration has it far from the camera, or if the points are no such view.
+    """
     away_m = float(np.linalg.norm(calibration.known_scanner.translation))
     return away_m <= _FARTHEST_SCANNER_M and has_scanner(stored)
 

@@ -127,9 +127,13 @@ def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
 def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
     """Yields the frames, named by the stems of the first part's files, and files of no frame.
 
+    The files of a frame have one stem, such as 000123 of 000123.png and 000123.bin.
+
     Args:
-        parts: Where the files of each part are, by its field of `FrameFiles`, or a name that begins
-            with "mask". Every frame has the first part; images may be one video instead.
+        parts: Folder of each part of the frames, and pattern of its files' names, by the part's
+            field of `FrameFiles`; masks by names that begin with "mask". There are images, or one
+            video instead. Every frame has the first part, and those whose pattern has no ? at its
+            end.
         shared: A frame whose fields all frames have.
     """
     # The images may be a video, which has each frame by its number.
@@ -237,7 +241,10 @@ def layout_of_folders(
 
 
 def _paths_of(part: str) -> str:
-    """The folders where the files of a part may lie, with | between; and videos instead of images.
+    """The paths of which a place needs one to have a part, with | between them.
+
+    They are the folders where the part's files may lie, and the videos that may be there instead of
+    a folder of images.
 
     Args:
         part: Folders, with | between them, and pattern of names, as one path.
@@ -248,7 +255,10 @@ def _paths_of(part: str) -> str:
 
 
 def _part_in(place: Path, part: str) -> Part:
-    """The part in the first of its folders that a place has, or a video instead; else in the first.
+    """The folder of a part, and the pattern of its files' names.
+
+    Of several folders that it may have, it is the first that exists, or whose video does; else the
+    first of all.
 
     Args:
         place: The folder of all parts.
