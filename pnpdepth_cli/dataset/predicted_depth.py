@@ -351,6 +351,7 @@ def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, lis
         values = np.array(codes if scale is None else codes / scale, dtype=np.float32)
     unknown = _Unknown(values)
     unknown.add(~np.isfinite(values), "NaN or infinite")
+    # A picture of 8 bits is clipped at its ends; other numbers have codes, marks and far planes.
     if _is_8_bit(codes):
         _add_8_bit_ends(unknown, codes)
     else:

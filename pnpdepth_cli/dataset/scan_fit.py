@@ -54,6 +54,18 @@ _AS_IT_IS = np.zeros(4)
 """The pose that moves nothing."""
 _INEXACT = np.array([0.5, 0.5, 0.5, 0.3])
 """The pose that a right calibration may be off, of either sign."""
+_ROLL_STEP_DEG = 0.5
+"""Between turns about the camera's axis that are tried by themselves."""
+_AHEAD_STEP_M = 0.25
+"""Between ways along the camera's axis that are tried."""
+_TURN_STEPS = np.array([0.4, 0.4, 0.4, 0])
+"""Steps of a pose, by which turns are climbed at first."""
+_FINE_TURN_STEPS = np.array([0.15, 0.15, 0.15, 0])
+"""Steps of a pose, by which they are climbed then."""
+_ROLL_STEPS = np.array([0.1, 0.1, 0.1, 0])
+"""Steps of a pose, by which turns about the camera's axis are climbed."""
+_AHEAD_STEPS = np.array([0.1, 0.1, 0.1, 0.1])
+"""Steps of a pose, by which ways along the camera's axis are climbed."""
 _PEAKS = 3
 """Best shifts, from which turns are searched."""
 _ROUNDS = 3
@@ -330,8 +342,8 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
         # From there, turns about all three axes.
         rolls = [np.array([about_x, about_y, roll, 0]) for roll in _ROLLS_DEG]
         pose = max(rolls, key=judge.of_pose_coarsely)
-        _, pose = _climb(judge.of_pose_coarsely, pose, np.array([0.4, 0.4, 0.4, 0]))
-        best, pose = judge.climb(pose, np.array([0.15, 0.15, 0.15, 0]))
+        _, pose = _climb(judge.of_pose_coarsely, pose, _TURN_STEPS)
+        best, pose = judge.climb(pose, _FINE_TURN_STEPS)
         if np.linalg.norm(pose[:2]) >= _LEAST_TURN_DEG:
             text = (
                 f"with the extrinsics turned by {pose[0]:.1f}° about the camera's x,"
@@ -342,7 +354,8 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
 
 def _rolled(judge: _Judge) -> Iterator[_Fit]:
     """Yields the best turn about the camera's axis, unless it is small."""
-    angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, 0.5)
+    # Turns of the scan as it is, and of the best pose that its calibration may mean.
+    angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, _ROLL_STEP_DEG)
     starts = [
         base + np.array([0, 0, sign * angle, 0])
         for base in (_AS_IT_IS, judge.pose_as_it_is)
@@ -350,14 +363,16 @@ def _rolled(judge: _Judge) -> Iterator[_Fit]:
         for sign in (-1, 1)
     ]
     start = max(starts, key=judge.of_pose_coarsely)
-    best, pose = judge.climb(start, np.array([0.1, 0.1, 0.1, 0]))
+    # Around the best of these.
+    best, pose = judge.climb(start, _ROLL_STEPS)
     if abs(pose[2]) >= _LEAST_TURN_DEG:
         yield _Fit("roll", best, f"with the extrinsics turned by {pose[2]:.1f}° about its axis")
 
 
 def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
     """Yields the best way along the camera's axis, unless it is short."""
-    ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, 0.25)
+    # Ways of the scan as it is, and of the best pose that its calibration may mean.
+    ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, _AHEAD_STEP_M)
     starts = [
         base + np.array([0, 0, 0, sign * way])
         for base in (_AS_IT_IS, judge.pose_as_it_is)
@@ -365,7 +380,8 @@ def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
         for sign in (-1, 1)
     ]
     start = max(starts, key=judge.of_pose_coarsely)
-    best, pose = judge.climb(start, np.array([0.1, 0.1, 0.1, 0.1]))
+    # Around the best of these.
+    best, pose = judge.climb(start, _AHEAD_STEPS)
     if abs(pose[3]) >= _LEAST_AHEAD_M:
         where = "ahead" if pose[3] > 0 else "back"
         text = f"{abs(pose[3]):.1f} m {where}, as if the scan was of another time than the image"

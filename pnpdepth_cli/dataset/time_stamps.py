@@ -51,6 +51,7 @@ def time_of(path: Path) -> float | None:
     number = match[1]
     if "." in number:
         return float(number)
+    # The digits behind those of whole seconds are ms, µs or ns.
     return int(number) / 10.0 ** (len(number) - _DIGITS_OF_SECONDS)
 
 
