@@ -57,8 +57,7 @@ def _frames_of_list(path: Path) -> list[FrameFiles | Unmatched]:
         }
         try:
             frames[number] = _frame_of(cells, files)
-        # Of float() and int(), and our own.
-        except (ValueError, OverflowError, UsageError) as error:
+        except (ValueError, UsageError) as error:  # also of float() and int()
             raise InputError(f"{path}, line {number}: {one_line(error)}") from error
         for file in files.values():
             if not file.exists():
