@@ -395,18 +395,21 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     direction of a jump of depth: a mirror changes the sign of x·y, and an exchange of x and y
     exchanges the first two.
     """
+    # Pixels from each side of the image.
     height, width = size
     xy, weights = judge.jumps.projected(judge.camera)
     x, y = xy.T
     from_right = width - 1 - x
     from_bottom = height - 1 - y
+    # What keeps the image's size.
     mirrored = weights * np.array([1, 1, -1])
     readings = [
         ("with the image mirrored", np.column_stack([from_right, y]), mirrored),
         ("with the image's rows in reverse", np.column_stack([x, from_bottom]), mirrored),
         ("with the image turned by 180°", np.column_stack([from_right, from_bottom]), weights),
     ]
-    if height == width:  # of other images the size tells
+    # What exchanges its sides: of an image that is no square, the size tells.
+    if height == width:
         exchanged = weights[:, [1, 0, 2]]
         turned = exchanged * np.array([1, 1, -1])
         readings += [

@@ -139,7 +139,7 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
     # The images may be a video, which has each frame by its number.
     video = _video_of(parts["image"])
     if video is not None:
-        parts = {field: part for field, part in parts.items() if field != "image"}
+        parts = {field: parts[field] for field in parts if field != "image"}
     first, *others = parts
     needed = [field for field in others if not parts[field][1].endswith("?")]
     for field in needed:
@@ -148,8 +148,8 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
             yield parts[first][0], f"has no {folder}; add it"
             return
     files = dict[str, dict[str, Path]]()  # by part, then by stem
-    for field, part in parts.items():
-        files[field], ambiguous = _files_of(part)
+    for field in parts:
+        files[field], ambiguous = _files_of(parts[field])
         yield from ambiguous
     # Files without a partner.
     pairs = [(first, field) for field in needed] + [(field, first) for field in others]
@@ -212,7 +212,7 @@ def layout_of_folders(
         shared: A frame whose fields all frames have.
     """
     # What a place of the data set has, and by what it is found.
-    needed = [_paths_of(part) for part in parts.values() if "/" in part and not part.endswith("?")]
+    needed = [_paths_of(text) for text in parts.values() if "/" in text and not text.endswith("?")]
     needs = (*needed, *marks)
     finder = marks[0] if marks else needed[-1].split("|")[0]
 
@@ -228,7 +228,7 @@ def layout_of_folders(
         for place in find_places(root):
             calibration = place / calib if calib and (place / calib).is_file() else None
             finish = finish_of(place) if finish_of else replace
-            parts_of_place = {field: _part_in(place, part) for field, part in parts.items()}
+            parts_of_place = {field: _part_in(place, text) for field, text in parts.items()}
             for entry in join_parts(parts_of_place, replace(shared, calib=calibration)):
                 if isinstance(entry, tuple):
                     yield entry
@@ -240,21 +240,21 @@ def layout_of_folders(
     return Layout(matches=find_places, frames=frames, needs=needs, below=below)
 
 
-def _paths_of(part: str) -> str:
+def _paths_of(text: str) -> str:
     """The paths of which a place needs one to have a part, with | between them.
 
     They are the folders where the part's files may lie, and the videos that may be there instead of
     a folder of images.
 
     Args:
-        part: Folders, with | between them, and pattern of names, as one path.
+        text: Folders, with | between them, and pattern of names, as one path.
     """
-    folders, _, pattern = part.rpartition("/")
+    folders, _, pattern = text.rpartition("/")
     endings = ("", *VIDEO_SUFFIXES) if pattern.endswith(".IMAGE") else ("",)
     return "|".join(folder + ending for ending in endings for folder in folders.split("|"))
 
 
-def _part_in(place: Path, part: str) -> Part:
+def _part_in(place: Path, text: str) -> Part:
     """The folder of a part, and the pattern of its files' names.
 
     Of several folders that it may have, it is the first that exists, or whose video does; else the
@@ -262,8 +262,8 @@ def _part_in(place: Path, part: str) -> Part:
 
     Args:
         place: The folder of all parts.
-        part: Folders, with | between them, and pattern of names, as one path.
+        text: Folders, with | between them, and pattern of names, as one path.
     """
-    folders, _, pattern = part.rpartition("/")
+    folders, _, pattern = text.rpartition("/")
     candidates = [(place / folder, pattern) for folder in folders.split("|")]
     return next(filter(_exists, candidates), candidates[0])

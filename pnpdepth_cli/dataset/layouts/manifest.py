@@ -104,6 +104,7 @@ def _lines_of(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise InputError(f"{path} is not a text file; give CSV") from error
     if "\n" not in text:  # of old spreadsheets
         text = text.replace("\r", "\n")
+    # The header, then the lines.
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
