@@ -239,7 +239,7 @@ def _camera_of(
 
 
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
-    """The points of another frame of the sequence, read or sampled as it does itself.
+    """The points of the used part of another frame of the sequence, as reading it gives them.
 
     Args:
         files: The files of the other frame.

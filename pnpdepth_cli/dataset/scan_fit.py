@@ -235,7 +235,7 @@ class _Judge:
         """The best score of a pose (4,) as inexact as a calibration may be, and that pose."""
 
         def score(pose: Floats) -> float:
-            """The score of a pose, which is never chosen if no calibration is so inexact."""
+            """The quick score of a pose; −∞ if no calibration is off by so much."""
             if (np.abs(pose) > _INEXACT).any():
                 return -np.inf
             return self.of_pose_coarsely(pose)

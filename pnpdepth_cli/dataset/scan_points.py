@@ -249,6 +249,7 @@ def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occlud
             has_scanner=cloud.of_scanner,
         )
     except NoPointsError as error:
+        # The axes by which most points would be in the image.
         counts = points_by_reading(cloud.xyz, calibration, size)
         text = max(counts, key=lambda reading: counts[reading])
         count = counts[text]

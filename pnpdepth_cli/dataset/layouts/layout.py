@@ -121,7 +121,8 @@ def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
         if match is not None and path.is_file():
             named.append(("".join(match.groups("")), path))
     files, ambiguous = one_of_each(named)
-    return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
+    in_order = {name: files[name] for name in sorted(files, key=natural_order)}
+    return in_order, ambiguous
 
 
 def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
