@@ -127,8 +127,8 @@ def scale_of_sparse(
     """
     if options.depth_scale is None:
         return _scale_of_layout(files, files.sparse_scale)
-    # Integers of ground truth whose own file states another scale keep it: then what the user states
-    # is of the sparse depth.
+    # Integers of ground truth whose own file states another scale keep that: then what the user
+    # states is of the sparse depth.
     has_codes = isinstance(truth, StoredNumbers) and holds_integers(
         truth.file, of_scale=options.depth_scale
     )
@@ -140,7 +140,8 @@ def scale_of_truth(
 ) -> StatedScale:
     """Returns the scale that is stated of the ground truth, and of whose numbers it is stated.
 
-    The rule is that of `scale_of_sparse`, with the two files exchanged.
+    `--depth-scale` is of both files of a frame, but of the integers alone if the sparse depth holds
+    integers. What a layout states is of integers only.
 
     Args:
         files: The files of the frame, with the scales that the data set states.
