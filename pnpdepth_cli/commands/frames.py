@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest
 from pnpdepth_cli.commands.requests.frames_request import FramesRequest
-from pnpdepth_cli.dataset.scan_points import choose_camera
+from pnpdepth_cli.dataset.rectified_camera import choose_camera
 from pnpdepth_cli.dataset.scan_returns import scan_returns
 from pnpdepth_cli.errors import InputError, NoPointsError, OutputError
 from pnpdepth_cli.io.atomic import atomic_path, make_folder

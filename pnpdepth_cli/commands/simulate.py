@@ -11,7 +11,7 @@ from pnpdepth_cli.commands.shared.sparse_files import (
     sparse_outputs,
     write_sparse_files,
 )
-from pnpdepth_cli.dataset.arrays import check_size, record_of
+from pnpdepth_cli.dataset.arrays import check_camera, record_of
 from pnpdepth_cli.file_record import FileRecord
 from pnpdepth_cli.io.calibration import read_calibration
 from pnpdepth_cli.io.depth import describe_range
@@ -55,7 +55,7 @@ def simulate_scan(
     files = sparse_outputs(output, (depth, calib), overwrite)
     dense, notes = read_dense(depth, depth_scale)
     camera = read_calibration(calib).camera
-    notes += check_size(calib, camera, (dense.shape[0], dense.shape[1]), depth)
+    notes += check_camera(calib, camera, (dense.shape[0], dense.shape[1]), depth)
     # The points, with what decided them.
     points = simulate_lidar(dense, camera, lidar, seed)
     notes.append(f"sparse: {describe_range(points.depth, Reading(f'{lidar.name}, seed {seed}'))}")

@@ -227,11 +227,11 @@ def camera_of_file(
         InputError: The file is no calibration, or is of another image.
     """
     camera = read_calibration(path, number).camera
-    notes = check_size(path, camera, size, image)
+    notes = check_camera(path, camera, size, image)
     return replace(camera, source=f"{path}: {camera.source}"), notes
 
 
-def check_size(path: Path, camera: Camera, size: Size, image: Path | None = None) -> list[str]:
+def check_camera(path: Path, camera: Camera, size: Size, image: Path | None = None) -> list[str]:
     """Returns warnings if an image seems to be of another camera than a calibration, or none.
 
     Args:

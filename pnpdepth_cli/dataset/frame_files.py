@@ -40,6 +40,7 @@ class VideoFrame:
     """Number of the frame, from 0."""
 
     def __str__(self) -> str:
+        """VIDEO[NUMBER], which `source_of` reads."""
         return f"{self.path}[{self.index}]"
 
 
@@ -121,6 +122,7 @@ class FrameFiles:
     belong together."""
 
     def __post_init__(self) -> None:
+        """Raises InputError for a path that no file can have."""
         sources = (self.image, self.sparse, self.sparse_mask, self.gt, self.calib)
         for source in (*sources, *self.depths, *self.masks):
             if source is not None:
@@ -202,6 +204,7 @@ class ReadOptions:
     """Which points of a depth map are removed. None: the program's own choice."""
 
     def __post_init__(self) -> None:
+        """Raises UsageError for a scale that is not above 0, or an unknown kind of depth."""
         if self.unit_scale is not None and not 0 < self.unit_scale < math.inf:
             raise UsageError(f"--unit-scale must be above 0, got {self.unit_scale:g}")
         inverse_factor("--sparse-kind", self.sparse_kind)

@@ -180,10 +180,9 @@ class ResultRecord:
     """Versions of the program, Python and the numerical libraries."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for half a result."""
+        """Raises ValueError for a result without a network or a setting that a report reads."""
         if not self.method.networks:
             raise ValueError("it names no network")
-        # A report of a batch reads these.
         for name in ("align", "iterations", "propagate"):
             if name not in self.settings:
                 raise ValueError(f"its settings lack {name!r}")
@@ -216,13 +215,15 @@ class FrameRecord:
     """The refined depth. None of a frame that failed, or that `eval` scored."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for errors that are not of the result, and for half a record."""
+        """Raises ValueError for errors without those of the result, and for a batch's half record.
+
+        A summary and a report read more of a frame of a batch than of others.
+        """
         for basis, stages in self.errors.items():
             if AFTER not in stages:
                 raise ValueError(f"the errors {basis} are not of the result")
         if self.batch is None or self.status == "failed":
             return
-        # A summary and a report read these of a result of a batch.
         if self.result is None:
             raise ValueError("it does not say how the frame was refined")
         for basis, stages in self.errors.items():
@@ -282,7 +283,8 @@ class FrameRecord:
         try:
             with _CONVERTING:
                 return msgspec.convert(entry, cls)
-        # A text that is not Unicode ends msgspec's own message in a UnicodeError.
+        # msgspec raises ValidationError, also for our ValueErrors, and lets UsageError pass. A text
+        # that is not Unicode ends its own message in a UnicodeError.
         except (msgspec.ValidationError, OverflowError, UnicodeError, UsageError) as error:
             raise InputError(
                 f"{source} is no record of a frame as this version writes it"

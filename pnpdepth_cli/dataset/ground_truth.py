@@ -120,7 +120,8 @@ def _truth_of_map(
     scale = stated.scale
     map_file = _map_by_scale(truth, scale)
     if options.depth_scale is not None and stored.sparse and stored_depth.is_float(stored.sparse):
-        # The option is of the floats beside the map, unless the map has no scale of its own.
+        # `--depth-scale` is of both files, unless the map's own file or the data set states another
+        # scale for the map: then it is of the floats of the sparse depth.
         by_layout = _map_by_scale(truth, files.gt_scale)
         if not by_layout.reading.assumed:
             map_file = by_layout
@@ -129,7 +130,8 @@ def _truth_of_map(
     if factor is not None:
         map_file = arrays.depth_of_inverse(map_file, factor, scale)
         scale = None  # the numbers are metres by now
-    # Pixels that a mask or the checks of `plausible_map` rule out are unknown.
+    # Pixels that a mask or the checks of `plausible_map` rule out are unknown. Where the data set
+    # says that depth has another size than the image, it goes to the image's pixels.
     depth = arrays.apply_masks(map_file.values, files.masks)
     if files.gt_other_size and stored.size is not None and depth.shape != stored.size:
         depth = arrays.move_depth(truth.path, depth, stored.size)
@@ -144,7 +146,13 @@ def _truth_of_map(
 
 
 def _map_by_scale(stored: StoredNumbers, scale: float | None) -> DepthFile:
-    """The map in metres, if its integers have this many codes per metre; None: the file's own."""
+    """The depth map (H, W) of a file in metres, 0 where unknown.
+
+    Args:
+        stored: The file, and the numbers in it.
+        scale: Codes per metre of its integers. None: those that the file states, else usual ones.
+            Floats are metres.
+    """
     check_scale(scale)
     return depth_from_stored(stored.path, stored.file, scale)
 

@@ -208,7 +208,12 @@ def _motion_from(
 
 
 def _contradiction_warning(neighbour: Neighbour, motion: _Motion) -> str:
-    """A line on a neighbour whose poses say another motion than the images."""
+    """A line on a neighbour whose poses say another motion than the images.
+
+    Args:
+        neighbour: The neighbour.
+        motion: Its motion, with the distance between what poses and images say.
+    """
     moved = f"puts points {motion.off_px:.0f} px elsewhere"
     if not math.isfinite(motion.off_px):
         moved = "puts points in view that the poses put behind the camera"

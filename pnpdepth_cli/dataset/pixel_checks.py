@@ -127,7 +127,15 @@ def check_pixels(path: Path, xy: NDArray[np.floating], size: Size) -> tuple[Mask
 
 
 def _check_relative(path: Path, xy: NDArray[np.floating], size: Size) -> None:
-    """Raises InputError for coordinates (N, 2) that are fractions of the image's sides (H, W)."""
+    """Raises InputError for coordinates that are fractions of the image's sides.
+
+    In a small image, and of few points, they may be pixels.
+
+    Args:
+        path: The file of the points, for messages.
+        xy: (N, 2) pixel coordinates, as they should be.
+        size: (H, W) of the image.
+    """
     height, width = size
     is_relative = (np.abs(xy) <= _LARGEST_RELATIVE).all(axis=1)
     if len(xy) < _FEWEST_RELATIVE or min(size) <= _SMALL_IMAGE_PX:
@@ -153,14 +161,15 @@ def _check_size_of_pixels(path: Path, xy: NDArray[np.floating], size: Size, outs
 
     Args:
         path: The file of the points, for messages.
-        xy: (N, 2) pixel coordinates.
+        xy: (N, 2) pixel coordinates of this image, as they should be.
         size: (H, W) of the image.
         outside: Number of the points that are outside the image.
     """
     height, width = size
     if outside <= _FEW_OUTSIDE * len(xy):
         return
-    if bool(in_frame(xy, (width, height)).all()):
+    turned = (width, height)  # (H, W) of the image turned by 90°
+    if bool(in_frame(xy, turned).all()):
         raise InputError(
             f"{path}: {outside:,} of {len(xy):,} points are outside the {width}×{height} image,"
             f" but all are inside {height}×{width}: swap x and y, or turn the image by 90°"

@@ -111,7 +111,12 @@ def plausible_map(
 
 
 def named(what: str, note: str) -> str:
-    """Returns a line for a person with the name of its depths before it, behind "warning: "."""
+    """Returns a line for a person that begins with the name of its depths; a warning's with both.
+
+    Args:
+        what: Name of the depths, such as "gt".
+        note: The line. A warning begins with "warning: ", and so does what is returned.
+    """
     text = note.removeprefix("warning: ")
     return f"{what}: {text}" if text == note else f"warning: {what}: {text}"
 

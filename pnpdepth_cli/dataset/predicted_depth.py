@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from pnpdepth_cli.completion.image_registration import better_orientation, evidence
 from pnpdepth_cli.dataset.arrays import same_aspect_ratio
 from pnpdepth_cli.dataset.plausible import named
-from pnpdepth_cli.dataset.range_ends import far_end, near_end, repeated_ends
+from pnpdepth_cli.dataset.unknown_pixels import SAVE_RAW, STEPS_OF_8_BITS, Map, without_unknown
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.file_record import FileRecord, file_and_part
 from pnpdepth_cli.io import formats
@@ -30,10 +29,6 @@ from pnpdepth_cli.io.formats import ArrayKind, DepthFile, Reading, images
 from pnpdepth_cli.io.rgb import VIDEO_BRANDS, read_rgb
 from pnpdepth_cli.points import Size, SparsePoints
 
-Map = NDArray[np.float32]
-
-_RAW = "save the raw array as NPY (numpy.save), or as a 16-bit PNG"
-"""The way out of messages on files that hold pictures instead of numbers."""
 _LIST_SUFFIXES = (".csv", ".txt")
 
 # Arrays of an archive.
@@ -50,21 +45,16 @@ _LARGEST_MATRIX = 4
 # What numbers are none of depth.
 _GREY = 2
 """Levels of 255 by which the channels of a grey picture may differ; compression makes some."""
-_STEPS = 256
-"""Different numbers that 8 bits have."""
 _FEW_NUMBERS = 20
 """Different numbers; fewer are of labels."""
 _MANY_PIXELS = 1000
 """Pixels, of which few different numbers tell something."""
-_FILLED = 0.005
-"""Fraction of the pixels; so many zeros in the middle of a range stand for unknown."""
-_MORE_ZEROS = 3
-"""Times as many as any other number, for the same."""
 
 _SAMPLED = 2000
 """Pixels that stand for all of a map: their depths are compared with the image's edges."""
 _LEAST_WEIGHT = 0.5 - 1e-6
-"""Weight of known pixels, from which an interpolated one is known; half of it, but for rounding."""
+"""Sum of the weights of known pixels, from which an interpolated one is known: half of all, but for
+rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +91,7 @@ def read_predicted_depth(
     stored = _load(file, part)
     codes = _one_channel(path, stored, size)
     # Those that are unknown.
-    values, notes = _without_unknown(codes, stored.reading.scale)
+    values, notes = without_unknown(codes, stored.reading.scale)
     notes += _check_variety(path, values, is_float=codes.dtype.kind == "f")
     # The size of the image.
     if size is not None and values.shape != size:
@@ -149,7 +139,7 @@ def _load(path: Path, part: str) -> DepthFile:
     if _is_video(data):
         raise InputError(f"{path} is a video; save the depth of the image's frame, as NPY")
     if kind is None and path.suffix.lower() in _LIST_SUFFIXES:
-        raise InputError(f"{path} is a text, as of a list of points; {_RAW}")
+        raise InputError(f"{path} is a text, as of a list of points; {SAVE_RAW}")
     if kind in ("JPEG", "WEBP") or data[4:8] == b"ftyp":  # HEIC, which `kind_of` does not know
         return _load_picture(path, kind or "HEIC")
     if kind in ("PNG", "TIFF") and not _holds_depth(path, data, kind):
@@ -186,7 +176,7 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
     if len(candidates) == 1:
         return candidates[0]
     if not candidates:
-        raise InputError(f"{path} has no depth map among its arrays ({listed}); {_RAW}")
+        raise InputError(f"{path} has no depth map among its arrays ({listed}); {SAVE_RAW}")
     names = " and ".join(candidates)
     raise InputError(f"{path} has several maps, {names}; name one as {path.name}:{candidates[0]}")
 
@@ -223,7 +213,13 @@ def _is_video(data: bytes) -> bool:
 
 
 def _holds_depth(path: Path, data: bytes, kind: str) -> bool:
-    """Whether a PNG or TIFF has one channel of 16 bits or floats, not a picture's pixels."""
+    """Whether a PNG or TIFF has one channel of 16 bits or floats, not a picture's pixels.
+
+    Args:
+        path: The file, for messages.
+        data: Its content.
+        kind: "PNG" or "TIFF".
+    """
     with images.open_image(path, data, kind) as image:
         mode = images.raw_mode(image) if kind == "PNG" else image.mode
         return mode.startswith("I;16") or (kind == "TIFF" and mode in ("F", "I"))
@@ -241,12 +237,12 @@ def _load_picture(path: Path, kind: str) -> DepthFile:
     """
     picture = read_rgb(path)
     levels = np.rint(picture.values * picture.white)
-    bits = 8 if picture.white == _STEPS - 1 else 16
+    bits = 8 if picture.white == STEPS_OF_8_BITS - 1 else 16
     difference = np.ptp(levels, axis=2)  # (H, W) of the largest and the smallest channel
-    if difference.max() > _GREY * picture.white / (_STEPS - 1):
+    if difference.max() > _GREY * picture.white / (STEPS_OF_8_BITS - 1):
         raise InputError(
             f"{path} is a {kind} in colour, a photo or depth drawn with a colour map, which is no"
-            f" number; {_RAW}"
+            f" number; {SAVE_RAW}"
         )
     grey = np.median(levels, axis=2)
     source = f"{bits}-bit grey {kind}"
@@ -299,126 +295,8 @@ def _equal_channels(path: Path, values: NDArray[np.generic]) -> NDArray[np.gener
         return first
     raise InputError(
         f"{path} has {values.shape[-1]} channels that differ, as of colours, points or normals,"
-        f" and depth has one; {_RAW}"
+        f" and depth has one; {SAVE_RAW}"
     )
-
-
-class _Unknown:
-    """Which pixels of a map are unknown, and a line on each reason."""
-
-    def __init__(self, values: Map) -> None:
-        self._values = values
-        self.mask = np.zeros(values.shape, bool)
-        self.notes = list[str]()
-
-    @property
-    def known(self) -> Map:
-        """The numbers (N,) of the pixels that are not unknown."""
-        return self._values[~self.mask]
-
-    def add(self, pixels: NDArray[np.bool_], what: str) -> None:
-        """Adds pixels, (H, W) true, and a line that says what those that are new hold."""
-        new = pixels & ~self.mask
-        count = int(np.count_nonzero(new))
-        if count:
-            verb = "is" if count == 1 else "are"
-            self.notes.append(f"{count:,} of {new.size:,} pixels {verb} {what}; taken as unknown")
-            self.mask |= new
-
-
-def _without_unknown(codes: NDArray[Any], scale: float | None) -> tuple[Map, list[str]]:
-    """The numbers (H, W) as float32, NaN where unknown; and lines that count the unknown pixels.
-
-    Args:
-        codes: (H, W) numbers as stored.
-        scale: Codes per unit that the file states. None: it states none.
-    """
-    # A float64 beyond float32 becomes infinite, and with that unknown.
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        values = np.array(codes if scale is None else codes / scale, dtype=np.float32)
-    unknown = _Unknown(values)
-    unknown.add(~np.isfinite(values), "NaN or infinite")
-    if _is_8_bit(codes):
-        _add_8_bit_ends(unknown, codes)
-    else:
-        _add_ends_of_codes(unknown, codes)
-        _add_marks(unknown, values)
-        _add_ends(unknown, values)
-    values[unknown.mask] = np.nan
-    return values, unknown.notes
-
-
-def _add_8_bit_ends(unknown: _Unknown, codes: NDArray[Any]) -> None:
-    """Adds 0 and 255, at which a picture of depth is clipped, and a warning that it has steps."""
-    lowest = codes == 0
-    highest = codes == _STEPS - 1
-    levels = len(np.unique(codes[np.isfinite(codes)]))
-    unknown.notes.append(
-        f"warning: 8 bits have 256 steps, of which {levels} are used;"
-        f" {np.count_nonzero(lowest):,} of {codes.size:,} pixels are 0 and"
-        f" {np.count_nonzero(highest):,} are 255, where it is clipped, and taken as unknown;"
-        f" better {_RAW}"
-    )
-    unknown.mask |= lowest | highest
-
-
-def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
-    """Adds the largest code of an integer type, and the smallest below 0: no sensor measures them.
-
-    Floats have none.
-    """
-    if codes.dtype.kind not in "iu":
-        return
-    limits = np.iinfo(codes.dtype)
-    unknown.add(codes == limits.max, f"{limits.max}, the largest code")
-    if limits.min < 0:
-        unknown.add(codes == limits.min, f"{limits.min}, the smallest code")
-
-
-def _add_marks(unknown: _Unknown, values: Map) -> None:
-    """Adds the only number below 0; and 0, unless it is one of many numbers of both signs."""
-    known = unknown.known
-    below_zero = np.unique(known[known < 0])
-    if len(below_zero) == 1 and known.max(initial=0) > 0:
-        unknown.add(values == below_zero[0], f"{below_zero[0]:.6g}, the only number below 0")
-    # Between numbers of both signs, as of logarithms, 0 is a number as any other, unless it is far
-    # more frequent.
-    known = unknown.known
-    zeros = int(np.count_nonzero(known == 0))
-    if zeros and known.min() < 0 < known.max():
-        _, counts = np.unique(known[known != 0], return_counts=True)
-        if zeros < max(_FILLED * values.size, _MORE_ZEROS * int(counts.max())):
-            return
-    unknown.add(values == 0, "0")
-
-
-def _add_ends(unknown: _Unknown, values: Map) -> None:
-    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity."""
-    # About one value, far from all others and mixed with them at its edges.
-    known = unknown.known.astype(np.float64)
-    if known.min(initial=np.inf) > 0:
-        is_known = ~unknown.mask
-        for end, bound in (
-            (far_end(known), "98 % of the others are at most"),
-            (near_end(known), "98 % of the others are at least"),
-        ):
-            pixels = np.zeros(values.shape, bool)
-            pixels[is_known] = end.is_no_surface
-            unknown.add(pixels, f"about {end.value:.6g}, where {bound} {end.reach:.4g}")
-    # Exactly one value.
-    for value, _ in repeated_ends(unknown.known):
-        name = "smallest" if value <= float(unknown.known.min()) else "largest"
-        unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")
-
-
-def _is_8_bit(codes: NDArray[Any]) -> bool:
-    """Whether the numbers are whole and go from 0 or more to 255, as of 8 bits, of any type."""
-    if codes.dtype == np.uint8:
-        return True
-    finite = codes[np.isfinite(codes)] if codes.dtype.kind == "f" else codes
-    if not finite.size or finite.min() < 0 or finite.max() != _STEPS - 1:
-        return False
-    return bool((np.rint(finite) == finite).all())
 
 
 def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
@@ -445,10 +323,10 @@ def _check_variety(path: Path, values: Map, *, is_float: bool) -> list[str]:
         )
     # Most maps show by a sample that they have more.
     sample = known[:: max(1, known.size // _SAMPLED)]
-    if known.size < _MANY_PIXELS or len(np.unique(sample)) > _STEPS:
+    if known.size < _MANY_PIXELS or len(np.unique(sample)) > STEPS_OF_8_BITS:
         return []
     different = len(np.unique(known))
-    if different > _STEPS:
+    if different > STEPS_OF_8_BITS:
         return []
     if different < _FEW_NUMBERS:
         return [f"warning: {different} different numbers only, as of labels or a drawing"]

@@ -60,7 +60,7 @@ class _End(NamedTuple):
 
     is_no_surface: Mask  # (N,) which of the numbers are of no surface; none, if the end is one
     value: float  # the extreme number; 0 if the end is a surface
-    reach: float  # number that 98 % (or 90 %) of the others do not exceed; 0 if it is a surface
+    reach: float  # number that 98 % of the others do not exceed; 0 if it is a surface
 
 
 def far_values(depth: NDArray[np.floating], unit: str = "m") -> tuple[Mask, list[str]]:
@@ -171,8 +171,8 @@ def _upper_end(numbers: Floats, rare: float) -> _End:
     others = _usual_numbers(numbers, is_alike, least_count)
     if not others.size:
         return surface
-    # Far beyond the others, also with the mixtures that a renderer makes at edges of the sky. Those
-    # go from the geometric mean of the two on.
+    # Far beyond the others, also with the mixtures that a renderer makes at edges of the sky: these
+    # are above the geometric mean of the two.
     reach = float(np.quantile(others, 0.98))
     if largest >= _BEYOND * reach:
         return _End(numbers > math.sqrt(largest * reach), largest, reach)
@@ -185,7 +185,8 @@ def _upper_end(numbers: Floats, rare: float) -> _End:
         return _End(is_same, largest, reach)
     reach_of_most = float(np.quantile(different, 0.9))
     if largest >= _BEYOND_MOST * reach_of_most:
-        return _End(numbers > math.sqrt(largest * reach_of_most), largest, reach_of_most)
+        is_far = numbers > math.sqrt(largest * reach_of_most)
+        return _End(is_far, largest, float(np.quantile(numbers[~is_far], 0.98)))
     return surface
 
 
@@ -214,9 +215,13 @@ def _usual_numbers(numbers: Floats, is_alike: Mask, least_count: float) -> Float
 
 
 def _clip_lines(depth: Floats, unit: str) -> list[str]:
-    """Warnings on ends that may be a clip: far more depths (N,) have its value than any other.
+    """Warnings if far more depths have the largest or the smallest value than any other.
 
     A drawing, of few values, gives none.
+
+    Args:
+        depth: (N,) known depths.
+        unit: Name of their unit.
     """
     distinct, counts = np.unique(depth.astype(np.float32), return_counts=True)
     if len(distinct) < _FEW_VALUES:

@@ -74,6 +74,7 @@ def read_frame(
     used, held_out = _hold_out(points, holdout, seed)
 
     def points_of_neighbour(neighbour: FrameFiles) -> Points:
+        """The points of a neighbouring frame, read as those of this one."""
         return _points_of(neighbour, options, size, seed)
 
     joined = read_neighbours(files, used, camera, points_of_neighbour)
@@ -88,13 +89,8 @@ def read_frame(
     # What a record and a person should know.
     sources = _sources_of(stored, truth, sparse, predicted)
     notes = [note for source in sources.values() for note in source.notes]
-    notes += [*findings, *camera_notes, *joined.notes]
-    if files.masks and truth is None:
-        notes.append(
-            f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used;"
-            " a mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
-        )
-    # A calibration or a model states no pose, or its own, which goes before that of the data set.
+    notes += [*findings, *camera_notes, *joined.notes, *_unused_mask_note(files)]
+    # A COLMAP model has the pose of its image, which goes before that of the data set.
     pose = sparse.pose
     if pose is None and files.pose:
         pose = np.array(files.pose)
@@ -125,6 +121,16 @@ def _time_warnings(files: FrameFiles) -> list[str]:
     depths = [depth for depth in (files.sparse, files.gt) if depth is not None]
     warnings = [time_warning(files.image_file, depth) for depth in depths]
     return [warning for warning in warnings if warning is not None]
+
+
+def _unused_mask_note(files: FrameFiles) -> list[str]:
+    """A line for a person on masks without ground truth, of which nothing is masked; else none."""
+    if not files.masks or files.gt is not None:
+        return []
+    return [
+        f"mask {files.masks[0]} is of ground truth, of which there is none, so it is not used; a"
+        " mask of the sparse depth is --sparse-mask, or sparse_mask in a list"
+    ]
 
 
 class _Predicted(NamedTuple):
@@ -233,7 +239,7 @@ def _camera_of(
 
 
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
-    """The points of another frame of the sequence, read or sampled as it does itself.
+    """The points of the used part of another frame of the sequence, as reading it gives them.
 
     Args:
         files: The files of the other frame.

@@ -164,8 +164,7 @@ def _errors_of(refined: Refined, frame: ReadFrame, *, with_baselines: bool) -> d
     linear_stage = dict[str, Tensor]()
     if frame.gt is not None or len(frame.held_out):
         linear_stage[LINEAR] = linear(frame.points)
-    # Against the truth, the result is scored where the truth is known, and all others on the pixels
-    # of these where the result is known.
+    # Against the truth, all others are scored on those pixels alone where the result is known.
     if frame.gt is not None:
         gt = torch.from_numpy(frame.gt)
         gt_of_result = torch.where(after > 0, gt, 0)
@@ -178,7 +177,7 @@ def _errors_of(refined: Refined, frame: ReadFrame, *, with_baselines: bool) -> d
             for name, depth in stages.items()
         }
     errors[HELD_OUT] = _errors_at_points(frame.held_out, own_stages | linear_stage)
-    # At validation points, each is predicted without them.
+    # At validation points, which no stage and no baseline was given.
     validation = refined.validation
     if validation is not None:
         predicted = dict(validation.predicted)  # (N,) at the validation points

@@ -54,6 +54,18 @@ _AS_IT_IS = np.zeros(4)
 """The pose that moves nothing."""
 _INEXACT = np.array([0.5, 0.5, 0.5, 0.3])
 """The pose that a right calibration may be off, of either sign."""
+_ROLL_STEP_DEG = 0.5
+"""Between turns about the camera's axis that are tried by themselves."""
+_AHEAD_STEP_M = 0.25
+"""Between ways along the camera's axis that are tried."""
+_TURN_STEPS = np.array([0.4, 0.4, 0.4, 0])
+"""Steps of a pose, by which turns are climbed at first."""
+_FINE_TURN_STEPS = np.array([0.15, 0.15, 0.15, 0])
+"""Steps of a pose, by which they are climbed then."""
+_ROLL_STEPS = np.array([0.1, 0.1, 0.1, 0])
+"""Steps of a pose, by which turns about the camera's axis are climbed."""
+_AHEAD_STEPS = np.array([0.1, 0.1, 0.1, 0.1])
+"""Steps of a pose, by which ways along the camera's axis are climbed."""
 _PEAKS = 3
 """Best shifts, from which turns are searched."""
 _ROUNDS = 3
@@ -116,7 +128,7 @@ class _Fit(NamedTuple):
 
 def fit_warning(
     scan: NDArray[np.floating],
-    own: Calibration,
+    calibration: Calibration,
     others: Mapping[str, Calibration],
     rgb: NDArray[np.float32],
     *,
@@ -126,8 +138,8 @@ def fit_warning(
 
     Args:
         scan: (N, 3) metres in the scanner's coordinates.
-        own: The calibration that projects the scan.
-        others: Further calibrations, such as those of other cameras, by what gives them.
+        calibration: The calibration that projects the scan.
+        others: Further calibrations, such as those of other cameras, by the option that gives each.
         rgb: (H, W, 3) in 0…1, the image.
         is_whole: Whether the points are the returns of a scanner. The jumps of other clouds are
             known as inexactly as their points are far apart. So few of them tell nothing, and many
@@ -135,33 +147,33 @@ def fit_warning(
     """
     # Too few jumps of depth tell nothing.
     size = (rgb.shape[0], rgb.shape[1])
-    jumps = _jumps(scan, own, size)
+    jumps = _jumps(scan, calibration, size)
     if jumps is None or jumps.clear < (_SOME_JUMPS if is_whole else _MANY_JUMPS):
         return []
     # Readings that are clearly better than the scan as it is.
-    judge = _Judge(rgb, own.camera, jumps)
-    readings = list(_readings(judge, scan, own, others, size))
+    judge = _Judge(rgb, calibration.camera, jumps)
+    readings = list(_readings(judge, scan, calibration, others, size))
     needed = _NEEDED if jumps.clear >= _MANY_JUMPS else _NEEDED_OF_FEW
     better = [
         reading
         for reading in readings
         if reading.score >= needed[reading.kind].score
-        and reading.score >= judge.as_it_is + needed[reading.kind].more
+        and reading.score >= judge.score_as_it_is + needed[reading.kind].more
     ]
     if better:
         best = max(better, key=lambda reading: reading.score)
         return [
             "warning: the image's edges meet the scan's jumps of depth better"
             f" {best.text}: {best.score:.1f} standard deviations above chance instead of"
-            f" {judge.as_it_is:.1f}; check calibration and times"
+            f" {judge.score_as_it_is:.1f}; check calibration and times"
         ]
     # None is, and the scan as it is fits no better than by chance.
-    if is_whole and judge.as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
+    if is_whole and judge.score_as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
         return [
             "warning: the image's edges do not meet the scan's jumps of depth"
-            f" ({judge.as_it_is:.1f} standard deviations above chance), and no turn, shift, mirror"
-            " or camera that was tried is better; check that image, scan and calibration belong"
-            " together"
+            f" ({judge.score_as_it_is:.1f} standard deviations above chance), and no turn, shift,"
+            " mirror or camera that was tried is better; check that image, scan and calibration"
+            " belong together"
         ]
     return []
 
@@ -193,7 +205,7 @@ class _Judge:
         self.chance = float(self.shifted.mean())
         self.spread = float(self.shifted.std()) + 1e-9  # above 0, of an image without edges
         # No calibration is exact: the scan as it is may be off by so little.
-        self.as_it_is, self.base = self._as_it_is()
+        self.score_as_it_is, self.pose_as_it_is = self._as_it_is()
 
     def of_pixels(self, xy: Floats, weights: Floats) -> float:
         """The score of weights (N, 3), as `Jumps.projected` gives them, at pixels (N, 2)."""
@@ -223,6 +235,7 @@ class _Judge:
         """The best score of a pose (4,) as inexact as a calibration may be, and that pose."""
 
         def score(pose: Floats) -> float:
+            """The quick score of a pose; −∞ if no calibration is off by so much."""
             if (np.abs(pose) > _INEXACT).any():
                 return -np.inf
             return self.of_pose_coarsely(pose)
@@ -269,7 +282,7 @@ def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tu
 def _readings(
     judge: _Judge,
     scan: NDArray[np.floating],
-    own: Calibration,
+    calibration: Calibration,
     others: Mapping[str, Calibration],
     size: Size,
 ) -> Iterator[_Fit]:
@@ -278,23 +291,23 @@ def _readings(
     Args:
         judge: Scores of the scan.
         scan: (N, 3) metres in the scanner's coordinates.
-        own: The calibration that projects the scan.
-        others: Further calibrations, by what gives them.
+        calibration: The calibration that projects the scan.
+        others: Further calibrations, by the option or file that gives each.
         size: (H, W) of the image.
     """
     yield from _turned(judge)
     yield from _rolled(judge)
     yield from _of_another_time(judge)
-    if judge.as_it_is >= _GOOD:
+    if judge.score_as_it_is >= _GOOD:
         return
     yield from _mirrored(judge, size)
     # The scan by other axes and cameras, whose points have other jumps.
-    for text, reading in _other_readings(own, others).items():
+    for text, reading in _other_readings(calibration, others).items():
         jumps = _jumps(scan, reading, size)
         if jumps is not None:
             yield _Fit("other", judge.of_pixels(*jumps.projected(reading.camera)), text)
     # The calibration of an image that was resized.
-    resized, factor = _resized(own, size)
+    resized, factor = _resized(calibration, size)
     jumps = None if resized is None else _jumps(scan, resized, size)
     if resized is not None and jumps is not None:
         xy, weights = jumps.projected(resized.camera)
@@ -329,8 +342,8 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
         # From there, turns about all three axes.
         rolls = [np.array([about_x, about_y, roll, 0]) for roll in _ROLLS_DEG]
         pose = max(rolls, key=judge.of_pose_coarsely)
-        _, pose = _climb(judge.of_pose_coarsely, pose, np.array([0.4, 0.4, 0.4, 0]))
-        best, pose = judge.climb(pose, np.array([0.15, 0.15, 0.15, 0]))
+        _, pose = _climb(judge.of_pose_coarsely, pose, _TURN_STEPS)
+        best, pose = judge.climb(pose, _FINE_TURN_STEPS)
         if np.linalg.norm(pose[:2]) >= _LEAST_TURN_DEG:
             text = (
                 f"with the extrinsics turned by {pose[0]:.1f}° about the camera's x,"
@@ -341,30 +354,34 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
 
 def _rolled(judge: _Judge) -> Iterator[_Fit]:
     """Yields the best turn about the camera's axis, unless it is small."""
-    angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, 0.5)
+    # Turns of the scan as it is, and of the best pose that its calibration may mean.
+    angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, _ROLL_STEP_DEG)
     starts = [
         base + np.array([0, 0, sign * angle, 0])
-        for base in (_AS_IT_IS, judge.base)
+        for base in (_AS_IT_IS, judge.pose_as_it_is)
         for angle in angles
         for sign in (-1, 1)
     ]
     start = max(starts, key=judge.of_pose_coarsely)
-    best, pose = judge.climb(start, np.array([0.1, 0.1, 0.1, 0]))
+    # Around the best of these.
+    best, pose = judge.climb(start, _ROLL_STEPS)
     if abs(pose[2]) >= _LEAST_TURN_DEG:
         yield _Fit("roll", best, f"with the extrinsics turned by {pose[2]:.1f}° about its axis")
 
 
 def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
     """Yields the best way along the camera's axis, unless it is short."""
-    ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, 0.25)
+    # Ways of the scan as it is, and of the best pose that its calibration may mean.
+    ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, _AHEAD_STEP_M)
     starts = [
         base + np.array([0, 0, 0, sign * way])
-        for base in (_AS_IT_IS, judge.base)
+        for base in (_AS_IT_IS, judge.pose_as_it_is)
         for way in ways
         for sign in (-1, 1)
     ]
     start = max(starts, key=judge.of_pose_coarsely)
-    best, pose = judge.climb(start, np.array([0.1, 0.1, 0.1, 0.1]))
+    # Around the best of these.
+    best, pose = judge.climb(start, _AHEAD_STEPS)
     if abs(pose[3]) >= _LEAST_AHEAD_M:
         where = "ahead" if pose[3] > 0 else "back"
         text = f"{abs(pose[3]):.1f} m {where}, as if the scan was of another time than the image"
@@ -378,18 +395,21 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     direction of a jump of depth: a mirror changes the sign of x·y, and an exchange of x and y
     exchanges the first two.
     """
+    # Pixels from each side of the image.
     height, width = size
     xy, weights = judge.jumps.projected(judge.camera)
     x, y = xy.T
     from_right = width - 1 - x
     from_bottom = height - 1 - y
+    # What keeps the image's size.
     mirrored = weights * np.array([1, 1, -1])
     readings = [
         ("with the image mirrored", np.column_stack([from_right, y]), mirrored),
         ("with the image's rows in reverse", np.column_stack([x, from_bottom]), mirrored),
         ("with the image turned by 180°", np.column_stack([from_right, from_bottom]), weights),
     ]
-    if height == width:  # of other images the size tells
+    # What exchanges its sides: of an image that is no square, the size tells.
+    if height == width:
         exchanged = weights[:, [1, 0, 2]]
         turned = exchanged * np.array([1, 1, -1])
         readings += [
@@ -406,13 +426,20 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
         yield _Fit("mirror", judge.of_pixels(pixels, pixel_weights), text)
 
 
-def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
-    """The calibration of the image (H, W) if it was resized, and the factor of its intrinsics.
+def _resized(calibration: Calibration, size: Size) -> tuple[Calibration | None, float]:
+    """The calibration of a resized image (H, W), and the factor of its intrinsics.
 
-    An image that was resized has its principal point elsewhere than in its middle, by one factor in
-    both directions. If it was not resized: None and 1.
+    An image was resized if the principal point that the calibration states is not in its middle,
+    but would be if both coordinates were multiplied by one factor.
+
+    Args:
+        calibration: The calibration, which may be of the image before it was resized.
+        size: (H, W) of the image.
+
+    Returns:
+        None and 1 if the image was not resized.
     """
-    centre_px = own.camera.intrinsics[:2, 2] + 0.5  # from the image's corner
+    centre_px = calibration.camera.intrinsics[:2, 2] + 0.5  # from the image's corner
     if centre_px.min() <= 0:
         return None, 1.0
     across = size[1] / (2 * centre_px[0])
@@ -421,19 +448,27 @@ def _resized(own: Calibration, size: Size) -> tuple[Calibration | None, float]:
     if abs(math.log(across / down)) > _SAME_RATIO or abs(math.log(factor)) < _RESIZED:
         return None, 1.0
     # The intrinsics of an image resized by the factor, about its corner.
-    intrinsics = own.camera.intrinsics.copy()
+    intrinsics = calibration.camera.intrinsics.copy()
     intrinsics[:2] *= factor
     intrinsics[:2, 2] += 0.5 * factor - 0.5
-    return replace(own, camera=replace(own.camera, intrinsics=intrinsics, size=size)), factor
+    return replace(
+        calibration, camera=replace(calibration.camera, intrinsics=intrinsics, size=size)
+    ), factor
 
 
-def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict[str, Calibration]:
-    """Calibrations by which the scan may be meant, by what a person is told of each.
+def _other_readings(
+    calibration: Calibration, others: Mapping[str, Calibration]
+) -> dict[str, Calibration]:
+    """Other calibrations by which the scan may have to be projected, by words for a person.
 
     They are those of other axes of the scan, of the inverse of the scanner's pose, and `others`.
+
+    Args:
+        calibration: The calibration that projects the scan.
+        others: Further calibrations, by words for a person.
     """
-    scanner = own.known_scanner
-    readings = {"with the extrinsics inverted": replace(own, scanner=scanner.inverse())}
+    scanner = calibration.known_scanner
+    readings = {"with the extrinsics inverted": replace(calibration, scanner=scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (
@@ -445,17 +480,24 @@ def _other_readings(own: Calibration, others: Mapping[str, Calibration]) -> dict
         ("with the scan turned by 180° about z", np.diag([-1.0, -1.0, 1.0])),
     ):
         other_axes = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
-        readings[text] = replace(own, scanner=scanner @ other_axes)
+        readings[text] = replace(calibration, scanner=scanner @ other_axes)
     return readings | dict(others)
 
 
-def points_by_reading(scan: NDArray[np.floating], own: Calibration, size: Size) -> dict[str, int]:
-    """Returns how many points of a scan (N, 3) are in the image (H, W) by other axes of the scan.
+def points_by_reading(
+    scan: NDArray[np.floating], calibration: Calibration, size: Size
+) -> dict[str, int]:
+    """Returns how many points of a scan are in the image if the scan has other axes.
 
-    They are counted by what a person is told of the axes, such as "with z of the scan negated".
+    The counts are by words for a person, such as "with z of the scan negated".
+
+    Args:
+        scan: (N, 3) metres in the scanner's coordinates.
+        calibration: The calibration that projects the scan.
+        size: (H, W) of the image.
     """
     counts = dict[str, int]()
-    for text, reading in _other_readings(own, {}).items():
+    for text, reading in _other_readings(calibration, {}).items():
         xyz = reading.known_scanner.apply(scan)
         seen, _ = points_in_image(xyz, reading.camera, size)
         counts[text] = len(seen)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
-from pnpdepth_cli.dataset.arrays import check_size
+from pnpdepth_cli.dataset.arrays import check_camera
 from pnpdepth_cli.dataset.frame_files import ScanOptions
+from pnpdepth_cli.dataset.rectified_camera import choose_camera
 from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
 from pnpdepth_cli.dataset.scan_returns import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
@@ -28,7 +29,6 @@ from pnpdepth_cli.io.poses import read_extrinsics
 from pnpdepth_cli.io.rgb import read_rgb
 from pnpdepth_cli.io.scans import check_no_colmap_map, read_scan
 from pnpdepth_cli.points import Size, in_frame
-from pnpdepth_cli.sensors.edge_fit import edge_map, jumps_of
 from pnpdepth_cli.sensors.ground import height_above_ground
 from pnpdepth_cli.sensors.lens import pixels_of, unproject
 from pnpdepth_cli.sensors.projection import (
@@ -58,13 +58,6 @@ _AHEAD_DEG = 15.0
 _MOST_OUTSIDE = 1 / 3
 """Fraction of the points ahead that may be outside the image without a warning."""
 
-# The camera of images that may be rectified.
-_CLEARLY_BETTER = 1.0
-"""Standard deviations of the score by chance, by which another camera replaces the usual one."""
-_CHANCE_PX = 80.0
-"""Largest shift of the points, across and down, whose scores tell chance."""
-_LEAST_INSIDE = 0.5
-"""Fraction of the jumps of depth that a camera puts into the image, at least, to be compared."""
 
 # Heights that tell a scan in another unit.
 _HIGH_M = 4.5
@@ -125,7 +118,7 @@ def read_scan_points(
     size = size or calibration.camera.size
     if size is None:
         raise InputError(f"{calib} does not give the image's size; give --image")
-    warnings = check_size(calib, calibration.camera, size, image)
+    warnings = check_camera(calib, calibration.camera, size, image)
     # The returns of the scan, in metres.
     cloud = _read_cloud(path, calibration, scale, of_integers)
     # Of a raw and rectified cameras, that of the image. It is read where its edges tell something.
@@ -220,7 +213,7 @@ def _extrinsics_notes(
             f"extrinsics: in the coordinates of the unrectified camera 0; the rotation and offset"
             f" that {calib} rectifies with are applied"
         )
-    # KITTI's own files have one direction.
+    # KITTI's own files always have the pose in one direction.
     if options.extrinsics is None and calibration.camera.source.startswith("KITTI"):
         return lines, False
     inverted = check_direction(cloud.xyz, calibration.camera, calibration.known_scanner, size)
@@ -228,7 +221,13 @@ def _extrinsics_notes(
 
 
 def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occluded: bool) -> Points:
-    """The points that the image (H, W) shows, with depth z in metres.
+    """The points of a scan that the image shows, with depth z in metres.
+
+    Args:
+        cloud: The points of the scan.
+        calibration: The calibration, with a pose of the scanner.
+        size: (H, W) of the image.
+        keep_occluded: Whether points stay that nearer ones hide from the camera.
 
     Raises:
         NoPointsError: There is none. It names the axes of the scan by which there are some.
@@ -243,6 +242,7 @@ def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occlud
             has_scanner=cloud.of_scanner,
         )
     except NoPointsError as error:
+        # The axes by which most points would be in the image.
         counts = points_by_reading(cloud.xyz, calibration, size)
         text = max(counts, key=lambda reading: counts[reading])
         count = counts[text]
@@ -265,23 +265,27 @@ def _edge_warning(
         cloud: The points of the scan.
         points: The points that the image shows.
         calibration: The calibration by which they are projected.
-        others: Further calibrations of the same scan, by what gives them.
+        others: Further calibrations of the same scan, by the option that gives each.
         options: Options that say whether `points` has occluded ones.
         rgb: (H, W, 3) in 0…1, the image.
     """
     if cloud.of_scanner:
         return fit_warning(cloud.xyz, calibration, others, rgb)
-    # A cloud is compared as the camera sees it: hidden points beside nearer ones would be jumps of
-    # depth.
+    # A cloud is compared as the camera sees it: hidden points beside nearer ones are no jumps.
     visible = points
     if options.keep_occluded:
         visible = _project(cloud, calibration, points.size, keep_occluded=False)
+    # Coordinates of the camera, in which there is no scanner elsewhere.
     xyz = unproject(calibration.camera, visible.xy, visible.depth)
     return fit_warning(xyz, replace(calibration, scanner=SAME_PLACE), {}, rgb, is_whole=False)
 
 
 def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path]:
     """The calibration of a scan, with a pose of the scanner, and the path of the calibration.
+
+    Args:
+        path: The scan, for messages.
+        options: Options with the file of the calibration, and that of the pose if there is one.
 
     Raises:
         InputError: A file cannot be read.
@@ -310,96 +314,12 @@ def _calibration_of(path: Path, options: ScanOptions) -> tuple[Calibration, Path
 
 
 def _is_of_scanner(calibration: Calibration, stored: NDArray[np.floating]) -> bool:
-    """Whether a scanner at their origin measured points (N, 3): by its pose and by their places."""
+    """Whether a scanner at the origin of the points (N, 3) measured them.
+
+    It did not if the calibration has it far from the camera, or if the points are no such view.
+    """
     away_m = float(np.linalg.norm(calibration.known_scanner.translation))
     return away_m <= _FARTHEST_SCANNER_M and has_scanner(stored)
-
-
-def choose_camera(
-    raw: Calibration,
-    frames: Iterable[tuple[NDArray[np.float32], NDArray[np.floating]]],
-    topic: str = "",
-) -> tuple[Calibration, str]:
-    """Returns the camera of images that may be rectified, and a line that says which it is.
-
-    A topic image_rect* is of rectified images. Any other image is raw, unless a rectified camera
-    puts the jumps of depth clearly better onto its edges: some bags hold rectified images as
-    image_raw.
-
-    Args:
-        raw: The camera of raw images and the pose of the scanner, with the rectified cameras.
-        frames: Images (H, W, 3) in 0…1, each with a scan (N, 3) in the scanner's coordinates.
-        topic: Topic of the images. Empty: they are of files, or their topic is not known.
-    """
-    # The candidates, of which the first is meant by the topic or by the usual meaning.
-    cameras = {
-        name: Calibration(camera=camera, scanner=raw.scanner and of_raw @ raw.scanner)
-        for name, (camera, of_raw) in raw.rectified.items()
-    }
-    candidates = cameras if "image_rect" in topic else {"K and distortion": raw} | cameras
-    choice = next(iter(candidates))
-    usual = candidates[choice]
-    why = f"the topic {topic}" if topic else "the usual meaning of camera_info"
-    # How well jumps of depth meet edges, in the mean of the frames.
-    scores = list[dict[str, float]]()
-    if usual.scanner is not None and len(candidates) > 1:
-        for rgb, xyz in frames:
-            frame_scores = _scores(xyz, rgb, usual, candidates)
-            if frame_scores is not None:
-                scores.append(frame_scores)
-    if scores:
-        means = {
-            name: float(np.mean([frame_scores[name] for frame_scores in scores]))
-            for name in candidates
-        }
-        best = max(means, key=lambda name: means[name])
-        if means[best] - means[choice] > _CLEARLY_BETTER:
-            choice = best
-        compared = ", ".join(f"{name} {score:+.2f}" for name, score in means.items())
-        why = f"image edges at jumps of depth: {compared}"
-    images = "rectified" if choice in cameras else "raw"
-    note = f"camera: {images} images, by {choice} ({why}); --calib gives another"
-    return candidates[choice], note
-
-
-def _scores(
-    scan: NDArray[np.floating],
-    rgb: NDArray[np.float32],
-    usual: Calibration,
-    candidates: Mapping[str, Calibration],
-) -> dict[str, float] | None:
-    """How well each calibration puts jumps of depth onto the image's edges, by its name.
-
-    Scores are in standard deviations by chance. A calibration that puts few of the jumps into the
-    image has 0.
-
-    Args:
-        scan: (N, 3) in the scanner's coordinates.
-        rgb: (H, W, 3) in 0…1, the image.
-        usual: The calibration by which jumps of depth are found.
-        candidates: All calibrations, by name.
-
-    Returns:
-        None where the points tell nothing.
-    """
-    # The jumps of depth are those that the usual camera sees. Chance is their score at all shifts.
-    size = (rgb.shape[0], rgb.shape[1])
-    jumps = jumps_of(scan, usual.camera, usual.known_scanner, size)
-    if jumps is None:
-        return None
-    edges = edge_map(rgb)
-    xy, weights = jumps.projected(usual.camera)
-    shifted = edges.shifted(xy, weights, (_CHANCE_PX, _CHANCE_PX))
-    chance = float(shifted.mean())
-    spread = float(shifted.std()) + 1e-9  # above 0, of an image without edges
-    # Each candidate projects them anew.
-    scores = dict.fromkeys(candidates, 0.0)
-    for name, candidate in candidates.items():
-        motion = candidate.known_scanner @ usual.known_scanner.inverse()
-        xy, weights = jumps.moved(motion).projected(candidate.camera)
-        if np.count_nonzero(in_frame(xy, size)) >= _LEAST_INSIDE * len(jumps.xyz):
-            scores[name] = (edges.score(xy, weights) - chance) / spread
-    return scores
 
 
 def check_direction(

@@ -241,7 +241,7 @@ def has_scanner(xyz: NDArray[np.floating]) -> bool:
 
 
 def _at_one_place(xyz: NDArray[np.float64]) -> Mask:
-    """(N,) true for points of a scan (N, 3) at one place that too many of them share."""
+    """(N,) true for points of a scan (N, 3) at the place of most of them, if too many are there."""
     if len(xyz) < _FEWEST_POINTS:
         return np.zeros(len(xyz), bool)
     # Places are compared as one number each: a sum with weights that no coordinates have.

@@ -116,7 +116,7 @@ def is_float(stored: StoredDepth) -> bool:
 def scale_of_sparse(
     files: FrameFiles, options: ReadOptions, truth: StoredDepth | None
 ) -> StatedScale:
-    """Returns the scale that is stated of the sparse depth, and whether it is of its numbers.
+    """Returns the scale that is stated of the sparse depth, and of whose numbers it is stated.
 
     `--depth-scale` is of both files of a frame, but of the integers alone if one of them holds
     integers. What a layout states is of integers only.
@@ -128,7 +128,8 @@ def scale_of_sparse(
     """
     if options.depth_scale is None:
         return _scale_of_layout(files, files.sparse_scale)
-    # Codes of ground truth whose own file states another scale are none of what the user states.
+    # Integers of ground truth whose own file states another scale keep that: then what the user
+    # states is of the sparse depth.
     has_codes = isinstance(truth, StoredNumbers) and holds_integers(
         truth.file, of_scale=options.depth_scale
     )
@@ -138,7 +139,10 @@ def scale_of_sparse(
 def scale_of_truth(
     files: FrameFiles, options: ReadOptions, sparse: StoredDepth | None
 ) -> StatedScale:
-    """Returns the scale that is stated of the ground truth, and whether it is of its numbers.
+    """Returns the scale that is stated of the ground truth, and of whose numbers it is stated.
+
+    `--depth-scale` is of both files of a frame, but of the integers alone if the sparse depth holds
+    integers. What a layout states is of integers only.
 
     Args:
         files: The files of the frame, with the scales that the data set states.

@@ -20,8 +20,8 @@ _USUAL_PERIOD_S = 0.1
 _FEWEST_TIMES = 3
 """Files of a folder that tell the time between frames."""
 _APART = 0.6
-"""Times the time between frames, up to which an image and its depth are of one moment. Of the
-nearest frame it is half of it, and what TUM's associate.py allows."""
+"""Multiple of the time between frames, up to which an image and its depth are of one moment. The
+nearest frame is within half of it; TUM's associate.py allows 0.02 s at 30 Hz, 0.6 of it."""
 _APART_OF_SCANS = 1.1
 """The same of scans, whose time is of their end, or of their begin."""
 _OTHER_CLOCK_S = 3600.0
@@ -51,6 +51,7 @@ def time_of(path: Path) -> float | None:
     number = match[1]
     if "." in number:
         return float(number)
+    # The digits behind those of whole seconds are ms, µs or ns.
     return int(number) / 10.0 ** (len(number) - _DIGITS_OF_SECONDS)
 
 
@@ -63,7 +64,8 @@ def time_warning(image: Path, depth: Path) -> str | None:
     gap_s = abs(depth_s - image_s)
     if gap_s == 0 or gap_s > _OTHER_CLOCK_S:
         return None
-    # The time between frames is that of the files beside the depth.
+    # The time between frames is that of the files beside the depth. They are listed again only if
+    # their folder changed.
     folder = depth.parent
     times = _times_of(folder, depth.suffix, folder.stat().st_mtime_ns)
     is_scan = depth.suffix.lower() in SCAN_ONLY_SUFFIXES

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -111,3 +113,17 @@ def test_a_clip_where_surfaces_are_is_told_and_kept(depth: np.ndarray) -> None:
     values, (note,) = plausible_map(depth.astype(np.float32), FLOAT, "gt", "--gt-scale", None)
     np.testing.assert_array_equal(values, depth.astype(np.float32))
     assert note.startswith("warning: gt: ")
+
+
+def test_what_is_said_of_the_other_depths_is_true_of_98_per_cent_of_them() -> None:
+    rng = np.random.default_rng(0)
+    rooms = rng.uniform(1, 5, 900)
+    corridor = rng.uniform(10, 20, 80)
+    edges_of_the_sky = np.linspace(31, 44, 10)
+    depth = np.concatenate([rooms, corridor, edges_of_the_sky, np.full(20, 45.0)])
+    is_no_depth, (note,) = far_values(depth)
+    assert is_no_depth[-30:].all()
+    said = re.search(r"98 % of the others are at most ([\d.]+) m", note)
+    assert said is not None
+    others = depth[~is_no_depth]
+    assert np.mean(others <= float(said[1]) + 0.05) == pytest.approx(0.98, abs=0.01)

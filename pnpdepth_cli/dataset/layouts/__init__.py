@@ -32,6 +32,7 @@ def _name_with_place(mark: str) -> Callable[[Path, Path, str], str]:
     """
 
     def name(root: Path, place: Path, stem: str) -> str:
+        """The name of a frame, such as seq-01_frame-000012."""
         return stem if place == root else f"{place.name}{mark}{stem}"
 
     return name
@@ -47,6 +48,7 @@ def _test_frames_of(place: Path) -> Finish:
     stems = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
 
     def keep(frame: FrameFiles) -> FrameFiles | None:
+        """The frame if it is of the split, else None."""
         return frame if frame.name in stems else None
 
     return keep

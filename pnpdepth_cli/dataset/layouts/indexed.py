@@ -207,6 +207,7 @@ def _add_pose(poses: Mapping[int, Pose]) -> Finish:
     """The function that gives a frame, whose name is its number, the pose of this number if any."""
 
     def add_pose(frame: FrameFiles) -> FrameFiles:
+        """The frame with the pose of its number, or without one."""
         return replace(frame, pose=poses.get(int(frame.name)))
 
     return add_pose

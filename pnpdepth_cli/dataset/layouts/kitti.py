@@ -57,6 +57,7 @@ def _poses_of_sequence(place: Path) -> Finish:
     poses = [as_pose(pose) for pose in read_poses(path)]
 
     def with_pose(frame: FrameFiles) -> FrameFiles:
+        """The frame with the pose of its number. Raises InputError if there is none."""
         if not frame.name.isdecimal() or int(frame.name) >= len(poses):
             raise InputError(
                 f"{frame.image} has no pose: its sequence's file holds {len(poses):,} poses, by"
@@ -100,7 +101,12 @@ def _of_drive(drive: Path, inside: Path, *beside: str) -> Path:
 
 
 def _truth_of(drive: Path, camera: str) -> Path:
-    """The folder of the annotated depth of a drive's camera; it may not exist."""
+    """The folder of the annotated depth of a drive's camera; it may not exist.
+
+    Args:
+        drive: The folder of the drive.
+        camera: Folder of the camera in it, such as image_02.
+    """
     beside = [f"data_depth_annotated/{split}" for split in ("train", "val")]
     return _of_drive(drive, Path("proj_depth/groundtruth", camera), *beside)
 

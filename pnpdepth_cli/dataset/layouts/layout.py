@@ -121,21 +121,26 @@ def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
         if match is not None and path.is_file():
             named.append(("".join(match.groups("")), path))
     files, ambiguous = one_of_each(named)
-    return {stem: files[stem] for stem in sorted(files, key=natural_order)}, ambiguous
+    in_order = {name: files[name] for name in sorted(files, key=natural_order)}
+    return in_order, ambiguous
 
 
 def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameFiles | Unmatched]:
     """Yields the frames, named by the stems of the first part's files, and files of no frame.
 
+    The files of a frame have one stem, such as 000123 of 000123.png and 000123.bin.
+
     Args:
-        parts: Where the files of each part are, by its field of `FrameFiles`, or a name that begins
-            with "mask". Every frame has the first part; images may be one video instead.
+        parts: Folder of each part of the frames, and pattern of its files' names, by the part's
+            field of `FrameFiles`; masks by names that begin with "mask". There are images, or one
+            video instead. Every frame has the first part, and those whose pattern has no ? at its
+            end.
         shared: A frame whose fields all frames have.
     """
     # The images may be a video, which has each frame by its number.
     video = _video_of(parts["image"])
     if video is not None:
-        parts = {field: part for field, part in parts.items() if field != "image"}
+        parts = {field: parts[field] for field in parts if field != "image"}
     first, *others = parts
     needed = [field for field in others if not parts[field][1].endswith("?")]
     for field in needed:
@@ -144,8 +149,8 @@ def join_parts(parts: Mapping[str, Part], shared: FrameFiles) -> Iterator[FrameF
             yield parts[first][0], f"has no {folder}; add it"
             return
     files = dict[str, dict[str, Path]]()  # by part, then by stem
-    for field, part in parts.items():
-        files[field], ambiguous = _files_of(part)
+    for field in parts:
+        files[field], ambiguous = _files_of(parts[field])
         yield from ambiguous
     # Files without a partner.
     pairs = [(first, field) for field in needed] + [(field, first) for field in others]
@@ -208,7 +213,7 @@ def layout_of_folders(
         shared: A frame whose fields all frames have.
     """
     # What a place of the data set has, and by what it is found.
-    needed = [_paths_of(part) for part in parts.values() if "/" in part and not part.endswith("?")]
+    needed = [_paths_of(text) for text in parts.values() if "/" in text and not text.endswith("?")]
     needs = (*needed, *marks)
     finder = marks[0] if marks else needed[-1].split("|")[0]
 
@@ -224,7 +229,7 @@ def layout_of_folders(
         for place in find_places(root):
             calibration = place / calib if calib and (place / calib).is_file() else None
             finish = finish_of(place) if finish_of else replace
-            parts_of_place = {field: _part_in(place, part) for field, part in parts.items()}
+            parts_of_place = {field: _part_in(place, text) for field, text in parts.items()}
             for entry in join_parts(parts_of_place, replace(shared, calib=calibration)):
                 if isinstance(entry, tuple):
                     yield entry
@@ -236,24 +241,30 @@ def layout_of_folders(
     return Layout(matches=find_places, frames=frames, needs=needs, below=below)
 
 
-def _paths_of(part: str) -> str:
-    """The folders where the files of a part may lie, with | between; and videos instead of images.
+def _paths_of(text: str) -> str:
+    """The paths of which a place needs one to have a part, with | between them.
+
+    They are the folders where the part's files may lie, and the videos that may be there instead of
+    a folder of images.
 
     Args:
-        part: Folders, with | between them, and pattern of names, as one path.
+        text: Folders, with | between them, and pattern of names, as one path.
     """
-    folders, _, pattern = part.rpartition("/")
+    folders, _, pattern = text.rpartition("/")
     endings = ("", *VIDEO_SUFFIXES) if pattern.endswith(".IMAGE") else ("",)
     return "|".join(folder + ending for ending in endings for folder in folders.split("|"))
 
 
-def _part_in(place: Path, part: str) -> Part:
-    """The part in the first of its folders that a place has, or a video instead; else in the first.
+def _part_in(place: Path, text: str) -> Part:
+    """The folder of a part, and the pattern of its files' names.
+
+    Of several folders that it may have, it is the first that exists, or whose video does; else the
+    first of all.
 
     Args:
         place: The folder of all parts.
-        part: Folders, with | between them, and pattern of names, as one path.
+        text: Folders, with | between them, and pattern of names, as one path.
     """
-    folders, _, pattern = part.rpartition("/")
+    folders, _, pattern = text.rpartition("/")
     candidates = [(place / folder, pattern) for folder in folders.split("|")]
     return next(filter(_exists, candidates), candidates[0])

@@ -57,8 +57,7 @@ def _frames_of_list(path: Path) -> list[FrameFiles | Unmatched]:
         }
         try:
             frames[number] = _frame_of(cells, files)
-        # Of float() and int(), and our own.
-        except (ValueError, OverflowError, UsageError) as error:
+        except (ValueError, UsageError) as error:  # also of float() and int()
             raise InputError(f"{path}, line {number}: {one_line(error)}") from error
         for file in files.values():
             if not file.exists():
@@ -105,6 +104,7 @@ def _lines_of(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         raise InputError(f"{path} is not a text file; give CSV") from error
     if "\n" not in text:  # of old spreadsheets
         text = text.replace("\r", "\n")
+    # The header, then the lines.
     reader = csv.DictReader(io.StringIO(text, newline="\n"), restkey="more than the header has")
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
