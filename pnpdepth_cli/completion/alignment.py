@@ -375,7 +375,9 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
         # Depth that is the same everywhere needs a shift, and says something of two points or more.
         has_level = candidate.kind == "affine" and len(x) > 1
         return _level(x, depth, candidate) if has_level else None
-    return _with_errors(x, depth, candidate, line) if scale else None
+    if not scale:  # the numbers are the same at all points
+        return None
+    return _with_errors(x, depth, candidate, line)
 
 
 def _level(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment:

@@ -172,7 +172,7 @@ def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -
     """All of the holes (R, C) if they have room, else whole ones in random order that still have.
 
     Args:
-        holes: Where holes are.
+        holes: Where holes are, (R, C) bool. Pixels that touch, also by a corner, are one hole.
         room: Number of pixels that holes may have in all.
         rng: Source of the order.
     """

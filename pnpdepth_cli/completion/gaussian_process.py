@@ -409,7 +409,7 @@ class _Systems(NamedTuple):
 
 
 def _systems(residuals: Residuals, near: Tensor) -> _Systems:
-    """The equations of B blocks; `near` (B, k) are the numbers of the points of each."""
+    """The equations (K + N) α = r of B blocks; `near` (B, k) are the numbers of their points."""
     features = residuals.point_features[near].double()
     u = features[..., LOG_DEPTH]
     scaled = residuals.scaled(features)

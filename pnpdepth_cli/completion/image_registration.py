@@ -524,11 +524,12 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
         right: Shift to the right in pixels of the reduced image.
         down: Shift downwards, likewise.
     """
-    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
-    standing = gains.sum() / (np.linalg.norm(gains) + _TINY)
+    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)  # of each part
+    standard_errors = gains.sum() / (np.linalg.norm(gains) + _TINY)
+    # Of more points, more is asked, and of fewer less.
     points = np.mean([frame.points for frame in frames])
     more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
-    return bool(standing >= _LEAST_STANDING + more)
+    return bool(standard_errors >= _LEAST_STANDING + more)
 
 
 def _bayes_factor(
@@ -545,13 +546,13 @@ def _bayes_factor(
         maps: Log likelihood (rows, columns) of each frame by shift.
         shift: Row and column of the shift in the maps.
     """
-    standing = np.array(
+    deviations = np.array(
         [(by_shift[shift] - by_shift.mean()) / (by_shift.std() + _TINY) for by_shift in maps]
     )
     points = np.array([frame.points for frame in frames])
-    # The log of N(standing; expected, 1) over N(standing; 0, 1), summed over the frames.
+    # The log of N(deviations; expected, 1) over N(deviations; 0, 1), summed over the frames.
     expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
-    return float(np.sum(expected * (standing - expected / 2)))
+    return float(np.sum(expected * (deviations - expected / 2)))
 
 
 def _edges(rgb: Image) -> Image:

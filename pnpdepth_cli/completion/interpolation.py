@@ -255,12 +255,14 @@ class _Grid(NamedTuple):
 
         None also if no square of the grid has points at its four corners.
         """
+        # Every x of a point is a column of nodes, every y a row.
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)
         if len(columns) * len(rows) > _NODES * len(xy):
             return None
         number = np.full((len(rows), len(columns)), -1)
         number[row, column] = np.arange(len(xy))
+        # The squares with a point at each corner: upper left, upper right, lower left, lower right.
         known = number >= 0
         full = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
         if not full.any():

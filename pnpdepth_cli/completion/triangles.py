@@ -68,7 +68,9 @@ class Positions:
         return len(self.columns) * len(self.rows) if self.nodes is None else len(self.nodes)
 
     def first_after(self, row: Numbers, column: Numbers) -> Numbers:
-        """Returns the number of the first position at or behind nodes of the grid, row after row.
+        """Returns the number (S,) of the first position at or behind each of S nodes of the grid.
+
+        Nodes are in the order row after row. Positions are some of them, or all.
 
         Args:
             row: Rows (S,) of the nodes.

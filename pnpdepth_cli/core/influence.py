@@ -90,11 +90,12 @@ def influential_fields(
 
 
 def _field(spreads: list[Spread], z_shape: torch.Size, prediction: Tensor) -> Field:
-    """The field of a layer: the largest patches of points at `_POSITIONS`.
+    """What one point influences through a layer: the largest patches of points at `_POSITIONS`.
 
     Args:
-        spreads: Where the prediction depends on z, as `_Follower.spreads_from` gives it.
-        z_shape: Shape of z, the layer's output.
+        spreads: Where the prediction depends on the layer's output z, as `_Follower.spreads_from`
+            gives it.
+        z_shape: Shape of z.
         prediction: The prediction, whose last two axes are rows and columns.
     """
     patches = [_patches(spreads, prediction.shape, position) for position in _POSITIONS]

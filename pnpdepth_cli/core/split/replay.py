@@ -47,9 +47,10 @@ def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None
         yield
     finally:
         for module, own_forward in own_forwards.items():
-            module.__dict__["forward"] = own_forward
             if own_forward is None:
-                del module.__dict__["forward"]
+                module.__dict__.pop("forward", None)
+            else:
+                module.__dict__["forward"] = own_forward
 
 
 def _stand_in(
@@ -71,6 +72,7 @@ def shapes_of(arguments: object) -> object:
     branches on values treats such arguments alike.
     """
     tensors = [(tensor.shape, tensor.dtype, tensor.device) for _, tensor in tensors_in(arguments)]
+    # The rest as text, in which empty tensors stand for all.
     return tensors, repr(map_tensors(arguments, lambda _, tensor: tensor.new_empty(0)))
 
 
@@ -204,6 +206,7 @@ class Replay:
         # Without a saved output the layer runs for what else it does, as changing its input.
         output = run() if saved is None else saved.fresh()
         if self.recorder is not None:
+            # The tensor that z stands for is in the network's hands only where the layer ran.
             original = dict(tensors_in(output))[self.path] if saved is None else None
             self.recorder.watch.note_injection(z, original)
         return map_tensors(output, lambda path, tensor: z if path == self.path else tensor)
