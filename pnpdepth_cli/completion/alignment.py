@@ -483,7 +483,9 @@ def _bic(fit: Alignment) -> float:
     −N·log(mean error) and a constant.
     """
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
-    error = max(fit.misfit, _LEAST_ERROR) if fit.points > parameters else _UNTESTED
+    error = max(fit.misfit, _LEAST_ERROR)
+    if fit.points <= parameters:  # it goes through all points, which says nothing of its error
+        error = _UNTESTED
     return 2 * fit.points * math.log(error) + parameters * math.log(fit.points)
 
 

@@ -333,9 +333,9 @@ def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:
 
 
 def _steps(points: SparsePoints) -> tuple[int, int]:
-    """How many rows and columns of pixels one node of the grid stands for; 1, 1: it is the pixels.
+    """(rows, columns) of pixels that one node of the grid stands for; (1, 1): each is a node.
 
-    The grid is the one on which the residual is predicted.
+    The grid is the one on which the residual is predicted, finer than the points.
     """
     height, width = points.size
     if height * width < _WORTH_A_GRID:

@@ -535,11 +535,11 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
 def _bayes_factor(
     frames: Sequence[Evidence], maps: Sequence[Floats], shift: tuple[int, int]
 ) -> float:
-    """Log of the Bayes factor of images that belong to their points at one shift over chance.
+    """Log of the Bayes factor: that images belong to their points at one shift, over chance.
 
-    The log likelihood there exceeds its mean over all shifts by so many standard deviations. For an
-    unrelated image these are 0 ± 1. For one that belongs there they grow with the logarithm of the
-    number of points (even frames of 7-Scenes and ICL-NUIM).
+    What counts is by how many standard deviations the log likelihood at the shift exceeds its mean
+    over all shifts. For an unrelated image that is 0 ± 1. For one that belongs there it grows with
+    the logarithm of the number of points (even frames of 7-Scenes and ICL-NUIM).
 
     Args:
         frames: Evidence of the frames.

@@ -127,8 +127,8 @@ class Triangulation:
         if self._last is None or self._last[0] is not xy:
             positions, number = Positions.of(coordinates)
             # Of many points and few positions, only the triangles at the positions are made.
-            is_few = len(self._rim) > _FEW * len(coordinates)
-            triangles = self._triangles_at(coordinates) if is_few else self._triangles
+            are_few = len(self._rim) > _FEW * len(coordinates)
+            triangles = self._triangles_at(coordinates) if are_few else self._triangles
             self._last = (xy, self._locate(coordinates, triangles, positions, number))
         _, located = self._last
         return self._depth(coordinates, located, space)

@@ -282,8 +282,7 @@ class _Follower(TorchDispatchMode):
 def _storage(tensor: Tensor) -> int:
     """A number that tensors in the same memory share; 0 for a sparse tensor, which has no storage.
 
-    It is the address of the storage, which torch raises NotImplementedError for where there is
-    none.
+    It is the address of torch's storage object; a sparse tensor raises NotImplementedError.
     """
     try:
         return int(tensor.untyped_storage()._cdata)

@@ -143,7 +143,7 @@ class Replay:
         """
         if not self.in_pass:
             return self._handle_outside(module, run)
-        if self._fills:
+        if self._fills:  # the output of the call around it will be saved
             return run()
         if self.has_front:  # the network has caught the end of the front
             raise self.end_of_front()
@@ -360,7 +360,9 @@ class Recorder:
 
 
 def _ids(tensors: list[tuple[tuple[str, ...], Tensor]]) -> list[tuple[tuple[str, ...], int]]:
-    """The paths and the identities of tensors, which change with the lists and dicts they are in.
+    """The paths of tensors and their identities, which are equal if the same tensors are there.
+
+    So they tell whether a call has changed the lists or dicts among its inputs.
 
     Args:
         tensors: Paths and tensors as `tensors_in` yields them; while they are held, no other tensor

@@ -73,13 +73,14 @@ class Watch(TorchDispatchMode):
         self.data_dependent = False
         self.escaped = False
         self.torn = False
-        # Keys and elements are storages, as `_storage` numbers them.
         self._operations = 0  # tensor operations so far, so that each has a number from 1
         self._touches = 0  # operations and calls so far that may have read z
         self._writes: list[int] = []
-        """For each change in place, the operation that created the storage; 0: none in this pass"""
-        self._created: dict[int, int] = {}  # operation that created a storage
-        self._marked: set[int] = set()  # storages that depend on z
+        """For each change in place, the number of the operation that created what is changed; 0:
+        it is older than the pass."""
+        # By storage, as `_storage` numbers it:
+        self._created: dict[int, int] = {}  # number of the operation that created it
+        self._marked: set[int] = set()  # those that depend on z
         self._protected: dict[int, list[SavedTensors]] = {}  # what is cloned before it is changed
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
@@ -96,7 +97,7 @@ class Watch(TorchDispatchMode):
             z: What the cut layer gives.
             original: Tensor of the network that z stands for; None if the layer did not run.
         """
-        self._touches += 1
+        self._touches += 1  # from here on the network reads z
         self._marked.add(_storage(z))
         if original is not None:
             self._twins = (original, z)
@@ -261,8 +262,7 @@ _NO_STORAGE = 0
 def _storage(tensor: Tensor) -> int:
     """A number that tensors in the same memory share; `_NO_STORAGE` for sparse tensors.
 
-    It is the address of the storage, which torch raises NotImplementedError for where there is
-    none.
+    It is the address of torch's storage object; a sparse tensor raises NotImplementedError.
     """
     try:
         return int(tensor.untyped_storage()._cdata)

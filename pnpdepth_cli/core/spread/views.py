@@ -68,7 +68,7 @@ def stack(call: Call) -> Spread:
     """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
     places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
-    if not places:
+    if not places:  # it came another way, such as through a keyword
         return everywhere(call)
     # A box that is empty stays so: its last place is before its first.
     empty = call.spread.empty()
