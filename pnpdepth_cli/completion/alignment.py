@@ -223,7 +223,7 @@ def candidates(
     kinds = _KINDS_OF_SCALE.get(output_scale, _ALL_KINDS)
     if align_setting in FITS:
         kinds = (align_setting,)
-    # Anything.
+    # Neither says what the numbers are.
     if reading is None:
         fits = [Candidate(any_reading, kind) for any_reading in READINGS for kind in kinds]
         return tuple(fit for fit in fits if _has_kind(fit.reading, fit.kind))
@@ -271,6 +271,7 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
         NoPointsError: There are too few points.
         ModelError: The numbers do not vary, or are not finite.
     """
+    # The points where the network gives a number.
     x = x.detach().cpu().double()
     depth = points.depth.detach().cpu().double()
     finite = x.isfinite()
@@ -281,15 +282,16 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
         )
     x = x[finite]
     depth = depth[finite]
+    # The best fit of each reading, the best one first; of equal ones the first that was tried.
     possible = [_fit(x, depth, candidate) for candidate in tried]
     fits = [fit for fit in possible if fit is not None]
-    if fits:
-        # The best fit of each reading, the best one first; of equal ones the first that was tried.
-        best_of_reading: dict[str, Alignment] = {}
-        for fit in sorted(fits, key=_bic):
-            best_of_reading.setdefault(fit.reading, fit)
+    best_of_reading: dict[str, Alignment] = {}
+    for fit in sorted(fits, key=_bic):
+        best_of_reading.setdefault(fit.reading, fit)
+    if best_of_reading:
         best, *others = best_of_reading.values()
         return [best, *(fit for fit in others if _is_alike(fit, best, x, depth))]
+    # There is none.
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(

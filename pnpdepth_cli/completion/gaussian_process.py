@@ -210,7 +210,7 @@ def _sample(features: Tensor, points: SparsePoints) -> Tensor:
 def _colour(rgb: Tensor) -> Tensor:
     """CIELAB (3, H, W) of an image (3, H, W), of mean 0 and standard deviation about 1.
 
-    The standard deviation is the root of the three's variances over the image, summed.
+    The standard deviation is the root of the sum of the three variances over the image.
 
     Remembered for the last two images, by identity: a frame's, whose residuals are propagated
     several times, and a grey one.
@@ -314,7 +314,7 @@ def leave_one_out(
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
     error = (inverse @ residuals.residual[near][..., None])[..., 0] * variance
-    # The points at the edge of a neighbourhood have others outside of it.
+    # Of several neighbourhoods the middle counts, as points at the edge have others outside.
     inner = _INNER if near.shape[0] > 1 else None
     return error[:, :inner], (variance - extra_noise)[:, :inner]
 
@@ -327,6 +327,7 @@ def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:
     count = len(residuals.points)
     if count <= max_exact:
         return _all_points(residuals)
+    # Around points that are evenly spaced in the order of points.
     middles = torch.linspace(0, count - 1, _NEIGHBOURHOODS).long()
     _, near = nearest_points(residuals.points, residuals.points.xy[middles].double(), NEIGHBOURS)
     return near

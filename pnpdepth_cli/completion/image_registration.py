@@ -159,9 +159,11 @@ class ImageRegistration:
             rgb: Image (H, W, 3); another number of channels, or none, will do.
         """
         height, width = rgb.shape[:2]
-        # The matrix leads from a pixel of the result to where its colour is.
-        x, y = (1 - self.zoom) * np.array([width - 1, height - 1]) / 2 + (self.right, self.down)
-        matrix = np.array([[self.zoom, 0, x], [0, self.zoom, y]])
+        # The matrix leads from a pixel x of the result to where its colour is: zoom·x, and what
+        # follows from the centre and the shift.
+        centre = np.array([width - 1, height - 1]) / 2
+        right, down = (1 - self.zoom) * centre + (self.right, self.down)
+        matrix = np.array([[self.zoom, 0, right], [0, self.zoom, down]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         moved = cv2.warpAffine(
             rgb, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
@@ -386,6 +388,7 @@ def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
     right = width * _reduction(size)  # edges of the reduced image
     bottom = height * _reduction(size)
     corner = np.array([right, bottom])
+    # |0 − y| leaves y as it is.
     orientations: dict[str, _Orient] = {
         "mirrored left to right": lambda xy: np.abs(np.array([right, 0.0]) - xy),
         "upside down, its rows from the bottom up": lambda xy: np.abs(np.array([0.0, bottom]) - xy),

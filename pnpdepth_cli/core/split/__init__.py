@@ -65,6 +65,7 @@ class Split:
         self._replay: Replay | None = None
 
     def __enter__(self) -> Self:
+        # If a step of opening fails, those before it are undone.
         with ExitStack() as opening:
             self._state = NetworkState(self._network)
             opening.callback(self._state.close)
@@ -116,6 +117,7 @@ class Split:
         Raises:
             ModelError: The network fails, the layer runs several times without a choice, or its
                 output cannot be replaced.
+            RuntimeError: `front` was not called before.
         """
         replay = self._replay
         if replay is None or replay.z0 is None:

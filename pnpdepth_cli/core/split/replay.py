@@ -291,7 +291,7 @@ class Recorder:
             self._saved[call] = saved
             self.watch.protect(saved)
         elif may_be_cached and next(module.children(), None) is not None:
-            self._uncacheable.add(module)
+            self._uncacheable.add(module)  # the next pass records what is in it
         # The front ends at the cut.
         if self._is_cut(module):
             self._replay.path, self._replay.z0 = self._cut.choose(output)
@@ -315,8 +315,9 @@ class Recorder:
                 f"layer {layer!r}: its output lies in the memory of an earlier tensor, and the"
                 " network changes one in place and reads the other; cut one layer later"
             )
-        # Another z may take another path behind the cut, unless the definition says otherwise. So
-        # no call there is recorded, and saved outputs stay whole, as it may read or change them.
+        # Another z may take another path behind the cut, as values reached Python there and it was
+        # not promised that they do not matter. So no call there is recorded, and saved outputs are
+        # cloned, as that path may change them.
         if self.watch.data_dependent:
             self._drop_from(self._calls_before)
             for saved in self._saved.values():

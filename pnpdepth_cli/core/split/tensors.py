@@ -11,6 +11,21 @@ import torch
 from torch import Tensor, nn
 
 
+NO_STORAGE = 0
+"""The number that stands for the memory of sparse tensors, which have no storage."""
+
+
+def storage_of(tensor: Tensor) -> int:
+    """Returns a number that tensors in the same memory share; `NO_STORAGE` for a sparse tensor.
+
+    It is the address of torch's storage object; a sparse tensor raises NotImplementedError.
+    """
+    try:
+        return int(tensor.untyped_storage()._cdata)
+    except NotImplementedError:
+        return NO_STORAGE
+
+
 def tensors_in(
     structure: object, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Tensor]]:

@@ -29,7 +29,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of_axis(cls, shape: Sequence[int], axis: int) -> Spread:
-        """Returns the box of each row of a feature map in that map itself.
+        """Returns, for each row of a feature map, the box of its elements in that map.
 
         Args:
             shape: Shape of the feature map.
@@ -144,10 +144,10 @@ def pointwise(call: Call) -> Spread:
             return everywhere(call)
     # Axes of the result that the input has not are in front of those that it has.
     new_axes = len(call.shape) - call.source.ndim
-    if new_axes < 0:
+    if new_axes < 0:  # no broadcasting
         return everywhere(call)
     axes = [full_range(call, axis) for axis in range(new_axes)]
     for axis, axis_range in enumerate(call.spread.axes(), start=new_axes):
-        is_repeated = call.source.shape[axis - new_axes] == 1 < call.shape[axis]
-        axes.append(full_range(call, axis) if is_repeated else axis_range)
+        is_broadcast = call.source.shape[axis - new_axes] == 1 and call.shape[axis] > 1
+        axes.append(full_range(call, axis) if is_broadcast else axis_range)
     return Spread.from_axes(axes)

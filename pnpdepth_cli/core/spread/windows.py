@@ -153,7 +153,7 @@ def resize(call: Call) -> Spread:
     How far it reaches is asked of the operation itself, with the options of the call.
     """
     options = _options(call)
-    corners = [options["align_corners"]] if "align_corners" in options else []
+    corners = [options["align_corners"]] if "align_corners" in options else []  # nearest has none
     responses: dict[int, Response] = {}
     for axis, scale_name in ((2, "scales_h"), (3, "scales_w")):
         old_size = call.source.shape[axis]
