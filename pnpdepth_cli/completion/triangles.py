@@ -216,7 +216,7 @@ def barycentric(corners: Floats, xy: Floats) -> Floats:
 
 def circles(corners: Floats) -> tuple[Floats, Floats]:
     """Returns the centre (T, 2) and the radius (T,) of the circles through triangles (T, 3, 2)."""
-    # In coordinates in which the first corner is 0.
+    # In coordinates in which the first corner is 0; the centre is as far from it as from b and c.
     a = corners[:, 0]
     b = corners[:, 1] - a
     c = corners[:, 2] - a

@@ -78,6 +78,7 @@ def refine(
     step = step_size(settings.lr, z)
     loss_of = checked_loss(settings.loss)
     rule: Update = UPDATES[settings.update]()
+    scale = _LOSS_SCALE if split.in_half else 1.0  # of the loss, so that no gradient vanishes
     so_far: Refinement | None = None
     updates = 0
     while True:
@@ -105,7 +106,15 @@ def refine(
         if is_last:
             return so_far
         # The gradient of L at z_k.
-        gradient = _gradient(loss, z, split)
+        with torch.enable_grad():
+            gradient = gradient_at(z, loss * scale)
+        if gradient is None:
+            raise ModelError(
+                f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
+                " the prediction does not depend on it or the network's forward runs under"
+                " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+            )
+        gradient = gradient / scale
         if not bool(gradient.isfinite().all()):
             raise _diverged("gradient", updates, step, so_far)
         # z_{k+1} = z_k − α·U(gradient)
@@ -123,24 +132,6 @@ def _with_pass(so_far: Refinement | None, depth: Tensor, loss: float, step: floa
     if so_far is None:
         return Refinement(before=depth, after=depth, losses=(loss,), step=step)
     return replace(so_far, after=depth, losses=(*so_far.losses, loss))
-
-
-def _gradient(loss: Tensor, z: Tensor, split: Split) -> Tensor:
-    """∂loss/∂z, of the shape of z.
-
-    Raises:
-        ModelError: The loss does not depend on z, as far as torch can follow.
-    """
-    scale = _LOSS_SCALE if split.in_half else 1.0
-    with torch.enable_grad():
-        gradient = gradient_at(z, loss * scale)
-    if gradient is None:
-        raise ModelError(
-            f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
-            " the prediction does not depend on it or the network's forward runs under"
-            " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-        )
-    return gradient / scale
 
 
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:

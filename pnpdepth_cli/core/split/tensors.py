@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-
 NO_STORAGE = 0
 """The number that stands for the memory of sparse tensors, which have no storage."""
 
