@@ -352,9 +352,9 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
 
 
 def _has_kind(reading: str, kind: str) -> bool:
-    """Whether this reading can be fitted with these parameters.
+    """Whether numbers taken for this (a reading) can be fitted by these parameters (a kind).
 
-    What is linear in 1/x, or a power, is fitted by scale and shift alone.
+    The inverse of a disparity, and a power, are fitted by scale and shift together, never by one.
     """
     return kind == "affine" or reading in ("depth", "disparity", "log")
 
@@ -420,7 +420,7 @@ def _with_errors(
 def _scale_and_shift(
     x: Tensor, depth: Tensor, reading: str, kind: str
 ) -> tuple[float, float] | None:
-    """Scale and shift of the line that fits best; None where x allows none.
+    """Scale and shift of the line that fits the points best; None where x allows none.
 
     A scale of 0 says that no line fits, because the numbers are the same at all points.
 
@@ -430,16 +430,18 @@ def _scale_and_shift(
         reading: What the numbers are taken for, a key of `_READINGS`.
         kind: The parameters that are fitted, one of `choices.FITS`.
     """
-    if kind == "none":
+    if kind == "none":  # nothing is fitted
         return 1.0, 0.0
     if kind != "affine":
         return _factor(x, depth, reading, kind)
+    # Scale and shift: a line in x, in 1/x or in log x, of which the latter two need x above 0.
     _, x_space, depth_space = _READINGS[reading]
-    if x_space != "depth" and not bool((x > 0).all()):  # 1/x or log x
+    if x_space != "depth" and not bool((x > 0).all()):
         return None
     x = to_space(x, x_space)
     if float(x.max() - x.min()) <= _DISTINCT * float(x.abs().max()):
         return 0.0, 0.0
+    # The line is clamped where aligned depth is.
     low, high = sorted(to_space(_bounds(depth), depth_space).tolist())
     return fit_line(x, to_space(depth, depth_space), depth_space, (low, high))
 

@@ -380,9 +380,10 @@ def _unchanged(xy: Floats) -> Floats:
 
 
 def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
-    """Where positions in an image (H, W) are if its depth is turned or mirrored, by words for it.
+    """The ways in which depth can be turned or mirrored against an image (H, W), by words for them.
 
-    x and y are exchanged only in a square image.
+    Each takes positions in the reduced image to where they belong then. x and y are exchanged only
+    in a square image.
     """
     height, width = size
     right = width * _reduction(size)  # edges of the reduced image

@@ -55,9 +55,9 @@ class Positions:
 
     @classmethod
     def of(cls, xy: Floats) -> tuple[Positions, Numbers]:
-        """Returns coordinates (M, 2) as positions without repetition, and which each of them is.
+        """Returns the distinct ones of coordinates (M, 2), and which of these each of them is.
 
-        The latter are (M,) numbers of positions.
+        The latter is the number (M,) of a position, in the order row after row.
         """
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)

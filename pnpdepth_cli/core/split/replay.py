@@ -91,8 +91,9 @@ class Replay:
         self.arguments = SavedTensors(_copies(arguments))
         self._shapes = shapes_of(self.arguments.value)
         self.outputs: dict[Call, SavedTensors | None] = {}
-        """Outputs of recorded calls in their order: None where not cached, of value None before it
-        ran. Calls that are not cached are recorded if they contain the cut or recorded calls."""
+        """Outputs of recorded calls, in the order in which calls begin. None: the call is not
+        cached, so that it runs in every pass; it contains the cut or recorded calls, or works in
+        place. An output of value None: the call has not run for the frame at hand."""
         self.cut_call: Call | None = None  # that is the cut; None before it was reached
         self.path: tuple[str, ...] = ()  # path of z in the output of that call
         self.static_graph = True  # whether arguments of the same shapes all make the same calls
@@ -149,7 +150,7 @@ class Replay:
             raise self.end_of_front()
         # A learning pass watches the call; a call that is not recorded yet is recorded.
         if self.recorder is not None:
-            run = functools.partial(self.recorder.run, module, run)
+            run = functools.partial(self.recorder.run_watched, module, run)
         call = module, self.calls[module]
         self.calls[module] += 1
         if call not in self.outputs:
@@ -241,8 +242,11 @@ class Recorder:
         self._calls_before = len(self._saved)  # this pass; in the rear's, those up to the cut
         self._is_inside_cached = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, run: Run) -> object:
-        """Returns the output of a submodule that `run` runs, watched for values that escape."""
+    def run_watched(self, module: nn.Module, run: Run) -> object:
+        """Returns what `run` returns, the output of a call of the module.
+
+        Values of tensors that reach Python meanwhile are noted.
+        """
         with self.watch.seeing_escapes_of(module):
             return run()
 

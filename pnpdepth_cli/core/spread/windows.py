@@ -139,6 +139,7 @@ def pool(call: Call) -> Spread:
 def adaptive_pool(call: Call) -> Spread:
     """Returns the boxes of a pooling to a stated size: the input's, widened by its windows."""
     responses: dict[int, Response] = {}
+    # Windows are the same for a mean and a maximum.
     for axis in (len(call.shape) - 2, len(call.shape) - 1):
         output = F.adaptive_avg_pool1d(_unit_rows(call, axis), call.shape[axis])
         responses[axis] = _response(output[:, 0])
@@ -217,7 +218,7 @@ def pixel_unshuffle(call: Call) -> Spread:
 
 @rule("gather")
 def gather(call: Call) -> Spread:
-    """Returns the boxes of `torch.gather`: everywhere that its indices take an element of a box to.
+    """Returns the boxes of `torch.gather`: all places that its indices fill from the input's boxes.
 
     They are all of the result if the indices have no values, as on the device "meta".
     """
