@@ -144,9 +144,10 @@ class Residuals:
 
 
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
-    """Returns the residuals at the points that lie in the image and have a prediction.
+    """Returns log measured − log predicted depth at the points in the image with a prediction.
 
-    Of several points at the same coordinates the one of least depth counts.
+    Features and default kernel of a Gaussian process are with it. Of several points at the same
+    coordinates the one of least depth counts.
 
     Args:
         prediction: Depth (H, W) in metres; not positive or not finite is unknown.

@@ -167,7 +167,7 @@ class Split:
             # The replay itself ends the pass at the cut, by `Replay.end_of_front`.
             if not replay.has_front:
                 raise
-        if replay.z0 is None or not replay.has_front:
+        if replay.z0 is None or not replay.has_front:  # the former for mypy alone
             ran = {module for module, _ in replay.outputs} if recorder is None else recorder.ran
             raise self._cut.not_reached_error(ran, replay.calls[self._cut.module])
         return replay.z0
