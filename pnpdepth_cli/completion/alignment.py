@@ -223,7 +223,7 @@ def candidates(
     kinds = _KINDS_OF_SCALE.get(output_scale, _ALL_KINDS)
     if align_setting in FITS:
         kinds = (align_setting,)
-    # Anything.
+    # Neither says what the numbers are.
     if reading is None:
         fits = [Candidate(any_reading, kind) for any_reading in READINGS for kind in kinds]
         return tuple(fit for fit in fits if _has_kind(fit.reading, fit.kind))
@@ -271,6 +271,7 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
         NoPointsError: There are too few points.
         ModelError: The numbers do not vary, or are not finite.
     """
+    # The points where the network gives a number.
     x = x.detach().cpu().double()
     depth = points.depth.detach().cpu().double()
     finite = x.isfinite()
@@ -281,15 +282,16 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
         )
     x = x[finite]
     depth = depth[finite]
+    # The best fit of each reading, the best one first; of equal ones the first that was tried.
     possible = [_fit(x, depth, candidate) for candidate in tried]
     fits = [fit for fit in possible if fit is not None]
-    if fits:
-        # The best fit of each reading, the best one first; of equal ones the first that was tried.
-        best_of_reading: dict[str, Alignment] = {}
-        for fit in sorted(fits, key=_bic):
-            best_of_reading.setdefault(fit.reading, fit)
+    best_of_reading: dict[str, Alignment] = {}
+    for fit in sorted(fits, key=_bic):
+        best_of_reading.setdefault(fit.reading, fit)
+    if best_of_reading:
         best, *others = best_of_reading.values()
         return [best, *(fit for fit in others if _is_alike(fit, best, x, depth))]
+    # There is none.
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
@@ -350,9 +352,9 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
 
 
 def _has_kind(reading: str, kind: str) -> bool:
-    """Whether this reading can be fitted with these parameters.
+    """Whether numbers taken for this (a reading) can be fitted by these parameters (a kind).
 
-    What is linear in 1/x, or a power, is fitted by scale and shift alone.
+    The inverse of a disparity, and a power, are fitted by scale and shift together, never by one.
     """
     return kind == "affine" or reading in ("depth", "disparity", "log")
 
@@ -375,7 +377,9 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
         # Depth that is the same everywhere needs a shift, and says something of two points or more.
         has_level = candidate.kind == "affine" and len(x) > 1
         return _level(x, depth, candidate) if has_level else None
-    return _with_errors(x, depth, candidate, line) if scale else None
+    if not scale:  # the numbers are the same at all points
+        return None
+    return _with_errors(x, depth, candidate, line)
 
 
 def _level(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment:
@@ -416,7 +420,7 @@ def _with_errors(
 def _scale_and_shift(
     x: Tensor, depth: Tensor, reading: str, kind: str
 ) -> tuple[float, float] | None:
-    """Scale and shift of the line that fits best; None where x allows none.
+    """Scale and shift of the line that fits the points best; None where x allows none.
 
     A scale of 0 says that no line fits, because the numbers are the same at all points.
 
@@ -426,16 +430,18 @@ def _scale_and_shift(
         reading: What the numbers are taken for, a key of `_READINGS`.
         kind: The parameters that are fitted, one of `choices.FITS`.
     """
-    if kind == "none":
+    if kind == "none":  # nothing is fitted
         return 1.0, 0.0
     if kind != "affine":
         return _factor(x, depth, reading, kind)
+    # Scale and shift: a line in x, in 1/x or in log x, of which the latter two need x above 0.
     _, x_space, depth_space = _READINGS[reading]
-    if x_space != "depth" and not bool((x > 0).all()):  # 1/x or log x
+    if x_space != "depth" and not bool((x > 0).all()):
         return None
     x = to_space(x, x_space)
     if float(x.max() - x.min()) <= _DISTINCT * float(x.abs().max()):
         return 0.0, 0.0
+    # The line is clamped where aligned depth is.
     low, high = sorted(to_space(_bounds(depth), depth_space).tolist())
     return fit_line(x, to_space(depth, depth_space), depth_space, (low, high))
 
@@ -481,7 +487,9 @@ def _bic(fit: Alignment) -> float:
     −N·log(mean error) and a constant.
     """
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
-    error = max(fit.misfit, _LEAST_ERROR) if fit.points > parameters else _UNTESTED
+    error = max(fit.misfit, _LEAST_ERROR)
+    if fit.points <= parameters:  # it goes through all points, which says nothing of its error
+        error = _UNTESTED
     return 2 * fit.points * math.log(error) + parameters * math.log(fit.points)
 
 

@@ -54,12 +54,12 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     prediction = prediction.detach().cpu()
     known, points = where_predicted(prediction, points.tensors())
     points = distinct(points)
-    # The global alignment. Metres go through `in_bounds`, which clamps them to its bounds.
+    # The global alignment, and one that only clamps metres to its bounds.
     x = torch.where(known, prediction, 1.0).double()  # 1 stands for what is unknown
     kinds = ("none", "scale", "affine")
     alignment = align(points.sample(x), points, [Candidate("depth", kind) for kind in kinds])
     aligned = alignment.scale * x + alignment.shift
-    in_bounds = replace(alignment, scale=1.0, shift=0.0)
+    clamping = replace(alignment, scale=1.0, shift=0.0)
     # Aligned depth in standard deviations over the points: the regressor of the local lines.
     at_points = points.sample(aligned)
     mean = at_points.mean()
@@ -68,10 +68,10 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
     regressor_at_points = (at_points - mean) / std
     # The residual of depth by lines around every pixel, outliers counting less.
     residual = points.depth.double() - at_points
-    log_residual = points.depth.double().log() - in_bounds.depth(at_points).log()
+    log_residual = points.depth.double().log() - clamping.depth(at_points).log()
     weights = inlier_weights(points, log_residual)
     shift, slope = local_lines(points, None, residual, regressor_at_points, weights)
-    depth = in_bounds.depth(aligned + shift + slope * regressor)
+    depth = clamping.depth(aligned + shift + slope * regressor)
     return torch.where(known, depth, 0.0).float().to(device)
 
 

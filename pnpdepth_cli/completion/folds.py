@@ -172,7 +172,7 @@ def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -
     """All of the holes (R, C) if they have room, else whole ones in random order that still have.
 
     Args:
-        holes: Where holes are.
+        holes: Where holes are, (R, C) bool. Pixels that touch, also by a corner, are one hole.
         room: Number of pixels that holes may have in all.
         rng: Source of the order.
     """
@@ -226,7 +226,8 @@ def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> flo
     low = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_FROM, dim=0)
     high = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_TO, dim=0)
     xy = low + (high - low) * torch.rand(_SAMPLED, 2, generator=generator)
-    return float(nearest_points(points, xy.double(), 1)[0].median())
+    distance, _ = nearest_points(points, xy.double(), 1)
+    return float(distance.median())
 
 
 def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Generator) -> float:
@@ -238,7 +239,8 @@ def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Gene
     if bool(held_out.all()):
         return math.inf
     xy = _sample(points.xy[held_out].cpu(), generator)
-    return float(nearest_points(points.select(~held_out), xy.double(), 1)[0].median())
+    distance, _ = nearest_points(points.select(~held_out), xy.double(), 1)
+    return float(distance.median())
 
 
 def _sample(xy: Tensor, generator: torch.Generator) -> Tensor:

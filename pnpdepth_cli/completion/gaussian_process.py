@@ -144,9 +144,10 @@ class Residuals:
 
 
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
-    """Returns the residuals at the points that lie in the image and have a prediction.
+    """Returns log measured − log predicted depth at the points in the image with a prediction.
 
-    Of several points at the same coordinates the one of least depth counts.
+    Features and default kernel of a Gaussian process are with it. Of several points at the same
+    coordinates the one of least depth counts.
 
     Args:
         prediction: Depth (H, W) in metres; not positive or not finite is unknown.
@@ -210,7 +211,7 @@ def _sample(features: Tensor, points: SparsePoints) -> Tensor:
 def _colour(rgb: Tensor) -> Tensor:
     """CIELAB (3, H, W) of an image (3, H, W), of mean 0 and standard deviation about 1.
 
-    The standard deviation is the root of the three's variances over the image, summed.
+    The standard deviation is the root of the sum of the three variances over the image.
 
     Remembered for the last two images, by identity: a frame's, whose residuals are propagated
     several times, and a grey one.
@@ -314,7 +315,7 @@ def leave_one_out(
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
     variance = 1 / inverse.diagonal(dim1=1, dim2=2)
     error = (inverse @ residuals.residual[near][..., None])[..., 0] * variance
-    # The points at the edge of a neighbourhood have others outside of it.
+    # Of several neighbourhoods the middle counts, as points at the edge have others outside.
     inner = _INNER if near.shape[0] > 1 else None
     return error[:, :inner], (variance - extra_noise)[:, :inner]
 
@@ -327,15 +328,16 @@ def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:
     count = len(residuals.points)
     if count <= max_exact:
         return _all_points(residuals)
+    # Around points that are evenly spaced in the order of points.
     middles = torch.linspace(0, count - 1, _NEIGHBOURHOODS).long()
     _, near = nearest_points(residuals.points, residuals.points.xy[middles].double(), NEIGHBOURS)
     return near
 
 
 def _steps(points: SparsePoints) -> tuple[int, int]:
-    """How many rows and columns of pixels one node of the grid stands for; 1, 1: it is the pixels.
+    """(rows, columns) of pixels that one node of the grid stands for; (1, 1): each is a node.
 
-    The grid is the one on which the residual is predicted.
+    The grid is the one on which the residual is predicted, finer than the points.
     """
     height, width = points.size
     if height * width < _WORTH_A_GRID:
@@ -409,7 +411,7 @@ class _Systems(NamedTuple):
 
 
 def _systems(residuals: Residuals, near: Tensor) -> _Systems:
-    """The equations of B blocks; `near` (B, k) are the numbers of the points of each."""
+    """The equations (K + N) α = r of B blocks; `near` (B, k) are the numbers of their points."""
     features = residuals.point_features[near].double()
     u = features[..., LOG_DEPTH]
     scaled = residuals.scaled(features)

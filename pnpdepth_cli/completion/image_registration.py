@@ -159,9 +159,11 @@ class ImageRegistration:
             rgb: Image (H, W, 3); another number of channels, or none, will do.
         """
         height, width = rgb.shape[:2]
-        # The matrix leads from a pixel of the result to where its colour is.
-        x, y = (1 - self.zoom) * np.array([width - 1, height - 1]) / 2 + (self.right, self.down)
-        matrix = np.array([[self.zoom, 0, x], [0, self.zoom, y]])
+        # The matrix leads from a pixel x of the result to where its colour is: zoom·x, and what
+        # follows from the centre and the shift.
+        centre = np.array([width - 1, height - 1]) / 2
+        right, down = (1 - self.zoom) * centre + (self.right, self.down)
+        matrix = np.array([[self.zoom, 0, right], [0, self.zoom, down]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         moved = cv2.warpAffine(
             rgb, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
@@ -378,14 +380,16 @@ def _unchanged(xy: Floats) -> Floats:
 
 
 def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
-    """Where positions in an image (H, W) are if its depth is turned or mirrored, by words for it.
+    """The ways in which depth can be turned or mirrored against an image (H, W), by words for them.
 
-    x and y are exchanged only in a square image.
+    Each takes positions in the reduced image to where they belong then. x and y are exchanged only
+    in a square image.
     """
     height, width = size
     right = width * _reduction(size)  # edges of the reduced image
     bottom = height * _reduction(size)
     corner = np.array([right, bottom])
+    # |0 − y| leaves y as it is.
     orientations: dict[str, _Orient] = {
         "mirrored left to right": lambda xy: np.abs(np.array([right, 0.0]) - xy),
         "upside down, its rows from the bottom up": lambda xy: np.abs(np.array([0.0, bottom]) - xy),
@@ -524,34 +528,35 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
         right: Shift to the right in pixels of the reduced image.
         down: Shift downwards, likewise.
     """
-    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
-    standing = gains.sum() / (np.linalg.norm(gains) + _TINY)
+    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)  # of each part
+    standard_errors = gains.sum() / (np.linalg.norm(gains) + _TINY)
+    # Of more points, more is asked, and of fewer less.
     points = np.mean([frame.points for frame in frames])
     more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
-    return bool(standing >= _LEAST_STANDING + more)
+    return bool(standard_errors >= _LEAST_STANDING + more)
 
 
 def _bayes_factor(
     frames: Sequence[Evidence], maps: Sequence[Floats], shift: tuple[int, int]
 ) -> float:
-    """Log of the Bayes factor of images that belong to their points at one shift over chance.
+    """Log of the Bayes factor: that images belong to their points at one shift, over chance.
 
-    The log likelihood there exceeds its mean over all shifts by so many standard deviations. For an
-    unrelated image these are 0 ± 1. For one that belongs there they grow with the logarithm of the
-    number of points (even frames of 7-Scenes and ICL-NUIM).
+    What counts is by how many standard deviations the log likelihood at the shift exceeds its mean
+    over all shifts. For an unrelated image that is 0 ± 1. For one that belongs there it grows with
+    the logarithm of the number of points (even frames of 7-Scenes and ICL-NUIM).
 
     Args:
         frames: Evidence of the frames.
         maps: Log likelihood (rows, columns) of each frame by shift.
         shift: Row and column of the shift in the maps.
     """
-    standing = np.array(
+    deviations = np.array(
         [(by_shift[shift] - by_shift.mean()) / (by_shift.std() + _TINY) for by_shift in maps]
     )
     points = np.array([frame.points for frame in frames])
-    # The log of N(standing; expected, 1) over N(standing; 0, 1), summed over the frames.
+    # The log of N(deviations; expected, 1) over N(deviations; 0, 1), summed over the frames.
     expected = _EVIDENCE * np.log(np.maximum(points / _NO_EVIDENCE, 1.0))
-    return float(np.sum(expected * (standing - expected / 2)))
+    return float(np.sum(expected * (deviations - expected / 2)))
 
 
 def _edges(rgb: Image) -> Image:

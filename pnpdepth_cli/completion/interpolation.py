@@ -127,8 +127,8 @@ class Triangulation:
         if self._last is None or self._last[0] is not xy:
             positions, number = Positions.of(coordinates)
             # Of many points and few positions, only the triangles at the positions are made.
-            is_few = len(self._rim) > _FEW * len(coordinates)
-            triangles = self._triangles_at(coordinates) if is_few else self._triangles
+            are_few = len(self._rim) > _FEW * len(coordinates)
+            triangles = self._triangles_at(coordinates) if are_few else self._triangles
             self._last = (xy, self._locate(coordinates, triangles, positions, number))
         _, located = self._last
         return self._depth(coordinates, located, space)
@@ -255,12 +255,14 @@ class _Grid(NamedTuple):
 
         None also if no square of the grid has points at its four corners.
         """
+        # Every x of a point is a column of nodes, every y a row.
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)
         if len(columns) * len(rows) > _NODES * len(xy):
             return None
         number = np.full((len(rows), len(columns)), -1)
         number[row, column] = np.arange(len(xy))
+        # The squares with a point at each corner: upper left, upper right, lower left, lower right.
         known = number >= 0
         full = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
         if not full.any():

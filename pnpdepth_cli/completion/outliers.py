@@ -105,7 +105,8 @@ def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
 def without_outliers(residuals: Residuals) -> Residuals:
     """Returns the residuals at the points that are no outliers; all unless some clearly are.
 
-    Outliers are sought again without those that were found, until there are none.
+    Outliers are sought again without those that were found, until there are none, at most
+    `_PASSES` times.
     """
     for _ in range(_PASSES):
         inliers = inlier_mask(residuals)
@@ -161,7 +162,7 @@ def inlier_mask(residuals: Residuals) -> Tensor:
     inliers = weight > _MIN_WEIGHT
     inliers = inliers | _suspected_together(residuals.points, ~inliers)
     weight = torch.where(inliers, weight.clamp_min(_MIN_WEIGHT), weight)
-    if bool(inliers.all()) or not bool(inliers.any()):
+    if bool(inliers.all()) or not bool(inliers.any()):  # with all suspected, none stands out
         return torch.ones_like(inliers)
     # They are outliers if the others predict each other far better without them.
     errors_with, _ = leave_one_out(residuals, near)

@@ -50,7 +50,8 @@ def local_lines(
 ) -> tuple[Tensor, Tensor]:
     """Returns shift and slope of the line residual = shift + slope · regressor around each pixel.
 
-    Both are (H, W) float64, or (M,) at coordinates.
+    The line is fitted to the pixel's nearest points. Both are (H, W) float64, or (M,) at
+    coordinates.
 
     Args:
         points: The N points.

@@ -56,12 +56,12 @@ class ResidualField:
     @functools.cached_property
     def outliers(self) -> Tensor:
         """(N,) bool: which points are outliers; none unless some clearly are."""
-        keys = _coordinate_keys(self.at_points.points)
-        inliers = _coordinate_keys(self.at_inliers.points)
-        outlying = keys[~torch.isin(keys, inliers)]
+        used_keys = _coordinate_keys(self.at_points.points)
+        inlier_keys = _coordinate_keys(self.at_inliers.points)
+        outlier_keys = used_keys[~torch.isin(used_keys, inlier_keys)]
         # Of points at the same coordinates one has a residual, which speaks for all of them.
         all_keys = _coordinate_keys(self.points.tensors())
-        return torch.isin(all_keys, outlying).to(self.points.xy.device)
+        return torch.isin(all_keys, outlier_keys).to(self.points.xy.device)
 
     def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
         """Returns the residual (H, W) at every pixel, or (M,) at the coordinates of M points.

@@ -55,9 +55,9 @@ class Positions:
 
     @classmethod
     def of(cls, xy: Floats) -> tuple[Positions, Numbers]:
-        """Returns coordinates (M, 2) as positions without repetition, and which each of them is.
+        """Returns the distinct ones of coordinates (M, 2), and which of these each of them is.
 
-        The latter are (M,) numbers of positions.
+        The latter is the number (M,) of a position, in the order row after row.
         """
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)
@@ -68,7 +68,9 @@ class Positions:
         return len(self.columns) * len(self.rows) if self.nodes is None else len(self.nodes)
 
     def first_after(self, row: Numbers, column: Numbers) -> Numbers:
-        """Returns the number of the first position at or behind nodes of the grid, row after row.
+        """Returns the number (S,) of the first position at or behind each of S nodes of the grid.
+
+        Nodes are in the order row after row. Positions are some of them, or all.
 
         Args:
             row: Rows (S,) of the nodes.
@@ -214,7 +216,7 @@ def barycentric(corners: Floats, xy: Floats) -> Floats:
 
 def circles(corners: Floats) -> tuple[Floats, Floats]:
     """Returns the centre (T, 2) and the radius (T,) of the circles through triangles (T, 3, 2)."""
-    # In coordinates in which the first corner is 0.
+    # In coordinates in which the first corner is 0; the centre is as far from it as from b and c.
     a = corners[:, 0]
     b = corners[:, 1] - a
     c = corners[:, 2] - a

@@ -19,7 +19,7 @@ from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from pnpdepth_cli.core.split.cut_point import CutPoint
-from pnpdepth_cli.core.split.tensors import tensors_in
+from pnpdepth_cli.core.split.tensors import storage_of, tensors_in
 from pnpdepth_cli.core.spread import Spread, spread_of
 from pnpdepth_cli.errors import ModelError, wrap_user_errors
 
@@ -90,11 +90,12 @@ def influential_fields(
 
 
 def _field(spreads: list[Spread], z_shape: torch.Size, prediction: Tensor) -> Field:
-    """The field of a layer: the largest patches of points at `_POSITIONS`.
+    """What one point influences through a layer: the largest patches of points at `_POSITIONS`.
 
     Args:
-        spreads: Where the prediction depends on z, as `_Follower.spreads_from` gives it.
-        z_shape: Shape of z, the layer's output.
+        spreads: Where the prediction depends on the layer's output z, as `_Follower.spreads_from`
+            gives it.
+        z_shape: Shape of z.
         prediction: The prediction, whose last two axes are rows and columns.
     """
     patches = [_patches(spreads, prediction.shape, position) for position in _POSITIONS]
@@ -243,7 +244,7 @@ class _Follower(TorchDispatchMode):
         for _, tensor in tensors_in(kwargs):
             inputs.append(_Input(None, tensor, dict(self._spreads_of(tensor))))
         result = func(*args, **kwargs)
-        input_storages = {_storage(input_.tensor) for input_ in inputs}
+        input_storages = {storage_of(input_.tensor) for input_ in inputs}
         for number, (_, output) in enumerate(tensors_in(result)):
             # Where the output depends on each source, through any of the inputs.
             output_spreads: dict[_Source, Spread] = {}
@@ -252,16 +253,16 @@ class _Follower(TorchDispatchMode):
                     moved = spread_of(func, args, place, tensor, spread, output, number)
                     if moved is not None:
                         output_spreads[source] = moved.joined(output_spreads.get(source))
-            if _storage(output) not in input_storages:
-                self._spreads[_storage(output)] = {}  # new memory; what was there before is gone
+            if storage_of(output) not in input_storages:
+                self._spreads[storage_of(output)] = {}  # new memory; what was there before is gone
             elif func._schema.is_mutable:
                 self._widen_views(output, output_spreads)
-            self._spreads.setdefault(_storage(output), {})[_geometry(output)] = output_spreads
+            self._spreads.setdefault(storage_of(output), {})[_geometry(output)] = output_spreads
         return result
 
     def _spreads_of(self, tensor: Tensor) -> dict[_Source, Spread]:
         """The spreads of a tensor by source, to read and to change; empty where it has none."""
-        places = self._spreads.setdefault(_storage(tensor), {})
+        places = self._spreads.setdefault(storage_of(tensor), {})
         return places.setdefault(_geometry(tensor), {})
 
     def _widen_views(self, written: Tensor, spreads: dict[_Source, Spread]) -> None:
@@ -273,21 +274,9 @@ class _Follower(TorchDispatchMode):
             written: The tensor that was changed.
             spreads: Where it depends on each source since.
         """
-        for (_, shape, _), view_spreads in self._spreads.get(_storage(written), {}).items():
+        for (_, shape, _), view_spreads in self._spreads.get(storage_of(written), {}).items():
             for source, spread in spreads.items():
                 view_spreads[source] = Spread.whole(shape or (1,), len(spread.first))
-
-
-def _storage(tensor: Tensor) -> int:
-    """A number that tensors in the same memory share; 0 for a sparse tensor, which has no storage.
-
-    It is the address of the storage, which torch raises NotImplementedError for where there is
-    none.
-    """
-    try:
-        return int(tensor.untyped_storage()._cdata)
-    except NotImplementedError:
-        return 0
 
 
 def _geometry(tensor: Tensor) -> _Geometry:

@@ -109,7 +109,11 @@ def refine(
         with torch.enable_grad():
             gradient = gradient_at(z, loss * scale)
         if gradient is None:
-            raise _no_gradient(split)
+            raise ModelError(
+                f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
+                " the prediction does not depend on it or the network's forward runs under"
+                " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
+            )
         gradient = gradient / scale
         if not bool(gradient.isfinite().all()):
             raise _diverged("gradient", updates, step, so_far)
@@ -128,15 +132,6 @@ def _with_pass(so_far: Refinement | None, depth: Tensor, loss: float, step: floa
     if so_far is None:
         return Refinement(before=depth, after=depth, losses=(loss,), step=step)
     return replace(so_far, after=depth, losses=(*so_far.losses, loss))
-
-
-def _no_gradient(split: Split) -> ModelError:
-    """The error of a loss that does not depend on z, as far as torch can follow."""
-    return ModelError(
-        f"layer {split.layer!r}: no gradient comes back from the prediction to it; either"
-        " the prediction does not depend on it or the network's forward runs under"
-        " torch.no_grad, inference_mode or detach (take that out, or cut at a later layer)"
-    )
 
 
 def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | None) -> DivergedError:

@@ -65,6 +65,7 @@ class Split:
         self._replay: Replay | None = None
 
     def __enter__(self) -> Self:
+        # If a step of opening fails, those before it are undone.
         with ExitStack() as opening:
             self._state = NetworkState(self._network)
             opening.callback(self._state.close)
@@ -116,6 +117,7 @@ class Split:
         Raises:
             ModelError: The network fails, the layer runs several times without a choice, or its
                 output cannot be replaced.
+            RuntimeError: `front` was not called before.
         """
         replay = self._replay
         if replay is None or replay.z0 is None:
@@ -129,7 +131,10 @@ class Split:
         return output
 
     def _record_front(self, arguments: tuple[object, ...]) -> Tensor:
-        """Runs the network up to the cut until its calls are known; returns z_0."""
+        """Returns z_0, after the network has run up to the cut as often as its calls need.
+
+        `self._replay` then has the recorded calls, up to the cut.
+        """
         while True:
             self._replay = replay = Replay(self._cut, arguments)
             uncacheable_before = len(self._uncacheable)
@@ -147,7 +152,11 @@ class Split:
                 return z0
 
     def _run_front(self, replay: Replay, recorder: Recorder | None = None) -> Tensor:
-        """Runs the network up to the cut; returns z_0.
+        """Returns z_0, after the network has run up to the cut.
+
+        Args:
+            replay: The calls that are recorded, with the arguments of the frame.
+            recorder: Recorder of a learning pass; None if all calls are recorded.
 
         Raises:
             ModelError: The network does not come to the cut.
@@ -158,7 +167,7 @@ class Split:
             # The replay itself ends the pass at the cut, by `Replay.end_of_front`.
             if not replay.has_front:
                 raise
-        if replay.z0 is None or replay.z is not None:  # has no front, as mypy understands it
+        if replay.z0 is None or not replay.has_front:  # the former for mypy alone
             ran = {module for module, _ in replay.outputs} if recorder is None else recorder.ran
             raise self._cut.not_reached_error(ran, replay.calls[self._cut.module])
         return replay.z0
@@ -167,6 +176,7 @@ class Split:
         """A recorder for the next pass, whose watch protects every saved tensor from changes."""
         saved = [output for output in replay.outputs.values() if output is not None]
         tensors = (replay.arguments, *saved, *self._state.tensors)
+        # With a promise, it does not matter which values the network can branch on.
         watch = Watch(tensors, escapes=not self._promised_static)
         return Recorder(self._cut, watch, replay, self._uncacheable)
 
@@ -177,7 +187,11 @@ class Split:
         return self._replay.handle(module, inputs, run)
 
     def _run(self, replay: Replay, recorder: Recorder | None = None) -> object:
-        """One pass of the network, learning if there is a recorder."""
+        """What the network returns in one pass of its forward; with a recorder the pass is learnt.
+
+        Raises:
+            ModelError: The network's forward fails.
+        """
         self._state.restore()
         replay.calls.clear()
         replay.in_pass = True

@@ -60,7 +60,7 @@ class CutPoint:
                 hint = "its named_modules() are its layers; `pnpdepth layers --all` lists them"
             raise ModelError(f"layer {name!r} is not in this network; {hint}")
         module = modules[name]
-        # What is around it, and around submodules with hooks.
+        # The submodules with hooks.
         hooked = [
             module_name
             for module_name, hooked_module in modules.items()
@@ -130,7 +130,7 @@ class CutPoint:
 
 
 def _around(inner_names: list[str], modules: Mapping[str, nn.Module]) -> frozenset[nn.Module]:
-    """The submodules that contain one with one of these names, not itself included.
+    """The submodules that contain a submodule with one of these names; none contains itself.
 
     Args:
         inner_names: Names such as `decoder.up1`.

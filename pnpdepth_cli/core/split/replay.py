@@ -47,9 +47,10 @@ def intercepted(modules: Iterable[nn.Module], handler: Handler) -> Iterator[None
         yield
     finally:
         for module, own_forward in own_forwards.items():
-            module.__dict__["forward"] = own_forward
             if own_forward is None:
-                del module.__dict__["forward"]
+                module.__dict__.pop("forward", None)
+            else:
+                module.__dict__["forward"] = own_forward
 
 
 def _stand_in(
@@ -71,6 +72,7 @@ def shapes_of(arguments: object) -> object:
     branches on values treats such arguments alike.
     """
     tensors = [(tensor.shape, tensor.dtype, tensor.device) for _, tensor in tensors_in(arguments)]
+    # The rest as text, in which empty tensors stand for all.
     return tensors, repr(map_tensors(arguments, lambda _, tensor: tensor.new_empty(0)))
 
 
@@ -89,8 +91,9 @@ class Replay:
         self.arguments = SavedTensors(_copies(arguments))
         self._shapes = shapes_of(self.arguments.value)
         self.outputs: dict[Call, SavedTensors | None] = {}
-        """Outputs of recorded calls in their order: None where not cached, of value None before it
-        ran. Calls that are not cached are recorded if they contain the cut or recorded calls."""
+        """Outputs of recorded calls, in the order in which calls begin. None: the call is not
+        cached, so that it runs in every pass; it contains the cut or recorded calls, or works in
+        place. An output of value None: the call has not run for the frame at hand."""
         self.cut_call: Call | None = None  # that is the cut; None before it was reached
         self.path: tuple[str, ...] = ()  # path of z in the output of that call
         self.static_graph = True  # whether arguments of the same shapes all make the same calls
@@ -141,13 +144,13 @@ class Replay:
         """
         if not self.in_pass:
             return self._handle_outside(module, run)
-        if self._fills:
+        if self._fills:  # the output of the call around it will be saved
             return run()
         if self.has_front:  # the network has caught the end of the front
             raise self.end_of_front()
         # A learning pass watches the call; a call that is not recorded yet is recorded.
         if self.recorder is not None:
-            run = functools.partial(self.recorder.run, module, run)
+            run = functools.partial(self.recorder.run_watched, module, run)
         call = module, self.calls[module]
         self.calls[module] += 1
         if call not in self.outputs:
@@ -204,6 +207,7 @@ class Replay:
         # Without a saved output the layer runs for what else it does, as changing its input.
         output = run() if saved is None else saved.fresh()
         if self.recorder is not None:
+            # The tensor that z stands for is in the network's hands only where the layer ran.
             original = dict(tensors_in(output))[self.path] if saved is None else None
             self.recorder.watch.note_injection(z, original)
         return map_tensors(output, lambda path, tensor: z if path == self.path else tensor)
@@ -238,8 +242,11 @@ class Recorder:
         self._calls_before = len(self._saved)  # this pass; in the rear's, those up to the cut
         self._is_inside_cached = False  # in a submodule that is to be cached as a whole
 
-    def run(self, module: nn.Module, run: Run) -> object:
-        """Returns the output of a submodule that `run` runs, watched for values that escape."""
+    def run_watched(self, module: nn.Module, run: Run) -> object:
+        """Returns what `run` returns, the output of a call of the module.
+
+        Values of tensors that reach Python meanwhile are noted.
+        """
         with self.watch.seeing_escapes_of(module):
             return run()
 
@@ -288,7 +295,7 @@ class Recorder:
             self._saved[call] = saved
             self.watch.protect(saved)
         elif may_be_cached and next(module.children(), None) is not None:
-            self._uncacheable.add(module)
+            self._uncacheable.add(module)  # the next pass records what is in it
         # The front ends at the cut.
         if self._is_cut(module):
             self._replay.path, self._replay.z0 = self._cut.choose(output)
@@ -312,8 +319,9 @@ class Recorder:
                 f"layer {layer!r}: its output lies in the memory of an earlier tensor, and the"
                 " network changes one in place and reads the other; cut one layer later"
             )
-        # Another z may take another path behind the cut, unless the definition says otherwise. So
-        # no call there is recorded, and saved outputs stay whole, as it may read or change them.
+        # Another z may take another path behind the cut, as values reached Python there and it was
+        # not promised that they do not matter. So no call there is recorded, and saved outputs are
+        # cloned, as that path may change them.
         if self.watch.data_dependent:
             self._drop_from(self._calls_before)
             for saved in self._saved.values():
@@ -357,7 +365,9 @@ class Recorder:
 
 
 def _ids(tensors: list[tuple[tuple[str, ...], Tensor]]) -> list[tuple[tuple[str, ...], int]]:
-    """The paths and the identities of tensors, which change with the lists and dicts they are in.
+    """The paths of tensors and their identities, which are equal if the same tensors are there.
+
+    So they tell whether a call has changed the lists or dicts among its inputs.
 
     Args:
         tensors: Paths and tensors as `tensors_in` yields them; while they are held, no other tensor

@@ -10,6 +10,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+NO_STORAGE = 0
+"""The number that stands for the memory of sparse tensors, which have no storage."""
+
+
+def storage_of(tensor: Tensor) -> int:
+    """Returns a number that tensors in the same memory share; `NO_STORAGE` for a sparse tensor.
+
+    It is the address of torch's storage object; a sparse tensor raises NotImplementedError.
+    """
+    try:
+        return int(tensor.untyped_storage()._cdata)
+    except NotImplementedError:
+        return NO_STORAGE
+
 
 def tensors_in(
     structure: object, path: tuple[str, ...] = ()
@@ -102,19 +116,19 @@ class SavedTensors:
     def of(cls, output: object, *, copied: bool = False) -> SavedTensors:
         """Returns the tensors of an output in new containers, clones if they are `copied`."""
 
-        def saved(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+        def clone_if_copied(path: tuple[str, ...], tensor: Tensor) -> Tensor:
             return tensor.clone() if copied else tensor
 
-        return cls(map_tensors(output, saved), copied)
+        return cls(map_tensors(output, clone_if_copied), copied)
 
     def fresh(self) -> object:
-        """Returns the tensors in new containers; whatever is done to them leaves `value` as is."""
+        """Returns the tensors in new containers, for the network to use; `value` stays as it is."""
 
-        def given(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+        def clone_if_needed(path: tuple[str, ...], tensor: Tensor) -> Tensor:
             # One of inference mode cannot be saved for a backward pass.
             return tensor.clone() if self.copied or tensor.is_inference() else tensor
 
-        return map_tensors(self.value, given)
+        return map_tensors(self.value, clone_if_needed)
 
 
 class NetworkState:

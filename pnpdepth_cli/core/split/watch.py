@@ -19,7 +19,14 @@ from torch._ops import OpOverload
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pnpdepth_cli.core.split.tensors import SavedTensors, is_transparent, map_tensors, tensors_in
+from pnpdepth_cli.core.split.tensors import (
+    NO_STORAGE,
+    SavedTensors,
+    is_transparent,
+    map_tensors,
+    storage_of,
+    tensors_in,
+)
 
 _ESCAPES = (Tensor.numpy, Tensor.tolist, Tensor.__array__, Tensor.__dlpack__)
 """Methods that give values to Python and are no tensor operations."""
@@ -73,13 +80,14 @@ class Watch(TorchDispatchMode):
         self.data_dependent = False
         self.escaped = False
         self.torn = False
-        # Keys and elements are storages, as `_storage` numbers them.
         self._operations = 0  # tensor operations so far, so that each has a number from 1
         self._touches = 0  # operations and calls so far that may have read z
         self._writes: list[int] = []
-        """For each change in place, the operation that created the storage; 0: none in this pass"""
-        self._created: dict[int, int] = {}  # operation that created a storage
-        self._marked: set[int] = set()  # storages that depend on z
+        """For each change in place, the number of the operation that created what is changed; 0:
+        it is older than the pass."""
+        # By storage, as `storage_of` numbers it:
+        self._created: dict[int, int] = {}  # number of the operation that created it
+        self._marked: set[int] = set()  # those that depend on z
         self._protected: dict[int, list[SavedTensors]] = {}  # what is cloned before it is changed
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
@@ -96,15 +104,15 @@ class Watch(TorchDispatchMode):
             z: What the cut layer gives.
             original: Tensor of the network that z stands for; None if the layer did not run.
         """
-        self._touches += 1
-        self._marked.add(_storage(z))
+        self._touches += 1  # from here on the network reads z
+        self._marked.add(storage_of(z))
         if original is not None:
             self._twins = (original, z)
 
     def protect(self, saved: SavedTensors) -> None:
         """Protects these tensors: they are cloned before an operation changes them in place."""
         for _, tensor in tensors_in(saved.value):
-            self._protected.setdefault(_storage(tensor), []).append(saved)
+            self._protected.setdefault(storage_of(tensor), []).append(saved)
 
     def now(self) -> Moment:
         """Returns this moment, for `can_stand_for`."""
@@ -128,7 +136,7 @@ class Watch(TorchDispatchMode):
         if self._marked and (has_marked_input or not is_transparent(inputs)):
             self._touches += 1
         # The tensors of its output that it created.
-        storages = [_storage(tensor) for _, tensor in tensors_in(output)]
+        storages = [storage_of(tensor) for _, tensor in tensors_in(output)]
         created_inside = {
             storage for storage in storages if self._created.get(storage, 0) > since.operations
         }
@@ -186,7 +194,7 @@ class Watch(TorchDispatchMode):
         effects = _effects_of(func)
         self._operations += 1
         inputs = [tensor for _, tensor in tensors_in((*args, *kwargs.values()))]
-        if self._stale and any(_storage(tensor) in self._stale for tensor in inputs):
+        if self._stale and any(storage_of(tensor) in self._stale for tensor in inputs):
             self.torn = True
         # Saved tensors are cloned before the operation changes them.
         written: list[Tensor] = []
@@ -198,15 +206,15 @@ class Watch(TorchDispatchMode):
         reads_z = bool(self._marked) and any(map(self._is_marked, inputs))
         result = func(*args, **kwargs)
         # New memory among its results belongs to this operation.
-        results = {_storage(tensor) for _, tensor in tensors_in(result)}
-        created = results - {_storage(tensor) for tensor in inputs} - {_NO_STORAGE}
+        results = {storage_of(tensor) for _, tensor in tensors_in(result)}
+        created = results - {storage_of(tensor) for tensor in inputs} - {NO_STORAGE}
         self._created.update(dict.fromkeys(created, self._operations))
         # An address seen before may have been freed and reused.
         self._marked -= created
         # What an operation makes of z, or writes, depends on z.
         if reads_z:
             self._touches += 1
-            self._marked |= results | {_storage(tensor) for tensor in written}
+            self._marked |= results | {storage_of(tensor) for tensor in written}
         # Values that the operation gives to Python.
         if effects.values_escape and self._notes_escapes:
             self.escaped = True
@@ -216,9 +224,10 @@ class Watch(TorchDispatchMode):
 
     def _before_write(self, tensor: Tensor) -> None:
         """Notes that a tensor is about to change in place, and clones what is saved of it."""
-        storage = _storage(tensor)
+        storage = storage_of(tensor)
         self._writes.append(self._created.get(storage, 0))
-        twins = {_storage(twin) for twin in self._twins}
+        # The network changes z or the tensor it stands for: the other one is not what it would be.
+        twins = {storage_of(twin) for twin in self._twins}
         if storage in twins:
             self._stale |= twins - {storage}
         for saved in self._protected.pop(storage, []):
@@ -228,7 +237,7 @@ class Watch(TorchDispatchMode):
     def _is_marked(self, tensor: Tensor) -> bool:
         """Whether a tensor depends on z."""
         # Only z requires gradient, so a tensor that does was computed from it.
-        return tensor.requires_grad or _storage(tensor) in self._marked
+        return tensor.requires_grad or storage_of(tensor) in self._marked
 
 
 class _EscapeMode(TorchFunctionMode):
@@ -252,22 +261,6 @@ class _EscapeMode(TorchFunctionMode):
         if func in _ESCAPES and isinstance(args[0], Tensor):
             self._watch.note_escape(args[0])
         return func(*args, **(kwargs or {}))
-
-
-_NO_STORAGE = 0
-"""The number that stands for the memory of sparse tensors, which have no storage."""
-
-
-def _storage(tensor: Tensor) -> int:
-    """A number that tensors in the same memory share; `_NO_STORAGE` for sparse tensors.
-
-    It is the address of the storage, which torch raises NotImplementedError for where there is
-    none.
-    """
-    try:
-        return int(tensor.untyped_storage()._cdata)
-    except NotImplementedError:
-        return _NO_STORAGE
 
 
 class _Effects(NamedTuple):

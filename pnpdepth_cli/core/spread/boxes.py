@@ -29,7 +29,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of_axis(cls, shape: Sequence[int], axis: int) -> Spread:
-        """Returns the box of each row of a feature map in that map itself.
+        """Returns, for each row of a feature map, the box of its elements in that map.
 
         Args:
             shape: Shape of the feature map.
@@ -43,15 +43,16 @@ class Spread(NamedTuple):
 
     @classmethod
     def whole(cls, shape: Sequence[int], count: int) -> Spread:
-        """Returns `count` boxes that are all of a tensor of this shape."""
+        """Returns `count` boxes, each of which is all of a tensor of this shape."""
         last = torch.tensor([max(size, 1) - 1 for size in shape], dtype=torch.long)
         return cls(torch.zeros(count, len(shape), dtype=torch.long), last.repeat(count, 1))
 
     @classmethod
     def from_axes(cls, axes: Sequence[AxisRange]) -> Spread:
-        """Returns boxes from their ranges along each axis; one empty range empties the box.
+        """Returns n boxes from their ranges along each axis; one empty range empties the box.
 
-        At least one axis is given.
+        Args:
+            axes: Range of the n boxes along each axis, one axis or more.
         """
         first = torch.stack([axis_first for axis_first, _ in axes], dim=1)
         last = torch.stack([axis_last for _, axis_last in axes], dim=1)
@@ -59,7 +60,7 @@ class Spread(NamedTuple):
         return cls(first.masked_fill(empty, NOWHERE), last.masked_fill(empty, -1))
 
     def axes(self) -> list[AxisRange]:
-        """The ranges along each axis."""
+        """Returns the ranges of the n boxes along each axis; the inverse of `from_axes`."""
         return list(zip(self.first.unbind(1), self.last.unbind(1), strict=True))
 
     def empty(self) -> Tensor:
@@ -121,9 +122,9 @@ def full_range(call: Call, axis: int) -> AxisRange:
 
 
 def everywhere(call: Call) -> Spread:
-    """Returns boxes that are all of the result, but for those that were empty.
+    """Returns the result's boxes where each of its elements may depend on each of the input's.
 
-    So they are where every element of the result may depend on every element of the input.
+    Each box is all of the result, but for those that were empty.
     """
     return Spread.from_axes([full_range(call, axis) for axis in range(len(call.shape))])
 
@@ -132,9 +133,9 @@ def everywhere(call: Call) -> Spread:
 @rule("where", "masked_fill", "addcmul", "lerp", "prelu", "_prelu_kernel", "native_dropout")
 @rule("native_batch_norm", "_native_batch_norm_legit", "_native_batch_norm_legit_no_training")
 def pointwise(call: Call) -> Spread:
-    """Returns the input's boxes, full along axes that are broadcast.
+    """Returns the result's boxes where each of its elements depends on the input's at its place.
 
-    So they are where each element of the result depends on the input's element at its place.
+    They are the input's boxes, full along axes that are broadcast.
     """
     if "batch_norm" in call.name:
         # Argument 5 is `training`: with it, elements are normalised by all others.
@@ -143,10 +144,10 @@ def pointwise(call: Call) -> Spread:
             return everywhere(call)
     # Axes of the result that the input has not are in front of those that it has.
     new_axes = len(call.shape) - call.source.ndim
-    if new_axes < 0:
+    if new_axes < 0:  # no broadcasting
         return everywhere(call)
     axes = [full_range(call, axis) for axis in range(new_axes)]
     for axis, axis_range in enumerate(call.spread.axes(), start=new_axes):
-        is_repeated = call.source.shape[axis - new_axes] == 1 < call.shape[axis]
-        axes.append(full_range(call, axis) if is_repeated else axis_range)
+        is_broadcast = call.source.shape[axis - new_axes] == 1 and call.shape[axis] > 1
+        axes.append(full_range(call, axis) if is_broadcast else axis_range)
     return Spread.from_axes(axes)

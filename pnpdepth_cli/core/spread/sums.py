@@ -15,7 +15,7 @@ from pnpdepth_cli.core.spread.boxes import (
 
 @rule("mm", "bmm", "addmm", "baddbmm", "linear")
 def product(call: Call) -> Spread:
-    """Returns boxes of a product of matrices: full along the axis that is summed over.
+    """Returns the boxes of a product of matrices, full along the axis that is summed over.
 
     Rows of the left factor are rows of the product, and columns of the right one its columns.
     """
@@ -35,7 +35,11 @@ def product(call: Call) -> Spread:
 
 @rule("mean", "sum", "amax", "amin", "logsumexp", "prod", "var", "std")
 def reduction(call: Call) -> Spread:
-    """Returns boxes whose reduced axes are gone, or full where the operation keeps them."""
+    """Returns the boxes of a sum, mean or the like along some axes.
+
+    They are the input's boxes. Axes that are reduced are gone, or full where the operation keeps
+    them.
+    """
     stated_axes = call.args[1] if len(call.args) > 1 else None
     if isinstance(stated_axes, int):
         stated_axes = [stated_axes]
@@ -56,7 +60,7 @@ def reduction(call: Call) -> Spread:
 
 @rule("_softmax", "_log_softmax", "_safe_softmax", "cumsum")
 def along_axis(call: Call) -> Spread:
-    """Returns boxes that are full along the axis of a softmax or a cumulative sum, argument 1."""
+    """Returns the boxes of a softmax or a cumulative sum: the input's, full along its axis."""
     axes = call.spread.axes()
     axis = call.args[1] % call.source.ndim
     axes[axis] = full_range(call, axis)
@@ -65,11 +69,13 @@ def along_axis(call: Call) -> Spread:
 
 @rule("native_layer_norm")
 def layer_norm(call: Call) -> Spread:
-    """Returns boxes that are full along the last axes, which are normalised together."""
+    """Returns the boxes of a layer norm: the input's, full along the axes normalised together.
+
+    These are the last ones, as many as argument 1 has sizes.
+    """
     if call.place != 0:  # weight or bias
         return everywhere(call)
     axes = call.spread.axes()
-    normalised = len(call.args[1])  # how many axes
-    for axis in range(len(axes) - normalised, len(axes)):
+    for axis in range(len(axes) - len(call.args[1]), len(axes)):
         axes[axis] = full_range(call, axis)
     return Spread.from_axes(axes)

@@ -40,7 +40,7 @@ def part_of(call: Call, number: int) -> Spread:
 
 @rule("cat")
 def concatenate(call: Call) -> Spread:
-    """Returns boxes shifted to where the input lies in the result of `torch.cat`.
+    """Returns the boxes of `torch.cat`: the input's, shifted to where it lies in the result.
 
     They reach over all its places if it is given several times.
     """
@@ -61,13 +61,14 @@ def concatenate(call: Call) -> Spread:
 
 @rule("stack")
 def stack(call: Call) -> Spread:
-    """Returns boxes with a new axis, from the first to the last place of the input along it.
+    """Returns the boxes of `torch.stack`: the input's, with a new axis.
 
-    `torch.stack` may be given one tensor several times; the box then reaches over all its places.
+    Along it they reach from the first to the last place of the input, which may be given several
+    times.
     """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
     places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
-    if not places:
+    if not places:  # it came another way, such as through a keyword
         return everywhere(call)
     # A box that is empty stays so: its last place is before its first.
     empty = call.spread.empty()
@@ -102,7 +103,7 @@ def _crop(call: Call, axis: int, start: int, step: int, count: int) -> list[Axis
 
 @rule("slice")
 def slice_(call: Call) -> Spread:
-    """Returns boxes of `tensor[start:end:step]` along an axis."""
+    """Returns the boxes of `tensor[start:end:step]` along an axis: what it keeps of the input's."""
     # aten's arguments behind the input, of which the last ones may be left to their defaults. The
     # end is not needed: the result has its size.
     defaults = (0, None, None, 1)
@@ -120,7 +121,7 @@ def slice_(call: Call) -> Spread:
 
 @rule("select")
 def select(call: Call) -> Spread:
-    """Returns boxes of `tensor[index]` along an axis, which the result has no more."""
+    """Returns the boxes of `tensor[index]` along an axis, which the result has no more."""
     axis = call.args[1] % call.source.ndim
     index = call.args[2] % call.source.shape[axis]
     axes = _crop(call, axis, index, step=1, count=1)
@@ -135,29 +136,29 @@ def select(call: Call) -> Spread:
 
 @rule("permute")
 def permute(call: Call) -> Spread:
-    """Returns boxes with their axes in the stated order."""
+    """Returns the boxes of `tensor.permute(order)`: the input's, with axes in that order."""
     axes = call.spread.axes()
     return Spread.from_axes([axes[axis % call.source.ndim] for axis in call.args[1]])
 
 
 @rule("transpose")
 def transpose(call: Call) -> Spread:
-    """Returns boxes with two axes exchanged."""
+    """Returns the boxes of `tensor.transpose(first, second)`: with these two axes exchanged."""
     axes = call.spread.axes()
-    here, there = (axis % call.source.ndim for axis in call.args[1:3])
-    axes[here], axes[there] = axes[there], axes[here]
+    first, second = (axis % call.source.ndim for axis in call.args[1:3])
+    axes[first], axes[second] = axes[second], axes[first]
     return Spread.from_axes(axes)
 
 
 @rule("t", "numpy_T")
 def reverse_axes(call: Call) -> Spread:
-    """Returns boxes with their axes in reverse order."""
+    """Returns the boxes of `tensor.T`: the input's, with axes in reverse order."""
     return Spread.from_axes(call.spread.axes()[::-1])
 
 
 @rule("flip")
 def flip(call: Call) -> Spread:
-    """Returns boxes mirrored along the stated axes."""
+    """Returns the boxes of `tensor.flip(axes)`: the input's, mirrored along these axes."""
     axes = call.spread.axes()
     empty = call.spread.empty()
     for stated_axis in call.args[1]:
@@ -173,7 +174,7 @@ def flip(call: Call) -> Spread:
 
 @rule("repeat")
 def repeat(call: Call) -> Spread:
-    """Returns boxes that are full along the axes that are repeated or new."""
+    """Returns the boxes of `tensor.repeat(repeats)`: full along axes that are repeated or new."""
     repeats = call.args[1]
     source_axes = call.spread.axes()
     new_axes = len(repeats) - len(source_axes)
@@ -185,7 +186,7 @@ def repeat(call: Call) -> Spread:
 
 @rule("view", "_unsafe_view", "reshape", "_reshape_alias", "squeeze", "unsqueeze", "flatten")
 def reshape(call: Call) -> Spread:
-    """Returns boxes of the same elements in other axes, as (2, 3, 4) becomes (6, 4) or (2, 12).
+    """Returns the boxes of the same elements in other axes, as (2, 3, 4) becomes (6, 4) or (2, 12).
 
     Both shapes fall into groups of neighbouring axes with equally many elements, such as (2, 3) and
     (6). Each group is moved by itself.
@@ -214,7 +215,12 @@ class _Group(NamedTuple):
 
 
 def _first_group(old_sizes: list[int], new_sizes: list[int]) -> _Group:
-    """The shortest group that both shapes begin with; both have as many elements in all."""
+    """The fewest first axes of two shapes that have equally many elements in both.
+
+    Args:
+        old_sizes: Sizes of the axes of one shape.
+        new_sizes: Sizes of the axes of the other, which has as many elements in all.
+    """
     old = old_sizes[:1]
     new = new_sizes[:1]
     while math.prod(old) != math.prod(new):

@@ -85,10 +85,10 @@ def _response_of_convolution(
 
 @rule("convolution", "_convolution", "cudnn_convolution", "mkldnn_convolution")
 def convolution(call: Call) -> Spread:
-    """Returns boxes widened by the kernel, in all channels.
+    """Returns the boxes of a convolution: the input's, widened by the kernel, in all channels.
 
-    All of the result, if the input at hand is weight or bias, or the operation one of those of a
-    device, whose arguments are others.
+    They are all of the result if the input is weight or bias, or the operation one of a device's
+    own, whose arguments are others.
     """
     if call.place != 0 or call.name not in ("convolution", "_convolution"):
         return everywhere(call)
@@ -111,7 +111,7 @@ def convolution(call: Call) -> Spread:
 
 @rule("max_pool2d_with_indices", "avg_pool2d", "max_pool2d")
 def pool(call: Call) -> Spread:
-    """Returns boxes widened by the windows of a pooling along rows and columns."""
+    """Returns the boxes of a pooling: the input's, widened by its windows of rows and columns."""
     options = _options(call)
     kernels = options["kernel_size"]
     strides = options.get("stride") or kernels
@@ -137,8 +137,9 @@ def pool(call: Call) -> Spread:
 
 @rule("_adaptive_avg_pool2d", "adaptive_max_pool2d", "mkldnn_adaptive_avg_pool2d")
 def adaptive_pool(call: Call) -> Spread:
-    """Returns boxes widened by the windows of a pooling that follow from the result's size."""
+    """Returns the boxes of a pooling to a stated size: the input's, widened by its windows."""
     responses: dict[int, Response] = {}
+    # Windows are the same for a mean and a maximum.
     for axis in (len(call.shape) - 2, len(call.shape) - 1):
         output = F.adaptive_avg_pool1d(_unit_rows(call, axis), call.shape[axis])
         responses[axis] = _response(output[:, 0])
@@ -148,12 +149,12 @@ def adaptive_pool(call: Call) -> Spread:
 @rule("upsample_bilinear2d", "upsample_nearest2d", "upsample_bicubic2d")
 @rule("_upsample_bilinear2d_aa", "_upsample_nearest_exact2d", "_upsample_bicubic2d_aa")
 def resize(call: Call) -> Spread:
-    """Returns boxes widened by the interpolation of rows and columns.
+    """Returns the boxes of a resized map: the input's, widened by the interpolation.
 
-    Which outputs it reaches is found by the operation itself, with the options of the call.
+    How far it reaches is asked of the operation itself, with the options of the call.
     """
     options = _options(call)
-    corners = [options["align_corners"]] if "align_corners" in options else []
+    corners = [options["align_corners"]] if "align_corners" in options else []  # nearest has none
     responses: dict[int, Response] = {}
     for axis, scale_name in ((2, "scales_h"), (3, "scales_w")):
         old_size = call.source.shape[axis]
@@ -182,7 +183,7 @@ _PADDING_MODES = {
 
 @rule(*_PADDING_MODES)
 def pad(call: Call) -> Spread:
-    """Returns boxes moved by the padding, and widened where it repeats elements."""
+    """Returns the boxes of a padded map: the input's, shifted, and widened where it is repeated."""
     padding = list(call.args[1])
     responses: dict[int, Response] = {}
     # Pairs of how many elements are added before and behind, those of the last axis first.
@@ -195,7 +196,7 @@ def pad(call: Call) -> Spread:
 
 @rule("pixel_shuffle")
 def pixel_shuffle(call: Call) -> Spread:
-    """Returns boxes where `factor²` channels of a cell become factor × factor pixels."""
+    """Returns the boxes where `factor²` channels of a cell become factor × factor pixels."""
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -206,7 +207,7 @@ def pixel_shuffle(call: Call) -> Spread:
 
 @rule("pixel_unshuffle")
 def pixel_unshuffle(call: Call) -> Spread:
-    """Returns boxes where factor × factor pixels become `factor²` channels of a cell."""
+    """Returns the boxes where factor × factor pixels become `factor²` channels of a cell."""
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -217,9 +218,9 @@ def pixel_unshuffle(call: Call) -> Spread:
 
 @rule("gather")
 def gather(call: Call) -> Spread:
-    """Returns boxes moved to where the indices of `torch.gather` take their elements.
+    """Returns the boxes of `torch.gather`: all places that its indices fill from the input's boxes.
 
-    All of the result if the indices have no values, as on the device "meta".
+    They are all of the result if the indices have no values, as on the device "meta".
     """
     indices = call.args[2]
     if call.place != 0 or indices.is_meta:
