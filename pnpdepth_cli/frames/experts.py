@@ -192,10 +192,10 @@ def expert_of(
         return expert
     # It predicts the validation points from the others; a prior is made from the others, too.
     kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
-    return _validated(expert, network, split, kept, updates=updates)
+    return _with_validation(expert, network, split, kept, updates=updates)
 
 
-def _validated(
+def _with_validation(
     expert: NetworkExpert,
     network: OpenNetwork,
     split: ValidatedFrame,

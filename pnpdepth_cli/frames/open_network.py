@@ -87,6 +87,7 @@ class OpenNetwork:
         always_updated: bool = False,
         tuned: bool = False,
     ) -> None:
+        # What the network is and takes.
         definition = network.definition
         self.network = network
         self.layer = layer
@@ -99,6 +100,7 @@ class OpenNetwork:
         self.tuned = tuned
         self._coarse = definition.coarse if coarse else None
         self._of_image_only = definition.input_kind in ("rgb", "map")
+        # What is kept: the cut until it is closed, the others until the next image.
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None

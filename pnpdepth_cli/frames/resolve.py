@@ -78,7 +78,7 @@ def with_input_range(network: Network, name: str | None) -> Network:
 def resolve_definition(
     network: Network, frame: Frame, more_frames: Callable[[], Sequence[Frame]] = tuple
 ) -> Network:
-    """Returns the network with a definition that leaves nothing open, and notes on the decisions.
+    """Returns the network with all decided that its definition leaves open, and notes on that.
 
     An open input range becomes the one whose prediction fits the points best, in the mean over the
     frames (`choose_input_range`).
@@ -221,6 +221,8 @@ def _by_preference(
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
     """Returns how wide the influential field of the default layer should be, in pixels.
+
+    The field is the part of the depth map that changes when the gradient of one point changes z.
 
     Args:
         size: (height, width) in pixels.
