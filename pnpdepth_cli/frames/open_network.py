@@ -62,7 +62,7 @@ class PreparedFrame:
 
 
 class OpenNetwork:
-    """A network of the method, with nothing left open, as a context manager.
+    """A network whose layer and settings are decided; a context manager.
 
     It is cut when z is first updated, and stays cut from frame to frame.
 

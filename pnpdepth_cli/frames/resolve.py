@@ -264,7 +264,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 def resolve_settings(
     definition: ModelDefinition, settings: Settings, *, metric: bool = True
 ) -> ClosedSettings:
-    """Returns settings with nothing open: the user's, else the network's defaults.
+    """Returns a value of each setting: the user's, else the network's default, else the paper's.
 
     Another update rule than the network's starts from the paper's step size, schedule and blur,
     because those of the network were tuned for its own rule. Where the points are in another unit
@@ -290,7 +290,7 @@ def resolve_settings(
 
 
 def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwork:
-    """Returns a network of the method with its layer and settings, nothing left open.
+    """Returns a network of the method with its layer and a value of each of its settings.
 
     What the user gives replaces the network's own value. The paper's method takes the rest from the
     paper. The other methods propagate the residual, and take for the rest what serves that: at most
