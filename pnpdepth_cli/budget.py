@@ -33,37 +33,37 @@ _VALUES_PER_BYTE = 1032
 
 
 def max_pixels() -> int:
-    """Returns the most pixels of an image, and rows or elements of any other array of numbers."""
+    """Returns how many pixels an image may have, and rows or elements another array of numbers."""
     if _chosen:
         return _chosen
     return min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
 
 
 def max_network_pixels() -> int:
-    """Returns the most pixels of the one image size that a network takes, by its file."""
+    """Returns how many pixels the image may have that a network takes, if its file fixes a size."""
     if _chosen:
         return _chosen
     return min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
 
 
 def max_file_bytes() -> int:
-    """Returns the most bytes of a file with an image, depth, points or text, as stored."""
+    """Returns how many bytes a file with an image, depth, points or text may have, as stored."""
     least = _LEAST_FILE_BYTES if _chosen else _MOST_FILE_BYTES
     return max(least, _FILE_BYTES_PER_PIXEL * max_pixels())
 
 
 def max_image_bytes() -> int:
-    """Returns the most bytes that an image or array takes as its file stores it, decoded."""
+    """Returns how many bytes an image or array may take, decoded but in its file's own type."""
     return max(_LEAST_FILE_BYTES, _DECODED_BYTES_PER_PIXEL * max_pixels())
 
 
 def max_decoded_bytes() -> int:
-    """Returns the most bytes of one file's decoded content, such as the tensors of a checkpoint."""
+    """Returns how many bytes one file's content may take, decoded, such as all of a checkpoint."""
     return _memory_bytes() // 2
 
 
 def max_values_from(file_bytes: int) -> int:
-    """Returns the most values that a file of so many bytes may claim to hold.
+    """Returns how many values a file of so many bytes may claim to hold.
 
     Any file may claim 2²⁵ values: an image of one colour takes almost no bytes. More values need
     the bytes that they cannot be compressed below.

@@ -221,7 +221,9 @@ class Refiner:
         shared = estimate_registration(self._evidences.pop(frame.size))
         method.registrations[frame.size] = shared
         # Nothing is said of images that were never moved, and stay.
-        if shared is None and self._moved.get(frame.size, set()) <= {str(None)}:
+        not_moved = str(None)
+        moved_before = self._moved.get(frame.size, set()) - {not_moved}
+        if shared is None and not moved_before:
             return []
         how = "are not moved" if shared is None else f"are all moved by {shared}"
         return [
@@ -231,6 +233,8 @@ class Refiner:
 
     def _is_moved_otherwise(self, frame: Frame, refined: Refined) -> bool:
         """Whether images of this size, with this one, were moved to their points in two ways.
+
+        How this one was moved is remembered for those after it.
 
         Args:
             frame: The frame, before it was refined.

@@ -161,7 +161,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedSettings:
-    """How z is updated and what follows, with nothing open.
+    """How z is updated and what follows, each setting with a value.
 
     The defaults are those of Wang et al., ICRA 2019, equations 2 and 3, with α, K, U and L of
     section IV.

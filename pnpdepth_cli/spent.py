@@ -48,6 +48,6 @@ def parts_of(seconds: dict[str, float], stage: str) -> Iterator[None]:
         yield
     finally:
         _noted.reset(token)
-        for part, spent_s in parts.items():
-            key = f"{stage}: {part}"
+        for name, spent_s in parts.items():
+            key = f"{stage}: {name}"
             seconds[key] = round(seconds.get(key, 0.0) + spent_s, 4)

@@ -157,9 +157,11 @@ def _make_updates(
     Raises:
         DivergedError: The loss is not finite.
     """
-    generator = torch.Generator().manual_seed(seed)
+    # Adam, its step size falling to 0.
     optimiser = torch.optim.Adam(theta.values(), LR, eps=EPSILON)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    # Visits of frames in random order, each with other points hidden at every update.
+    generator = torch.Generator().manual_seed(seed)
     order = _shuffle(len(lessons), generator)
     for first_step in range(0, STEPS, STEPS_A_VISIT):
         lesson = lessons[next(order)]
@@ -245,7 +247,9 @@ def _open_lesson(
         is_hidden = next(halves).to(points.depth.device)
         shown = points.select(~is_hidden)
         hidden = points.select(is_hidden)
-        typed_weights = {name: w.to(parameters[name].dtype) for name, w in weights.items()}
+        typed_weights = {
+            name: weight.to(parameters[name].dtype) for name, weight in weights.items()
+        }
         arguments = tuple(tensor.clone() for tensor in prepared.arguments_for(shown))
         with wrap_user_errors("the network's forward"):
             output = functional_call(network.module, typed_weights, arguments)

@@ -192,10 +192,10 @@ def expert_of(
         return expert
     # It predicts the validation points from the others; a prior is made from the others, too.
     kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
-    return _validated(expert, network, split, kept, updates=updates)
+    return _with_validation(expert, network, split, kept, updates=updates)
 
 
-def _validated(
+def _with_validation(
     expert: NetworkExpert,
     network: OpenNetwork,
     split: ValidatedFrame,
@@ -254,7 +254,11 @@ def _at_validation_points(dense: Tensor, split: ValidatedFrame) -> Tensor:
 def expert_of_user(
     network: OpenNetwork, split: ValidatedFrame, judged: Judged, *, needs_trust: bool = False
 ) -> NetworkExpert:
-    """Returns the expert of a user's network, z updated as far as the network is not strong.
+    """Returns what a user's network predicts, as an expert; z of a strong network is not updated.
+
+    A network of the image alone is strong if, with its depth, the points predict each other far
+    better than with a constant depth (`strength_of`). In between, its depth is a mean of the one
+    before and the one after the updates.
 
     Args:
         network: The network, open.
@@ -313,7 +317,7 @@ def _mix_with_aligned(prediction: Prediction, share_of_aligned: float) -> Tensor
 def networks_alone(
     networks: Sequence[OpenNetwork], split: ValidatedFrame, judged: Judged
 ) -> Experts:
-    """Returns the user's networks as the experts, with equal prior weights.
+    """Returns the predictions of the user's networks as the only experts, of equal prior weights.
 
     Args:
         networks: The networks, open.
@@ -336,7 +340,10 @@ def fused_experts(
     split: ValidatedFrame,
     judged: Judged,
 ) -> Experts:
-    """Returns the user's networks and what a network that takes a prior makes of them.
+    """Returns the experts of a frame: what predicts it, each with a prior weight.
+
+    They are the user's networks, a network that takes a prior with each one's depth and without,
+    linear interpolation, and, where the image is in doubt, that network with a grey image.
 
     Args:
         networks: The networks, open, the user's first.
@@ -397,6 +404,9 @@ def trust(
     network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, alone: NetworkExpert
 ) -> float:
     """Returns 0…1, the fraction of its prior weights that a user's network gets.
+
+    They are the weights of its own depth, and of the depth that has it as a prior, before the
+    validation points change them.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
     the validation points is that of `alone`, and none if it is twice that. Without validation

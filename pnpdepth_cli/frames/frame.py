@@ -166,7 +166,7 @@ class Saver(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class UsedNetwork:
-    """A network as it was used, with nothing left open."""
+    """A network as it was used, with the layer and the settings that were decided."""
 
     name: str
     layer: str

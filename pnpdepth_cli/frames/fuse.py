@@ -135,11 +135,12 @@ def with_shares(fused: Tensor, shares: Sequence[tuple[Tensor, float]]) -> Tensor
 def shares_on_lines(
     experts: Experts, split: ValidatedFrame, inliers: Frame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """Returns the shares of single networks in the result of a frame of scan lines.
+    """Returns which single networks have a weight in the result beside the fused depth.
 
-    Its validation points are whole lines beside others, where `compact` and interpolation are best.
-    So they do not show what a completion network of that scanner is worth, nor an image network
-    between the lines. There are none without validation points.
+    That is for frames of scan lines. Their validation points are whole lines beside others, where
+    `compact` and interpolation are best. So they do not show what a completion network of that
+    scanner is worth, nor an image network between the lines. Without validation points no network
+    has such a weight.
 
     Args:
         experts: The experts.
@@ -158,7 +159,7 @@ def shares_on_lines(
 def _shares_of_scanner(
     experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The shares of the user's completion networks; none if there is no such network that fits.
+    """The user's completion networks that have a weight beside the fused depth, as they fit.
 
     A network fits if its error at the points, which it was given, is at most the error of the
     experts' mean at the validation points, which they were not given.
@@ -180,8 +181,10 @@ def _shares_of_scanner(
         for expert in of_scanner
         if (points.sample(expert.dense) - points.depth).abs().mean() <= limit
     ]
-    # They share the weight equally.
-    weight = OWN_SCANNER / max(len(fitting), 1)
+    if not fitting:
+        return []
+    # They have the weight in equal parts.
+    weight = OWN_SCANNER / len(fitting)
     return [
         Share(expert.name, weight, expert.dense, expert.updated_at_validation) for expert in fitting
     ]
@@ -190,9 +193,10 @@ def _shares_of_scanner(
 def _share_of_image(
     experts: Experts, split: ValidatedFrame, inliers: Frame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The share of the user's first network, its aligned depth propagated; none if it has enough.
+    """The user's first network, if it has a weight beside the fused depth, in a list; else none.
 
-    There is none either if it takes points, or if no other network is fused with it.
+    Its depth is the aligned one, the residual propagated. It has no weight if its weight in the
+    fused depth is enough, if it takes points, or if no other network is fused with it.
 
     Args:
         experts: The experts.

@@ -63,7 +63,7 @@ class PreparedFrame:
 
 
 class OpenNetwork:
-    """A network of the method, with nothing left open, as a context manager.
+    """A network whose layer and settings are decided; a context manager.
 
     It is cut when z is first updated, and stays cut from frame to frame.
 
@@ -88,6 +88,7 @@ class OpenNetwork:
         always_updated: bool = False,
         tuned: bool = False,
     ) -> None:
+        # What the network is and takes.
         definition = network.definition
         self.network = network
         self.layer = layer
@@ -100,6 +101,7 @@ class OpenNetwork:
         self.tuned = tuned
         self._coarse = definition.coarse if coarse else None
         self._of_image_only = definition.input_kind in ("rgb", "map")
+        # What is kept: the cut until it is closed, the others until the next image.
         self._open = ExitStack()
         self._split: Split | None = None
         self._z0: Tensor | None = None

@@ -149,9 +149,9 @@ def without_outliers(
 ) -> Judged:
     """Returns the frame without its outliers, and what a network, the judge, gives for it.
 
-    An outlier differs from the judge's prediction otherwise than its neighbours do. From
-    `FEW_POINTS` points on, one whose depth alone contradicts its neighbours is an outlier, too. A
-    point that agrees with a strong network is none.
+    The difference of an outlier's log depth from the judge's prediction is clearly another than
+    that of its neighbours. From `FEW_POINTS` points on, one whose depth alone contradicts its
+    neighbours' is an outlier, too. A point that agrees with a strong network is none.
 
     z of a judge that takes the image alone is not updated yet: how strong the network is tells
     whether it will be (`expert_of_user`).

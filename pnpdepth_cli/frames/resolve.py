@@ -67,7 +67,7 @@ def with_input_range(network: Network, name: str | None) -> Network:
 def resolve_definition(
     network: Network, frame: Frame, more_frames: Callable[[], Sequence[Frame]] = tuple
 ) -> Network:
-    """Returns the network with a definition that leaves nothing open, and notes on the decisions.
+    """Returns the network with all decided that its definition leaves open, and notes on that.
 
     An open input range becomes the one whose prediction fits the points best, in the mean over the
     frames (`choose_input_range`).
@@ -211,6 +211,8 @@ def _by_preference(
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
     """Returns how wide the influential field of the default layer should be, in pixels.
 
+    The field is the part of the depth map that changes when the gradient of one point changes z.
+
     Args:
         size: (height, width) in pixels.
         point_count: Number of points, even over these pixels.
@@ -251,7 +253,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
 def resolve_settings(
     definition: ModelDefinition, settings: Settings, *, metric: bool = True
 ) -> ClosedSettings:
-    """Returns settings with nothing open: the user's, else the network's defaults.
+    """Returns a value of each setting: the user's, else the network's default, else the paper's.
 
     Another update rule than the network's starts from the paper's step size, schedule and blur,
     because those of the network were tuned for its own rule. Where the points are in another unit
@@ -277,7 +279,7 @@ def resolve_settings(
 
 
 def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwork:
-    """Returns a network of the method with its layer and settings, nothing left open.
+    """Returns a network of the method with its layer and a value of each of its settings.
 
     What the user gives replaces the network's own value. The paper's method takes the rest from the
     paper. The other methods propagate the residual, and take for the rest what serves that: at most

@@ -48,7 +48,7 @@ def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
 
     NaN where the lens shows nothing.
     """
-    inverse = np.linalg.inv(camera.intrinsics)
+    inverse = np.linalg.inv(camera.intrinsics)  # its last row is 0 0 1, as of the matrix
     plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
     return undistort(plane, camera.lens, camera.distortion) if camera.has_lens else plane
 

@@ -304,7 +304,10 @@ def occluded_in_map(points: Points) -> Mask | None:
     # Whether the points are a scan with occluded points.
     if len(points) < MIN_POINTS or bool((points.xy != np.floor(points.xy)).any()):
         return None
-    _, across_px = scan_pattern(points.xy, points.size) or (0.0, 0.0)
+    pattern = scan_pattern(points.xy, points.size)
+    if pattern is None:
+        return None
+    _, across_px = pattern
     low, high = _LINE_SPACING_PX
     if not low <= across_px <= high:
         return None

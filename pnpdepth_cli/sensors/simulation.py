@@ -46,6 +46,8 @@ class Lidar:
     def directions(self, rng: np.random.Generator) -> Floats:
         """Returns (M, 3) unit vectors of one revolution in scanner coordinates, beam after beam.
 
+        The axes are x forward, y left, z up; azimuth is from x to y.
+
         Args:
             rng: Generator of the noise of the angles.
         """
@@ -211,7 +213,7 @@ def sample_points(
 
     Raises:
         NoPointsError: The depth map or the pattern leaves no point.
-        UsageError: More points are asked for than are known.
+        UsageError: More points or lines are asked for than there are, or the image is missing.
         InputError: Image and depth differ in size.
     """
     size = (depth.shape[0], depth.shape[1])
@@ -223,33 +225,7 @@ def sample_points(
             "the depth map has no pixel with known depth to sample from; give one with depth above"
             " 0"
         )
-    wanted = pattern.wanted(known_pixels.size)
-    # The known pixels of the pattern, as row-major indices.
-    match pattern.kind:
-        case "uniform":
-            if wanted > known_pixels.size:
-                raise UsageError(
-                    f"{wanted:,} points of {known_pixels.size:,} known pixels; ask for fewer"
-                )
-            chosen = np.random.default_rng(seed).choice(known_pixels, wanted, replace=False)
-        case "shuffle":  # as Marigold-DC does, by numpy's legacy generator
-            rows = known_pixels[:, None].copy()  # rows of an array are shuffled unlike a flat one
-            np.random.RandomState(seed).shuffle(rows)
-            chosen = rows[:wanted, 0]
-        case "grid":
-            fraction = pattern.fraction
-            if fraction is None:
-                fraction = wanted / depth.size
-            chosen = np.intersect1d(_grid(fraction, size), known_pixels)
-        case "lines":
-            height, width = size
-            lines = _lines(pattern.wanted(height), height)
-            chosen = known_pixels[np.isin(known_pixels // width, lines)]
-        case _:  # features
-            corners = _corners(image, wanted)
-            chosen = corners[np.isin(corners, known_pixels)][:wanted]
-    # Their depths.
-    chosen = np.sort(chosen)
+    chosen = np.sort(_pixels_of_pattern(pattern, known_pixels, size, seed, image))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
     row, column = np.divmod(chosen, size[1])
@@ -258,6 +234,51 @@ def sample_points(
         depth=depth.ravel()[chosen].astype(np.float32),
         size=size,
     )
+
+
+def _pixels_of_pattern(
+    pattern: SamplePattern,
+    known_pixels: Pixels,
+    size: Size,
+    seed: int,
+    image: NDArray[np.float32] | None,
+) -> Pixels:
+    """The pixels of a pattern that have a depth.
+
+    Args:
+        pattern: Kind of the pattern, and how many points or lines are wanted.
+        known_pixels: Pixels that have a depth, rising.
+        size: (H, W) of the depth map.
+        seed: Random seed of the patterns "uniform" and "shuffle".
+        image: (H, W, 3) in 0…1, for the pattern "features".
+
+    Raises:
+        UsageError: More points or lines are asked for than there are, or the image is missing.
+    """
+    height, width = size
+    wanted = pattern.wanted(known_pixels.size)
+    match pattern.kind:
+        case "uniform":
+            if wanted > known_pixels.size:
+                raise UsageError(
+                    f"{wanted:,} points of {known_pixels.size:,} known pixels; ask for fewer"
+                )
+            return np.random.default_rng(seed).choice(known_pixels, wanted, replace=False)
+        case "shuffle":  # as Marigold-DC does, by numpy's legacy generator
+            rows = known_pixels[:, None].copy()  # rows of an array are shuffled unlike a flat one
+            np.random.RandomState(seed).shuffle(rows)
+            return np.asarray(rows[:wanted, 0])
+        case "grid":
+            fraction = pattern.fraction
+            if fraction is None:
+                fraction = wanted / (height * width)
+            return np.intersect1d(_grid(fraction, size), known_pixels)
+        case "lines":
+            lines = _lines(pattern.wanted(height), height)
+            return np.asarray(known_pixels[np.isin(known_pixels // width, lines)])
+        case _:  # features
+            corners = _corners(image, wanted)
+            return np.asarray(corners[np.isin(corners, known_pixels)][:wanted])
 
 
 def _grid(fraction: float, size: Size) -> Pixels:
