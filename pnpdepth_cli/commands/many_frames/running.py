@@ -44,6 +44,8 @@ _CONNECT_S = 5.0
 """Seconds for a cluster to answer."""
 _FRAMES_OF_A_CALL = 8
 """Frames that are read and written beside the network; fewer where that leaves workers idle."""
+_CALLS_OF_A_WORKER = 4
+"""Calls that each worker gets if there are enough frames, so that none waits long for the last."""
 _TRIES = 3
 """How often a frame is tried whose worker dies."""
 _DEATHS = 2 * _TRIES
@@ -61,8 +63,10 @@ def refine_all(
 
     Args:
         to_do: The frames to refine.
-        frames: All frames of the batch, of which some decide for every run and shard.
-        of_frame: The records that each frame belongs to, by its name.
+        frames: All frames of the batch. Some of them decide what settings leave open, so that every
+            run and shard decides alike.
+        of_frame: The records that each frame belongs to, by its name. Frames with the same records
+            are refined with the same weights.
         worked: Whether a frame was refined with these settings before.
         listener: Receives notes, and may stop the batch.
 
@@ -73,37 +77,48 @@ def refine_all(
         DeviceError: The cluster cannot be used.
     """
     for records in dict.fromkeys(of_frame[frame.name] for frame in to_do):
-        # The frames that are refined alike.
-        wanted = [frame for frame in to_do if of_frame[frame.name] is records]
-        alike = [frame for frame in frames if of_frame[frame.name] is records]
-        deciding = [alike[number] for number in spread(len(alike))]
+        # The frames that are refined alike, and those of them that decide.
+        to_do_alike = [frame for frame in to_do if of_frame[frame.name] is records]
+        all_alike = [frame for frame in frames if of_frame[frame.name] is records]
+        deciding = [all_alike[place] for place in spread(len(all_alike))]
         if records.request.ray is not None:
-            yield from _refine_on_workers(deciding, wanted, records, worked, listener)
+            yield from _refine_on_workers(deciding, to_do_alike, records, worked, listener)
         else:
             with _open_method(records.request, deciding) as method:
-                yield from _refine_frames(wanted, method, records, worked, listener.stopped)
+                yield from _refine_frames(to_do_alike, method, records, worked, listener.stopped)
         if listener.stopped():
             return
 
 
 def spread(count: int) -> list[int]:
-    """Returns at most `DECIDING` numbers from 0 to count - 1, with both among them."""
-    return sorted({i * (count - 1) // (DECIDING - 1) for i in range(DECIDING)})
+    """Returns at most `DECIDING` numbers from 0 to count − 1, evenly spaced, with both ends."""
+    last = count - 1
+    return sorted({step * last // (DECIDING - 1) for step in range(DECIDING)})
 
 
 @contextmanager
 def _open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
-    """Yields the method, whose open settings these frames decide; None if none can be read."""
+    """Yields the method, whose open settings these frames decide; None if none can be read.
+
+    Args:
+        request: The batch.
+        deciding: The frames that decide, in order. The first that can be read decides most.
+
+    Raises:
+        UsageError: The request combines what cannot be combined.
+        ModelError: The network cannot be loaded.
+    """
     frames = _readable(request, deciding)
     first = next(frames, None)
     if first is None:
         yield None
         return
-    # Where a network states no input range, two others decide as well.
-    behind = deciding[1:]
-    two = [behind[i] for i in sorted({len(behind) // 2, len(behind) - 1})] if behind else []
+    # Where a network states no input range, two others decide as well: of the middle and the end.
+    others = deciding[1:]
+    middle_and_end = sorted({len(others) // 2, len(others) - 1}) if others else []
+    two = [others[place] for place in middle_and_end]
     method = load_method(request.refine, first, lambda: [*_readable(request, two)])
-    # The images share a registration.
+    # The images of one camera share a registration, which all of these frames decide.
     if first.register == "auto":
         method.share_registration(itertools.chain([first], frames))
     with method:
@@ -111,7 +126,7 @@ def _open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Itera
 
 
 def _readable(request: BatchRequest, frames: Iterable[FrameFiles]) -> Iterator[ReadFrame]:
-    """The contents of the frames that can be read. UsageError if an option is wrong, for all."""
+    """Yields the frames that can be read. Raises UsageError if an option is wrong, for all."""
     for files in frames:
         try:
             yield read_requested(request_of(request, files))
@@ -126,15 +141,27 @@ class _Work:
     """A frame on its way: what was read and refined, or the error that ended it."""
 
     request: RefineRequest
+    """What is asked of the frame."""
     seconds: dict[str, float] = field(default_factory=dict)
+    """Seconds by the step that they were spent on."""
     state: BatchState | None = None
+    """Its settings and files as they were when it was read. None: it was not."""
     frame: ReadFrame | None = None
+    """What was read. None: an error ended it before."""
     refined: Refined | None = None
+    """The result. None: an error ended it before, or it is not refined yet."""
     error: Exception | None = None
+    """What ended it. None: nothing did so far."""
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Measures the time of the block; an error in it is this frame's alone, and kept."""
+        """Measures the time of the block, and keeps an exception in it as `error`.
+
+        The exception goes no further, as it is this frame's alone.
+
+        Args:
+            name: What the time is spent on.
+        """
         try:
             with timed(self.seconds, name):
                 yield
@@ -149,12 +176,14 @@ class _Steps:
     method: Method | None
     """None: no frame could be read when the batch began."""
     records: Records
+    """Where the results and their records lie."""
     worked: bool
     """Whether a frame was refined with these settings before."""
     stopped: Callable[[], bool]
+    """Function that is asked before each frame; True ends the batch."""
 
     def read(self, files: FrameFiles) -> _Work:
-        """Reads a frame, with what identifies its files; in a thread."""
+        """Reads a frame, with what identifies its files. A thread of its own runs it."""
         work = _Work(request=request_of(self.records.request, files))
         with work.step("read"):
             work.state = self.records.state(work.request)
@@ -162,8 +191,14 @@ class _Steps:
         return work
 
     def refine(self, reading: Iterable[_Work]) -> Iterator[_Work]:
-        """Refines the frames, in this thread; an error may be of all until one was refined."""
-        proven = self.worked or self.method is None
+        """Yields the frames that were read, refined or with an error. The calling thread runs it.
+
+        Raises:
+            StorageError: Nothing more can be written.
+            ModelError, UsageError: An error of the network or the settings, before any frame was
+                refined: it may be one of all frames.
+        """
+        is_proven = self.worked or self.method is None
         for work in reading:
             if self.stopped():
                 return
@@ -173,14 +208,20 @@ class _Steps:
                         raise InputError("no frame could be read when the batch began; try again")
                     with_stages = work.frame.gt is not None
                     work.refined = self.method.refine(work.frame, with_stages=with_stages)
-            proven |= work.refined is not None
-            fatal = StorageError if proven else (StorageError, ModelError, UsageError)
-            if isinstance(work.error, fatal):
+            is_proven |= work.refined is not None
+            of_all_frames: tuple[type[Exception], ...] = (StorageError,)
+            if not is_proven:
+                of_all_frames = (StorageError, ModelError, UsageError)
+            if isinstance(work.error, of_all_frames):
                 raise work.error
             yield work
 
     def write(self, work: _Work) -> FrameRecord:
-        """Writes the result of a frame, or why there is none; in a thread."""
+        """Writes the result of a frame, or why there is none. A thread of its own runs it.
+
+        Raises:
+            StorageError: Nothing more can be written.
+        """
         if work.refined is None or work.frame is None or self.method is None:
             return self.records.fail(work.request, work.error)
         try:
@@ -211,6 +252,16 @@ def _refine_frames(
 
     An error is of its frame alone, unless nothing more can be written, or it is of the network or
     the settings before any frame was refined.
+
+    Args:
+        frames: The frames to refine.
+        method: The method, open. None: no frame could be read when the batch began.
+        records: Where the results and their records lie.
+        worked: Whether a frame was refined with these settings before.
+        stopped: Function that is asked before each frame; True ends the batch.
+
+    Raises:
+        StorageError, ModelError, UsageError: An error of all frames.
     """
     steps = _Steps(method=method, records=records, worked=worked, stopped=stopped)
     with (
@@ -225,21 +276,40 @@ class Worker:
     """Refines frames in a process of the cluster; a Ray actor."""
 
     records: Records
+    """Where the results and their records lie."""
     deciding: Sequence[FrameFiles]
     """The frames that decide what is open for all."""
     folder: Path
     """The folder that relative paths start from."""
     max_pixels: int | None
+    """What the user gave as the largest image. None: nothing."""
     threads: int
+    """Number of threads with which torch and OpenCV compute."""
     stack: ExitStack = field(default_factory=ExitStack)
+    """Holds the method open until the process ends."""
 
     def refine(self, frames: Sequence[FrameFiles], worked: bool) -> list[FrameRecord]:
-        """Returns the records of frames as `_refine_frames`; DeviceError without the files."""
+        """Refines and writes frames; returns their records.
+
+        Args:
+            frames: The frames to refine.
+            worked: Whether a frame was refined with these settings before.
+
+        Raises:
+            DeviceError: The process does not see the files.
+            StorageError, ModelError, UsageError: An error of all frames.
+        """
         return list(_refine_frames(frames, self.method, self.records, worked))
 
     @functools.cached_property
     def method(self) -> Method | None:
-        """The method, open until the process ends, which is made like the driver's first."""
+        """The method, open until the process ends; None as `_open_method`.
+
+        Before it is made, the process gets the folder, the limits and the threads of this worker.
+
+        Raises:
+            DeviceError: The process does not see the files.
+        """
         import cv2
         import torch
 
@@ -262,6 +332,7 @@ class _Call:
 
     frames: Sequence[FrameFiles]
     deaths: int = 0
+    """How often, while the frame was alone in its call."""
 
 
 def _refine_on_workers(
@@ -274,6 +345,18 @@ def _refine_on_workers(
     """Refines and writes frames on Ray workers; yields the records as they are done.
 
     A worker that dies is replaced, and its frames are tried again one by one, by any worker.
+
+    Args:
+        deciding: The frames that decide what settings leave open.
+        to_do: The frames to refine.
+        records: Where the results and their records lie.
+        worked: Whether a frame was refined with these settings before.
+        listener: Receives notes, and may stop the batch.
+
+    Raises:
+        UsageError: Ray is not installed.
+        DeviceError: The cluster cannot be used, or its workers die.
+        StorageError, ModelError, UsageError: An error of all frames.
     """
     with _connected(records.request.ray or LOCAL) as ray:
         devices, start = _plan(ray, deciding, records)
@@ -297,20 +380,26 @@ class _Workers:
     """The workers of a cluster, the calls that they run, and those that wait."""
 
     ray: ModuleType
+    """The package Ray, connected to the cluster."""
     start: Callable[[], Any]
     """Starts a worker, a Ray actor."""
     records: Records
+    """Where the results and their records lie."""
     listener: Listener
+    """Receives notes, and may stop the batch."""
     worked: bool
     """Whether a frame was refined, so that no error of another is of all."""
     waiting: deque[_Call]
+    """Calls that no worker has yet."""
     idle: list[Any]
+    """Workers that have no call."""
     running: dict[Any, tuple[Any, _Call]] = field(default_factory=dict)
     """The worker and the call of each result that Ray will have."""
     deaths: int = 0
+    """How many workers died."""
 
     def hand_out(self) -> bool:
-        """Gives calls to the workers. False: none runs, so that all is done."""
+        """Gives calls to the workers. Returns whether any runs; if none does, all is done."""
         # Until a frame is refined, only one worker has a call, as its error may be of all.
         while self.idle and self.waiting and (self.worked or not self.running):
             if self.listener.stopped():
@@ -332,14 +421,16 @@ class _Workers:
             DeviceError: Workers die before any frame is refined.
             Exception: What the call raised, which is of all frames.
         """
-        (ended, *_), _ = self.ray.wait([*self.running])
-        worker, call = self.running.pop(ended)
+        ended_results, _ = self.ray.wait([*self.running])
+        result = ended_results[0]
+        worker, call = self.running.pop(result)
         try:
-            done: list[FrameRecord] = self.ray.get(ended)
+            done: list[FrameRecord] = self.ray.get(result)
+        # The call raised; Ray's own error hides what it was.
         except self.ray.exceptions.RayTaskError as error:
             raise error.cause from None
+        # The worker died: another one takes its place, and its frames wait again.
         except self.ray.exceptions.RayError as error:
-            # The worker died: another one takes its place, and its frames wait again.
             reason = one_line(error)
             self.deaths += 1
             if self.deaths == _DEATHS and not self.worked:
@@ -354,8 +445,13 @@ class _Workers:
 
 
 def _calls(to_do: Sequence[FrameFiles], workers: int) -> Iterator[_Call]:
-    """Yields the frames in parts of a few; the first is one frame, which proves the network."""
-    size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * workers)))
+    """Yields the frames in parts of a few; the first is one frame, which proves the network.
+
+    Args:
+        to_do: The frames to refine.
+        workers: Number of workers, each of which is to have several parts if there are enough.
+    """
+    size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (_CALLS_OF_A_WORKER * workers)))
     yield _Call(frames=to_do[:1])
     for first in range(1, len(to_do), size):
         yield _Call(frames=to_do[first : first + size])
@@ -367,6 +463,11 @@ def _after_death(
     """The calls that follow when a worker died, and the record of a frame that is given up.
 
     Only a frame that was alone in its call is known to be what the worker died of.
+
+    Args:
+        call: The call that the worker had.
+        records: Where the record of a frame that is given up is written.
+        reason: What Ray says of the death, one line.
     """
     deaths = call.deaths + 1 if len(call.frames) == 1 else call.deaths
     if deaths < _TRIES:
@@ -378,17 +479,27 @@ def _after_death(
 def _plan(
     ray: ModuleType, deciding: Sequence[FrameFiles], records: Records
 ) -> tuple[int, Callable[[], Any]]:
-    """Returns the number of devices of the cluster, and a function that starts a worker on one."""
-    # A GPU has its share of the cores; Ray has libraries use as many threads.
+    """Returns the number of devices of the cluster, and a function that starts a worker on one.
+
+    Args:
+        ray: The package Ray, connected to the cluster.
+        deciding: The frames that decide what settings leave open.
+        records: Where the results and their records lie.
+
+    Raises:
+        DeviceError: The cluster has no such device.
+    """
+    # A device is a GPU with its share of the cores, or a core; Ray has libraries use as many
+    # threads as a worker has cores.
     device = records.request.refine.device
-    total = ray.cluster_resources()
-    gpus = device == "cuda"
-    devices = int(total.get("GPU" if gpus else "CPU", 0))
+    resources = ray.cluster_resources()
+    on_gpus = device == "cuda"
+    devices = int(resources.get("GPU" if on_gpus else "CPU", 0))
     if not devices:
         raise DeviceError(f"the Ray cluster has no device {device}; change --device")
-    cores = max(1, int(total["CPU"] // devices)) if gpus else 1
+    cores = max(1, int(resources["CPU"] // devices)) if on_gpus else 1
     actor = ray.remote(Worker).options(
-        num_cpus=cores, num_gpus=int(gpus), scheduling_strategy="SPREAD"
+        num_cpus=cores, num_gpus=int(on_gpus), scheduling_strategy="SPREAD"
     )
     # All workers have the same job.
     return devices, functools.partial(
@@ -403,7 +514,15 @@ def _plan(
 
 @contextmanager
 def _connected(address: str) -> Iterator[ModuleType]:
-    """Yields Ray, connected. UsageError if it is not installed, DeviceError without a cluster."""
+    """Yields the package Ray, connected to a cluster until the end of the block.
+
+    Args:
+        address: Address of the cluster, as `parse_address` takes it.
+
+    Raises:
+        UsageError: Ray is not installed.
+        DeviceError: The cluster cannot be used.
+    """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray is imported and by its processes
     try:
         import ray
@@ -414,6 +533,7 @@ def _connected(address: str) -> Iterator[ModuleType]:
             host, _, port = address.removeprefix("ray://").rpartition(":")
             socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    # Ray documents no errors of this; some of its failures end the process.
     except (Exception, SystemExit) as error:
         raise DeviceError(
             f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"
