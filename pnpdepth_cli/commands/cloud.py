@@ -151,46 +151,6 @@ def _points_file(frame: ResultFrame) -> str:
     return frame.name if source is None else source.path
 
 
-def _parts(
-    request: CloudRequest,
-    frames: list[ResultFrame],
-    poses: list[Pose],
-    coloured: bool,
-    notes: list[str],
-    show: Callable[[int, int], None],
-) -> Iterator[point_cloud.PointCloud]:
-    """Yields the clouds of all depth maps in the world. Raises InputError if there is no point."""
-
-    # A depth map is read once, though several views around it need it.
-    @functools.lru_cache(maxsize=_IN_MEMORY)
-    def depth_and_camera(index: int) -> tuple[NDArray[np.float32], Camera]:
-        depth = _depth(request, frames[index], notes)
-        camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
-        notes.extend(note for note in found if note not in notes)
-        return depth, camera
-
-    @functools.lru_cache(maxsize=_IN_MEMORY)
-    def view(index: int) -> point_cloud.View:
-        depth, camera = depth_and_camera(index)
-        return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
-
-    # Pixels on which enough views agree, as coloured points.
-    empty = True
-    for index, frame in enumerate(frames):
-        show(index, len(frames))
-        depth, camera = depth_and_camera(index)
-        if request.min_views > 1:
-            near = point_cloud.neighbouring_views(np.stack(poses), index)
-            depth = point_cloud.consistent_depth(view(index), map(view, near), request.min_views)
-        image = request.image or frame.image
-        rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
-        for cloud in point_cloud.cloud_from_depth(depth, camera, rgb):
-            empty &= not len(cloud.xyz)
-            yield cloud.transform(poses[index])
-    if empty:
-        raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
-
-
 def _clouds(
     request: CloudRequest,
     frames: list[ResultFrame],

@@ -223,16 +223,6 @@ def _notes_on_clusters(records: Sequence[FrameRecord]) -> list[str]:
     return find_clusters(groups, np.array(errors, np.float64)).notes()  # None becomes NaN
 
 
-def _notes(records: Sequence[FrameRecord]) -> list[str]:
-    """How many frames with ground truth count as independent."""
-    if len(records) < 2:
-        return []
-    names = [record.name for record in records]
-    groups = groups_of(names, [record.group for record in records])
-    errors = [[record.errors[GT][AFTER].get(key) for key in _MAIN] for record in records]
-    return find_clusters(groups, np.array(errors, np.float64)).notes()
-
-
 def _table(summary: BatchSummary, records: Iterable[FrameRecord]) -> Table:
     """A row for each record, with errors of ground truth first.
 

@@ -282,7 +282,3 @@ def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.ui
 def _base64(values: NDArray[np.number], kind: str) -> str:
     """The values in base64, row by row, as numbers of a kind such as `<f4`, NumPy's name of it."""
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
-
-
-def _text(values: NDArray[np.number], kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
