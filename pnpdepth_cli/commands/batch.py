@@ -14,6 +14,7 @@ from pnpdepth_cli.commands.many_frames.summary import BatchSummary, write_summar
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.shared.pipeline import in_order
 from pnpdepth_cli.commands.shared.tables import count_of, names_of_depths
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
@@ -63,7 +64,12 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         _refine_missing(batch, of_frame, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
         with in_turn(request.output):
-            entries = in_order(lambda f: of_frame[f.name].find(f), batch.frames, _READERS)
+
+            def find(frame: FrameFiles) -> FrameRecord | str:
+                """The record of a frame, or why there is none with its present settings."""
+                return of_frame[frame.name].find(frame)
+
+            entries = in_order(find, batch.frames, _READERS)
             results = [entry for entry in entries if isinstance(entry, FrameRecord)]
             summary = write_summary(request, batch, records.settings, results)
             if request.html is not None:
@@ -83,7 +89,12 @@ def _refine_missing(
         of_frame: The records that each frame belongs to, by its name.
         listener: Receives notes and the records of frames, and may stop the batch.
     """
-    reasons = [*in_order(lambda f: of_frame[f.name].reason_to_refine(f), batch.chosen, _READERS)]
+
+    def reason(frame: FrameFiles) -> str | None:
+        """Why the frame is to be refined; None if it is done."""
+        return of_frame[frame.name].reason_to_refine(frame)
+
+    reasons = [*in_order(reason, batch.chosen, _READERS)]
     listener.say(_plan(reasons))
     to_do = [frame for frame, why in zip(batch.chosen, reasons, strict=True) if why is not None]
     if not to_do:

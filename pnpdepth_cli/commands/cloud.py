@@ -177,6 +177,7 @@ def _clouds(
     # A depth map is read once, though several views around it need it.
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def depth_and_camera(index: int) -> tuple[NDArray[np.float32], Camera]:
+        """The depth (H, W) of the frame of this index, 0 where it is not used, and its camera."""
         depth = _depth(request, frames[index], notes)
         camera, camera_notes = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
         notes.extend(note for note in camera_notes if note not in notes)
@@ -184,6 +185,7 @@ def _clouds(
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> point_cloud.View:
+        """The same frame's points (H, W, 3) in its camera's coordinates, its camera and pose."""
         depth, camera = depth_and_camera(index)
         return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
 

@@ -16,10 +16,12 @@ from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
 from pnpdepth_cli.commands.requests.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order
+from pnpdepth_cli.commands.shared.results import ResultFrame
 from pnpdepth_cli.commands.shared.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.shared.tables import Table, count_of, some_names
 from pnpdepth_cli.completion.two_depths import Agreement
 from pnpdepth_cli.dataset.agreement import unit_warning
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.dataset.result_record import versions
 from pnpdepth_cli.errors import InputError
@@ -96,8 +98,14 @@ def evaluate(
     """
     # Every frame is scored, or has a record that says why it is not.
     pairs, notes = pair_frames(request.prediction, request.ground_truth, request.rules.part)
+
+    def score(pair: tuple[FrameFiles, ResultFrame | None]) -> FrameRecord:
+        """The record of a frame with its prediction, if it has one."""
+        files, result = pair
+        return score_frame(files, result, request)
+
     records: list[FrameRecord] = []
-    for record in in_order(lambda pair: score_frame(*pair, request), pairs, THREADS):
+    for record in in_order(score, pairs, THREADS):
         records.append(record)
         on_frame(len(records), len(pairs))
     scored = [record for record in records if record.status == "done"]
@@ -190,7 +198,7 @@ def _intervals(
     if clusters.count < MIN_CLUSTERS:
         return ends
     for measure, column in zip(measures, values.T, strict=True):
-        low, high = interval(lambda mean: mean, [column], clusters)
+        low, high = interval(lambda mean: mean, [column], clusters)  # of the mean itself
         # No error is below 0, and no fraction above 1.
         highest = 1.0 if measure.percent else math.inf
         ends[measure.key] = max(low, 0.0), min(high, highest)
@@ -250,18 +258,18 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
 
 def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """Yields lines on pixels without prediction or given to the network, and on scales."""
-    known = sum(_numbers(scored, "known"))
-    empty = known - sum(_numbers(scored, "predicted"))
+    with_truth = sum(_numbers(scored, "known"))
+    empty = with_truth - sum(_numbers(scored, "predicted"))
     if empty:
         yield (
-            f"warning: {count_of(empty, 'pixel')} ({empty / known:.2%}) of the ground truth without"
-            " prediction"
+            f"warning: {count_of(empty, 'pixel')} ({empty / with_truth:.2%}) of the ground truth"
+            " without prediction"
         )
-    given = sum(_numbers(scored, "given"))
-    if given and not request.rules.exclude_sparse:
+    with_point = sum(_numbers(scored, "given"))
+    if with_point and not request.rules.exclude_sparse:
         yield (
-            f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
-            " leaves them out"
+            f"{with_point:,} of the scored pixels have a point of the sparse input;"
+            " --exclude-sparse leaves them out"
         )
     # How predictions were scaled, or that they should be.
     not_in_metres = [record.unit for record in scored if record.unit != METRES]

@@ -271,7 +271,17 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset_s: f
 
 
 def _report_pairs(pairs: _Pairs, request: FramesRequest, sensors: Sensors, say: Say) -> None:
-    """Says what is not among the pairs that were written. Raises InputError if there is none."""
+    """Says what was left out of the pairs that were written.
+
+    Args:
+        pairs: What was written, and what not.
+        request: Which bag, and how near in time image and scan must be.
+        sensors: Topics of the images and the points.
+        say: Receives the lines.
+
+    Raises:
+        InputError: No pair was written.
+    """
     if pairs.dropped:
         say(f"points: dropped {describe_dropped(pairs.dropped)}")
     if pairs.lost:

@@ -75,7 +75,7 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
     reading = file.reading
     masked = apply_masks(file.values, frame.masks)
     is_scale_of_layout = request.gt_scale is None and not frame.scales_stated
-    values, notes = plausible_map(
+    depth, notes = plausible_map(
         masked,
         reading,
         "gt",
@@ -83,9 +83,9 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
         scale,
         of_integers=OF_DATA_SET if is_scale_of_layout else "",
     )
-    gt = np.ascontiguousarray(frame.part.apply(values))
+    gt = np.ascontiguousarray(frame.part.apply(depth))
     if request.gt_range:
-        gt = _depth_of_distances(gt, frame, result, (values.shape[0], values.shape[1]))
+        gt = _depth_of_distances(gt, frame, result, (depth.shape[0], depth.shape[1]))
         reading = reading._replace(source=f"{reading.source}, distances")
     return DepthToScore(gt, reading, notes)
 

@@ -104,6 +104,11 @@ def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequ
 def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Scored:
     """The scores of a result, how prediction and ground truth were read, and notes.
 
+    Args:
+        files: The frame's ground truth, and its sparse depth, image and camera if there are any.
+        result: The frame's prediction.
+        request: The rules.
+
     Raises:
         PnpDepthError: A file cannot be read, or nothing can be scored.
     """

@@ -62,10 +62,20 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes the bag, its frames in the order of their times; see `Export.write`."""
+    """Writes the bag, its frames in the order of their times; returns lines for a person.
+
+    Args:
+        folder: Output folder, which is there.
+        frames: The frames.
+        done: Callback after each frame.
+
+    Raises:
+        PnpDepthError: An image is damaged, ROS has no model of a lens, or rosbags is not there.
+    """
     times_ns, notes = _times(frames)
 
     def outgoing() -> Iterator[OutgoingMessage]:
+        """Yields the messages of all frames; a frame is read when its turn comes."""
         for place in np.argsort(times_ns, kind="stable"):
             yield from _messages(frames[place], times_ns[place], notes)
             done()

@@ -119,6 +119,7 @@ def write_batch_report(
 
     # A frame a time, so that memory does not grow with their number.
     def entries(images: Path) -> Iterator[dict[str, object]]:
+        """Yields the page's entry of each frame, whose images are linked in the folder."""
         for frame, result in results:
             views = _views(frame.name, result, request, images)
             yield _entry(frame, basis, columns) | views

@@ -32,6 +32,8 @@ from pnpdepth_cli.protocols import find_protocol
 
 CSV = "summary.csv"
 JSON = "summary.json"
+_PREDICTED_SUFFIXES = (*DEPTH_SUFFIXES, *frame_files.IMAGE_SUFFIXES, ".bin")
+"""Suffixes of depth maps of networks: formats of depth, images, and COLMAP's dense maps."""
 _SEARCHED = 3
 """Frames at the start of a sequence for which it is searched how image and points belong together;
 the others are of the same sensors."""
@@ -164,7 +166,7 @@ def _with_depths(folder: Path, frames: Sequence[FrameFiles]) -> list[FrameFiles]
     Raises:
         InputError: A frame has none.
     """
-    maps, _ = frame_files.find_files(folder, (*DEPTH_SUFFIXES, *frame_files.IMAGE_SUFFIXES, ".bin"))
+    maps, _ = frame_files.find_files(folder, _PREDICTED_SUFFIXES)
     with_depths = list[FrameFiles]()
     for frame in frames:
         image = frame.image_file
@@ -296,14 +298,23 @@ def _neighbour(frame: FrameFiles, near: FrameFiles, apart: int, source: str) -> 
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
-    """Returns what is asked of the refinement of one frame, one that `find_frames` returned."""
+    """Returns the request by which one frame of a batch is read and refined.
+
+    Args:
+        request: The batch.
+        frame: A frame of `find_frames`.
+    """
     return replace(request.refine, files=frame, reading=request.reading)
 
 
 def _as_requested(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
-    """The frame as it is read: with the confidence, the part and the points that are asked for.
+    """The frame with the user's least confidence, the protocol's part, and where points are from.
 
-    What the data set states of this one frame goes before the user's least confidence.
+    A least confidence that the data set has for this one frame goes before the user's.
+
+    Args:
+        request: The batch, which may have a least confidence, a protocol, and points to sample.
+        frame: The frame as the data set has it.
     """
     if frame.sparse_mask is not None and frame.min_confidence is None:
         frame = replace(frame, min_confidence=request.refine.files.min_confidence)
@@ -351,7 +362,12 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
-    """Raises InputError for a frame whose results have no files of their own."""
+    """Raises InputError for a frame whose results would need a file of another or no valid name.
+
+    Args:
+        frames: All frames of the batch.
+        refine: How a frame is refined, which says which files a result has.
+    """
     endings = [path.name for path in refine.outputs_in(Path(), "").values()]
     owners = dict.fromkeys((CSV, JSON), "the batch")  # who writes a file or folder, by its path
     for frame in frames:

@@ -29,11 +29,14 @@ from pnpdepth_cli.frames.method import Method
 
 @contextmanager
 def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
-    """Yields the method, whose open settings these frames decide; None if none can be read.
+    """Yields the method with which all frames are refined, open; None if no frame can be read.
+
+    What neither the user nor the network states, such as the layer or the range of the input, is
+    found on a few frames.
 
     Args:
         request: The batch.
-        deciding: The frames that decide, in order. The first that can be read decides most.
+        deciding: These frames, in order. The first that can be read decides most.
 
     Raises:
         UsageError: The request combines what cannot be combined.
@@ -47,8 +50,12 @@ def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterat
     # Where a network states no input range, two others decide as well: of the middle and the end.
     others = deciding[1:]
     middle_and_end = sorted({len(others) // 2, len(others) - 1}) if others else []
-    two = [others[place] for place in middle_and_end]
-    method = load_method(request.refine, first, lambda: [*_readable(request, two)])
+
+    def more() -> list[ReadFrame]:
+        """The two others, which are read only if they are needed."""
+        return [*_readable(request, [others[place] for place in middle_and_end])]
+
+    method = load_method(request.refine, first, more)
     # The images of one camera share a registration, which all of these frames decide.
     if first.register == "auto":
         method.share_registration(itertools.chain([first], frames))
@@ -57,7 +64,11 @@ def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterat
 
 
 def _readable(request: BatchRequest, frames: Iterable[FrameFiles]) -> Iterator[ReadFrame]:
-    """Yields the frames that can be read. Raises UsageError if an option is wrong, for all."""
+    """Yields the frames that can be read; the others will have a record that says why not.
+
+    Raises:
+        UsageError: An option is wrong, which concerns all frames.
+    """
     for files in frames:
         try:
             yield read_requested(request_of(request, files))
@@ -114,7 +125,7 @@ class _Steps:
     """Function that is asked before each frame; True ends the batch."""
 
     def read(self, files: FrameFiles) -> _Work:
-        """Reads a frame, with what identifies its files. A thread of its own runs it."""
+        """Reads a frame, with what identifies its files. Runs in one of the reading threads."""
         work = _Work(request=request_of(self.records.request, files))
         with work.step("read"):
             work.state = self.records.state(work.request)
@@ -148,7 +159,7 @@ class _Steps:
             yield work
 
     def write(self, work: _Work) -> FrameRecord:
-        """Writes the result of a frame, or why there is none. A thread of its own runs it.
+        """Writes the result of a frame, or why there is none. Runs in one of the writing threads.
 
         Raises:
             StorageError: Nothing more can be written.

@@ -47,7 +47,7 @@ class Worker:
     records: Records
     """Where the results and their records lie."""
     deciding: Sequence[FrameFiles]
-    """The frames that decide what is open for all."""
+    """A few frames on which it finds what neither user nor network states, as all workers do."""
     folder: Path
     """The folder that relative paths start from."""
     max_pixels: int | None
@@ -72,7 +72,7 @@ class Worker:
 
     @functools.cached_property
     def method(self) -> Method | None:
-        """The method, open until the process ends; None as `open_method`.
+        """The method of `open_method`, open until the process ends; None if no frame can be read.
 
         Before it is made, the process gets the folder, the limits and the threads of this worker.
 
@@ -116,7 +116,7 @@ def refine_on_workers(
     A worker that dies is replaced, and its frames are tried again one by one, by any worker.
 
     Args:
-        deciding: The frames that decide what settings leave open.
+        deciding: A few frames on which every worker finds what neither user nor network states.
         to_do: The frames to refine.
         records: Where the results and their records lie.
         worked: Whether a frame was refined with these settings before.
@@ -252,7 +252,7 @@ def _plan(
 
     Args:
         ray: The package Ray, connected to the cluster.
-        deciding: The frames that decide what settings leave open.
+        deciding: A few frames on which every worker finds what neither user nor network states.
         records: Where the results and their records lie.
 
     Raises:

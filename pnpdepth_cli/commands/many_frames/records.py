@@ -170,7 +170,7 @@ class Records:
         return record
 
     def _digest(self, request: RefineRequest) -> str:
-        """The SHA-256 of the settings that decide the frame's result."""
+        """The SHA-256 of all settings of a frame; two frames with the same were refined alike."""
         settings = self.settings | _settings_of(request)
         pose = request.files.pose
         if pose is not None:
@@ -181,7 +181,7 @@ class Records:
 
 
 def _settings_of(request: RefineRequest) -> dict[str, object]:
-    """The settings, but no files, that decide a frame's result, in JSON's own types."""
+    """The settings that change a frame's result if they change, but no files, by their names."""
     # All fields of the request and its groups, side by side.
     fields = dict[str, object]()
     for name, value in vars(request).items():

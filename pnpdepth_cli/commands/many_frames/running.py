@@ -26,8 +26,8 @@ def refine_all(
 
     Args:
         to_do: The frames to refine.
-        frames: All frames of the batch. Some of them decide what settings leave open, so that every
-            run and shard decides alike.
+        frames: All frames of the batch. What neither user nor network states is found on some of
+            them, so that it is the same in every run and shard.
         of_frame: The records that each frame belongs to, by its name. Frames with the same records
             are refined with the same weights.
         worked: Whether a frame was refined with these settings before.
@@ -40,7 +40,7 @@ def refine_all(
         DeviceError: The cluster cannot be used.
     """
     for records in dict.fromkeys(of_frame[frame.name] for frame in to_do):
-        # The frames that are refined alike, and those of them that decide.
+        # The frames that are refined alike, and those on which is found what nobody states.
         to_do_alike = [frame for frame in to_do if of_frame[frame.name] is records]
         all_alike = [frame for frame in frames if of_frame[frame.name] is records]
         deciding = [all_alike[place] for place in spread(len(all_alike))]

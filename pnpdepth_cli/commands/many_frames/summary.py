@@ -136,8 +136,9 @@ def _counts(batch: BatchFrames, records: Sequence[FrameRecord]) -> dict[str, int
 def _weights_of(results: Sequence[ResultRecord]) -> dict[str, dict[str, float]]:
     """Mean, least and largest weight of each expert over the frames, by the expert's name.
 
-    An expert is a network, or what else is fused to the result. One that a frame lacks has weight 0
-    there; frames without weights, as of other methods, are left out.
+    The experts are what is fused to the result: the depth of each network, and linear
+    interpolation. One that a frame lacks has weight 0 there; frames without weights, as of other
+    methods, are left out.
     """
     of_frames = [result.weights for result in results if result.weights]
     weights = dict[str, dict[str, float]]()

@@ -160,7 +160,7 @@ class BatchRequest:
             raise UsageError("--pose-kind is for --poses")
         if self.ray is not None and self.refine.device not in ("cpu", "cuda"):
             raise UsageError("--ray computes on --device cpu, or on all GPUs with --device cuda")
-        choose_measures(MEASURES, self.columns)
+        choose_measures(MEASURES, self.columns)  # raises for an unknown key
 
     @property
     def is_of_bag(self) -> bool:
