@@ -39,7 +39,7 @@ def write_depth_cloud(
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
-    # The frames, with poses where views must agree.
+    # The frames. Either all have a pose or none; views can only agree if they have.
     check_outputs([request.output], overwrite=request.overwrite)
     frames = result_frames(request.depth)
     notes: list[str] = []

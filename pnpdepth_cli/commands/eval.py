@@ -368,6 +368,7 @@ def frames_table(evaluation: Evaluation) -> Table:
         row += [scores.get(measure.key) for measure in evaluation.shown]
         row.append(frame.message)
         rows.append(row)
+    # Keys are headings, too; but coverage is a measure, whose heading a table knows.
     counts = [COVERAGE if key == COVERAGE.key else key for key in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)

@@ -123,7 +123,7 @@ def _depth_topics(
 
 
 def _depth_camera(
-    bag: Bag, images: str, points: str, has_same_frame: bool, say: Say
+    bag: Bag, images: str, points: str, has_same_frame_id: bool, say: Say
 ) -> Camera | None:
     """The camera of depth images if it is another than that of the images, else None.
 
@@ -133,36 +133,38 @@ def _depth_camera(
         bag: The open bag.
         images: Topic of the images.
         points: Topic of the depth images.
-        has_same_frame: Whether both have one frame_id.
+        has_same_frame_id: Whether both have one frame_id.
         say: Receives a warning if nothing tells that depth and images belong together.
     """
     calibrations = [messages.camera_of_bag(bag, topic) for topic in (images, points)]
     of_images, of_depth = (
         None if calibration is None else calibration[0].camera for calibration in calibrations
     )
+    # Depth has no camera of its own: there is none, or the only camera_info of the bag is of both.
     if of_depth is None:
-        _warn_of_unregistered(points, has_same_frame, say)
+        _warn_of_unregistered(points, has_same_frame_id, say)
         return None
     if of_images is None:
         return of_depth
-    if of_images.source == of_depth.source:  # the only camera_info of the bag
-        _warn_of_unregistered(points, has_same_frame, say)
+    if of_images.source == of_depth.source:
+        _warn_of_unregistered(points, has_same_frame_id, say)
         return None
+    # Two cameras that are alike are one.
     has_same_k = np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
-    if has_same_frame and has_same_k and of_images.size == of_depth.size:
+    if has_same_frame_id and has_same_k and of_images.size == of_depth.size:
         return None
     return of_depth
 
 
-def _warn_of_unregistered(points: str, has_same_frame: bool, say: Say) -> None:
+def _warn_of_unregistered(points: str, has_same_frame_id: bool, say: Say) -> None:
     """Warns of depth images whose camera nothing tells, unless their frame or topic does.
 
     Args:
         points: Topic of the depth images.
-        has_same_frame: Whether they have the images' frame_id.
+        has_same_frame_id: Whether they have the images' frame_id.
         say: Receives the warning.
     """
-    if has_same_frame or _REGISTERED.search(points):
+    if has_same_frame_id or _REGISTERED.search(points):
         return
     say(
         f"warning: {points} has no camera_info and is in another frame than the images; its pixels"

@@ -200,6 +200,7 @@ def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
 
 def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
     """The fields of an Image of pixels (H, W) or (H, W, C), little-endian, rows without padding."""
+    # (H, bytes of a row)
     rows = np.ascontiguousarray(pixels.reshape(len(pixels), -1))
     data = rows.astype(rows.dtype.newbyteorder("<"), copy=False).view(np.uint8)
     return {
@@ -275,7 +276,10 @@ def _options_of_points(sparse: FileRecord) -> ReadOptions:
         keep_occluded=sparse.keep_occluded,
     )
     return ReadOptions(
-        unit_scale=sparse.unit_scale, registration="off", scan=scan, sample=sparse.sampled
+        unit_scale=sparse.unit_scale,
+        registration="off",  # it moves the image, not the points
+        scan=scan,
+        sample=sparse.sampled,
     )
 
 

@@ -36,7 +36,8 @@ def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterat
 
     Args:
         request: The batch.
-        deciding: These frames, in order. The first that can be read decides most.
+        deciding: These frames, in order. The first that can be read counts for all of that, others
+            for the range of the input and for how images are moved to their points.
 
     Raises:
         UsageError: The request combines what cannot be combined.

@@ -173,7 +173,8 @@ class BatchRequest:
     def reading(self) -> ReadOptions:
         """How the files of every frame are read, with the points that the protocol has.
 
-        Points that the user asks for go before those of the protocol.
+        Points that the user asks for go before those of the protocol. Which LiDAR points of a
+        background behind others are removed is the protocol's alone.
         """
         options = self.refine.reading
         if self.protocol is None:
