@@ -61,6 +61,7 @@ MAY_IMPORT = {
 IN_COMMANDS = {
     "requests": set[str](),
     "shared": {"requests"},
+    "bag_frames": {"requests", "shared"},
     "comparisons": {"requests", "shared"},
     "evaluation": {"requests", "shared"},
     "exports": {"shared"},

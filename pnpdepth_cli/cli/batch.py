@@ -191,6 +191,7 @@ def _run(
     from pnpdepth_cli.commands.shared.tables import count_of
 
     def say_once(line: str) -> None:
+        """Prints a note, unless an earlier run printed it."""
         if line not in printed:
             say_above_bar(line)
         printed.add(line)
@@ -272,7 +273,11 @@ def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _C
 
 
 def _option(context: click.Context, name: str) -> click.Option:
-    """The option of this name, without its dashes.
+    """The option that `--vary` calls by this name.
+
+    Args:
+        context: Context of the command.
+        name: Long name of the option without its dashes, such as `lr`.
 
     Raises:
         UsageError: It cannot be varied, or is given besides.

@@ -20,6 +20,7 @@ class _File(click.Path):
     """A path; an empty text is none, where pathlib takes it for the current folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Returns the path of the text; an empty text is an error of usage."""
         if value == "":
             self.fail("an empty text names no file", param, ctx)
         return super().convert(value, param, ctx)
@@ -58,12 +59,15 @@ class _Names(click.Choice):  # type: ignore[type-arg]
         self._names = names
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Returns the text if it is a name of the list, or a Python file that the list takes."""
         is_file = value.endswith(".py") and value in self._names
         return value if is_file else super().convert(value, param, ctx)
 
 
 def _type_of(declared: Field[Any]) -> Any:
-    """What click makes of the option's text: names, a number in its limits, or the field's type.
+    """The type by which click reads the option's text, and refuses what is no value of it.
+
+    That is a name of a list, a whole number within limits, or the type of the dataclass's field.
 
     None leaves the type to click; the option then states its own, or is a text.
     """
@@ -212,6 +216,7 @@ class GroupedCommand(click.Command):
         named = {member for members in groups.values() for member in members}
 
         def flags(member: str | type) -> list[str]:
+            """The long names of the options that a member of a group stands for."""
             if isinstance(member, str):
                 return [member]
             return [flag for flag in map(flag_of, options_of(member)) if flag not in named]

@@ -52,7 +52,7 @@ def say(text: object) -> None:
 
 
 def print_json(value: object) -> None:
-    """Prints a value of JSON's own types on stdout."""
+    """Prints a value, of dictionaries, lists, texts and numbers, as JSON on stdout."""
     click.echo(json.dumps(value, indent=2))
 
 
@@ -70,6 +70,7 @@ def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     began = printed_at = 0.0
 
     def show(done: int, total: int) -> None:
+        """Draws the bar, or prints a line, that so many of all are done."""
         nonlocal bar, began, printed_at
         from tqdm import tqdm
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from pnpdepth_cli.commands.many_frames.summary import BatchSummary, write_summar
 from pnpdepth_cli.commands.requests.batch_request import BatchRequest, Listener
 from pnpdepth_cli.commands.shared.pipeline import in_order
 from pnpdepth_cli.commands.shared.tables import count_of, names_of_depths
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
 from pnpdepth_cli.io.atomic import in_turn, lock_folder, make_folder, remove_leftovers
 from pnpdepth_cli.protocols import WHOLE, find_protocol
@@ -41,42 +42,36 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
     # Which frames are refined, and how.
     refine = replace(request.refine, view_3d=request.html_3d)
     request = replace(request, refine=refine)
-    found = find_frames(request)
-    own = Records(request)
+    batch = find_frames(request)
+    records = Records(request)
     if request.html is not None:
         # Imported where it is used: what draws pages takes 50 ms.
         from pnpdepth_cli.commands.many_frames.batch_report import check_batch_report
 
         check_batch_report(request, request.html)
-    for note in _notes(request, found):
+    for note in _notes(request, batch):
         listener.say(note)
     if not refine.overwrite:
-        own.check_new(found.chosen)
+        records.check_new(batch.chosen)
     make_folder(request.output)
     with lock_folder(request.output, request.shard):
         if request.shard is None and (leftovers := remove_leftovers(request.output)):
             listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
-        # Those that are not done are refined; the frames of a sequence may have adapted weights.
-        of_frame = dict.fromkeys([frame.name for frame in found.frames], own)
+        # The frames of a sequence may have adapted weights, and then records of their own.
+        of_frame = dict.fromkeys([frame.name for frame in batch.frames], records)
         if request.adapt:
-            of_frame = with_adapted_weights(own, found.frames, listener)
-        asked = in_order(lambda f: of_frame[f.name].reason_to_refine(f), found.chosen, _READERS)
-        reasons = [*asked]
-        to_do = [frame for frame, why in zip(found.chosen, reasons, strict=True) if why]
-        listener.say(_plan(reasons))
-        if to_do:
-            from pnpdepth_cli.commands.many_frames.running import refine_all  # imports torch
-
-            listener.begin(len(to_do))
-            worked = len(to_do) < len(found.chosen)
-            refining = refine_all(to_do, found.frames, of_frame, worked, listener)
-            with closing(refining) as records:
-                _follow(records, listener)
+            of_frame = with_adapted_weights(records, batch.frames, listener)
+        _refine_missing(batch, of_frame, listener)
         # All that are done are summed up; the summary of the shard that ends last stays.
         with in_turn(request.output):
-            known = in_order(lambda f: of_frame[f.name].find(f), found.frames, _READERS)
-            results = [record for record in known if isinstance(record, FrameRecord)]
-            summary = write_summary(request, found, own.settings, results)
+
+            def find(frame: FrameFiles) -> FrameRecord | str:
+                """The record of a frame, or why there is none with its present settings."""
+                return of_frame[frame.name].find(frame)
+
+            entries = in_order(find, batch.frames, _READERS)
+            results = [entry for entry in entries if isinstance(entry, FrameRecord)]
+            summary = write_summary(request, batch, records.settings, results)
             if request.html is not None:
                 from pnpdepth_cli.commands.many_frames.batch_report import write_batch_report
 
@@ -84,45 +79,82 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
             return summary
 
 
+def _refine_missing(
+    batch: BatchFrames, of_frame: Mapping[str, Records], listener: Listener
+) -> None:
+    """Refines the chosen frames that are not done, or not with these settings and files.
+
+    Args:
+        batch: The frames.
+        of_frame: The records that each frame belongs to, by its name.
+        listener: Receives notes and the records of frames, and may stop the batch.
+    """
+
+    def reason(frame: FrameFiles) -> str | None:
+        """Why the frame is to be refined; None if it is done."""
+        return of_frame[frame.name].reason_to_refine(frame)
+
+    reasons = [*in_order(reason, batch.chosen, _READERS)]
+    listener.say(_plan(reasons))
+    to_do = [frame for frame, why in zip(batch.chosen, reasons, strict=True) if why is not None]
+    if not to_do:
+        return
+    from pnpdepth_cli.commands.many_frames.running import refine_all  # imports torch
+
+    listener.begin(len(to_do))
+    # Settings with which a frame was refined work, so that an error is of its frame alone.
+    worked = len(to_do) < len(batch.chosen)
+    # Closed at the end, also of an exception, so that threads and workers stop at once.
+    with closing(refine_all(to_do, batch.frames, of_frame, worked, listener)) as records:
+        _follow(records, listener)
+
+
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
     """Tells the listener of each record, and of the first result how it was made."""
-    told = False
+    is_told = False
     for record in records:
         listener.frame(record)
-        if not told and record.result is not None:
-            told = True
-            for note in (names_of_depths(record.result)[1], *record.notes):
+        if not is_told and record.result is not None:
+            is_told = True
+            _, name_of_result = names_of_depths(record.result)
+            for note in (name_of_result, *record.notes):
                 listener.say(f"{record.name}: {note}")
 
 
-def _notes(request: BatchRequest, found: BatchFrames) -> Iterator[str]:
-    """What a person should know of the frames before they are refined."""
-    frames, unmatched = found.frames, found.unmatched
+def _notes(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
+    """Yields what a person should know of the frames before they are refined, a line each."""
+    # Layout, part and poses.
+    frames = batch.frames
     with_gt = sum(frame.gt is not None for frame in frames)
     guessed = " (guessed; --layout names another)" if request.layout is None else ""
     count = count_of(len(frames), "frame")
-    yield f"layout: {found.layout}{guessed}: {count}, {with_gt:,} with ground truth"
-    cut = sorted({str(frame.part) for frame in frames if frame.part != WHOLE})
+    yield f"layout: {batch.layout}{guessed}: {count}, {with_gt:,} with ground truth"
+    parts = sorted({str(frame.part) for frame in frames if frame.part != WHOLE})
     if request.protocol is not None and (note := find_protocol(request.protocol).note):
         yield f"protocol {request.protocol}: {note}"
-    elif cut and request.protocol is None:
-        yield f"frames: {', '.join(cut)}; --protocol whole keeps all of them"
-    if found.poses is not None:
-        yield found.poses
-    if len(found.chosen) < len(frames):
-        yield f"chosen: {count_of(len(found.chosen), 'frame')} of them"
-    for line in unmatched[:_MAX_LISTED]:
+    elif parts and request.protocol is None:
+        yield f"frames: {', '.join(parts)}; --protocol whole keeps all of them"
+    if batch.poses is not None:
+        yield batch.poses
+    # Frames that are not refined, and files that are in no frame.
+    if len(batch.chosen) < len(frames):
+        yield f"chosen: {count_of(len(batch.chosen), 'frame')} of them"
+    for line in batch.unmatched[:_MAX_LISTED]:
         yield f"warning: {line}"
-    if (more := len(unmatched) - _MAX_LISTED) > 0:
+    if (more := len(batch.unmatched) - _MAX_LISTED) > 0:
         yield f"warning: {more:,} more files are in no frame; summary.json lists them"
 
 
 def _plan(reasons: Sequence[str | None]) -> str:
-    """How many of the frames are done, and why others are to do, given the reason of each."""
-    kinds = Counter(filter(None, reasons))
+    """How many frames are done, and why the others are to do, in a line.
+
+    Args:
+        reasons: Why each frame is to be refined; None for one that is done.
+    """
+    counts = Counter(reason for reason in reasons if reason is not None)
     frames = count_of(len(reasons), "frame")
-    to_do = kinds.total()
+    to_do = counts.total()
     if not to_do:
         return f"{frames}, all of them done already"
-    counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
-    return f"{frames}: {len(reasons) - to_do:,} done already, {to_do:,} to do ({counts})"
+    texts = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+    return f"{frames}: {len(reasons) - to_do:,} done already, {to_do:,} to do ({texts})"

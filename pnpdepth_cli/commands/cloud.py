@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from pnpdepth_cli.io.atomic import make_folder
 from pnpdepth_cli.io.poses import poses_of_frames
 from pnpdepth_cli.io.scans import write_cloud
 from pnpdepth_cli.sensors import point_cloud
+from pnpdepth_cli.sensors.point_cloud import PointCloud
 
 _IN_MEMORY = 12
 """Depth maps of neighbouring views that are kept, with their points."""
@@ -29,7 +30,7 @@ _IN_MEMORY = 12
 def write_depth_cloud(
     request: CloudRequest, show: Callable[[int, int], None] = lambda done, of: None
 ) -> tuple[str, list[str]]:
-    """Writes the cloud; returns what is in it in words, and notes, lines for a person.
+    """Writes the cloud of the depth files; returns what is in it in words, and lines for a person.
 
     Args:
         request: Depth files, camera, poses and limits of the cloud.
@@ -38,7 +39,7 @@ def write_depth_cloud(
     Raises:
         PnpDepthError: An input or output is at fault; then nothing is written.
     """
-    # The frames, with poses where views must agree.
+    # The frames. Either all have a pose or none; views can only agree if they have.
     check_outputs([request.output], overwrite=request.overwrite)
     frames = result_frames(request.depth)
     notes: list[str] = []
@@ -49,28 +50,43 @@ def write_depth_cloud(
             " results, and --poses"
         )
     # The cloud, part by part.
-    coloured = all(request.image or frame.image for frame in frames)
-    placed = [np.eye(3, 4) if pose is None else pose for pose in poses]
-    parts = _parts(request, frames, placed, coloured, notes, show)
+    is_coloured = all(request.image or frame.image for frame in frames)
+    known_poses = [np.eye(3, 4) if pose is None else pose for pose in poses]
+    clouds: Iterable[PointCloud] = _clouds(
+        request, frames, known_poses, is_coloured=is_coloured, notes=notes, show=show
+    )
     make_folder(request.output.parent)
-    merged = parts if request.voxel is None else [point_cloud.merge_in_voxels(parts, request.voxel)]
-    points = write_cloud(request.output, merged)
+    if request.voxel is not None:
+        clouds = [point_cloud.merge_in_voxels(clouds, request.voxel)]
+    points = write_cloud(request.output, clouds)
+    # Why it has no colours: the first image that there is not.
     lost = next((frame.lost_image for frame in frames if not frame.image), "")
-    colours = "coloured" if coloured else f"without colours ({lost})"
+    colours = "coloured" if is_coloured else f"without colours ({lost})"
     return f"{points:,} points, {colours}", notes
 
 
 def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
-    """The pose of each frame: of the file that is given, which adds a note, else of the records."""
+    """The pose of each frame: of the file that is given, else of the records, else estimated.
+
+    None for all frames where nothing tells them.
+
+    Args:
+        request: What is asked of the cloud.
+        frames: The frames.
+        notes: Lines for a person; gets where the poses are from, or that there are none.
+
+    Raises:
+        InputError: The file does not fit the frames, or only some records have a pose.
+    """
     if request.poses is not None:
         names = [frame.name for frame in frames]
-        rows, how = poses_of_frames(request.poses, names, request.pose_kind)
+        poses_of_file, how = poses_of_frames(request.poses, names, request.pose_kind)
         notes.append(f"poses: {request.poses}, {how}")
-        return list(rows)
+        return list(poses_of_file)
     poses = [frame.camera_and_pose[1] for frame in frames]
     if len(frames) > 1 and all(pose is None for pose in poses):
         poses = _estimated_poses(frames, notes)
-    without = [f.depth for f, pose in zip(frames, poses, strict=True) if pose is None]
+    without = [frame.depth for frame, pose in zip(frames, poses, strict=True) if pose is None]
     if without and len(without) < len(frames):
         raise InputError(
             f"{without[0]} has no pose in its record, but others have; give --poses for all, or"
@@ -85,16 +101,26 @@ def _poses(request: CloudRequest, frames: list[ResultFrame], notes: list[str]) -
 
 
 def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose | None]:
-    """The poses that follow from the motions `batch --accumulate` estimated, which adds a note.
+    """The poses that follow from the motions that `batch --accumulate` estimated.
 
     The first frame's camera is the world. None for all frames unless motions tie all together.
+
+    Args:
+        frames: The frames, whose records have motions to their neighbours.
+        notes: Lines for a person; gets where the poses are from.
+
+    Raises:
+        InputError: A record is damaged.
     """
-    # Motions from other frames to each, by the file of their points.
+    # For each frame the frames that a motion ties to it, each with the motion that leads from the
+    # other's coordinates to its own; both directions of each motion. A record names its neighbours
+    # by the file of their points.
     place = {_points_file(frame): index for index, frame in enumerate(frames)}
     ties: list[list[tuple[int, Extrinsics]]] = [[] for _ in frames]
     for here, frame in enumerate(frames):
         result = frame.record.result
-        for neighbour in () if result is None else result.neighbours:
+        neighbours = [] if result is None else result.neighbours
+        for neighbour in neighbours:
             there = place.get(neighbour.path)
             if there is None or neighbour.motion is None:
                 continue
@@ -125,31 +151,46 @@ def _points_file(frame: ResultFrame) -> str:
     return frame.name if source is None else source.path
 
 
-def _parts(
+def _clouds(
     request: CloudRequest,
     frames: list[ResultFrame],
     poses: list[Pose],
-    coloured: bool,
+    *,
+    is_coloured: bool,
     notes: list[str],
     show: Callable[[int, int], None],
-) -> Iterator[point_cloud.PointCloud]:
-    """Yields the clouds of all depth maps in the world. Raises InputError if there is no point."""
+) -> Iterator[PointCloud]:
+    """Yields the points of all depth maps in the world's coordinates, some rows at a time.
+
+    Args:
+        request: What is asked of the cloud.
+        frames: The depth maps.
+        poses: Pose of each.
+        is_coloured: Whether the points get the colours of the images.
+        notes: Lines for a person; gets those on cameras and depth.
+        show: Receives the numbers of frames that are done, and of all.
+
+    Raises:
+        InputError: A file is damaged or lacks what is asked for, or there is no point.
+    """
 
     # A depth map is read once, though several views around it need it.
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def depth_and_camera(index: int) -> tuple[NDArray[np.float32], Camera]:
+        """The depth (H, W) of the frame of this index, 0 where it is not used, and its camera."""
         depth = _depth(request, frames[index], notes)
-        camera, found = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
-        notes.extend(note for note in found if note not in notes)
+        camera, camera_notes = _camera(request, frames[index], (depth.shape[0], depth.shape[1]))
+        notes.extend(note for note in camera_notes if note not in notes)
         return depth, camera
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> point_cloud.View:
+        """The same frame's points (H, W, 3) in its camera's coordinates, its camera and pose."""
         depth, camera = depth_and_camera(index)
         return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
 
     # Pixels on which enough views agree, as coloured points.
-    empty = True
+    is_empty = True
     for index, frame in enumerate(frames):
         show(index, len(frames))
         depth, camera = depth_and_camera(index)
@@ -157,20 +198,31 @@ def _parts(
             near = point_cloud.neighbouring_views(np.stack(poses), index)
             depth = point_cloud.consistent_depth(view(index), map(view, near), request.min_views)
         image = request.image or frame.image
-        rgb = image_of_size(image, depth.shape) if coloured and image is not None else None
+        rgb = image_of_size(image, depth.shape) if is_coloured and image is not None else None
         for cloud in point_cloud.cloud_from_depth(depth, camera, rgb):
-            empty &= not len(cloud.xyz)
+            is_empty &= not len(cloud.xyz)
             yield cloud.transform(poses[index])
-    if empty:
+    if is_empty:
         raise InputError(f"{request.depth}: no pixel is left; relax --max-depth, --max-sigma, …")
 
 
 def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArray[np.float32]:
-    """The depth of a frame (H, W), 0 where it is excluded. What is no depth is told in `notes`."""
+    """The depth of a frame (H, W), 0 where it is unknown, not valid, or excluded by the request.
+
+    Args:
+        request: What is asked of the cloud.
+        frame: The frame.
+        notes: Lines for a person; gets those on values that are no depth.
+
+    Raises:
+        InputError: A file is damaged, or no standard deviation is there and one is needed.
+    """
     depth, keep = frame.read(request.depth_scale)
-    far, lines = far_values(depth[keep], frame.record.unit)
-    keep[keep] = ~far
+    # Extreme values are no depth, such as the one that all pixels of the sky have.
+    is_no_depth, lines = far_values(depth[keep], frame.record.unit)
+    keep[keep] = ~is_no_depth
     notes.extend(f"{frame.depth}: {line}" for line in lines)
+    # The user's limits.
     keep &= depth <= request.max_depth
     if request.max_sigma is not None:
         if frame.sigma is None:
@@ -185,16 +237,25 @@ def _depth(request: CloudRequest, frame: ResultFrame, notes: list[str]) -> NDArr
 def _camera(
     request: CloudRequest, frame: ResultFrame, size: tuple[int, int]
 ) -> tuple[Camera, list[str]]:
-    """The camera that is given, else of the record, else of EXIF; and lines for a person."""
+    """The camera that is given, else of the record, else of EXIF; and lines for a person.
+
+    Args:
+        request: What is asked of the cloud.
+        frame: The frame.
+        size: (H, W) of its depth.
+
+    Raises:
+        InputError: There is no camera, or it is of another size.
+    """
     if request.calib is not None:
         return camera_of_file(request.calib, None, size, frame.depth)
-    of_record, _ = frame.camera_and_pose
-    if of_record is not None:
+    camera, _ = frame.camera_and_pose
+    if camera is not None:
         if frame.size != size:
             raise InputError(
                 f"{frame.depth} is {size[1]}×{size[0]}, unlike its record; refine it again, or give"
                 " --calib"
             )
-        return of_record, [f"camera: {of_record.source} (from the record)"]
+        return camera, [f"camera: {camera.source} (from the record)"]
     lacking = f"{frame.depth} has no camera in a record"
     return camera_of_exif(request.image or frame.image, size, lacking)

@@ -53,17 +53,17 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     names = _shared_frames(runs)
     measures = _shared_measures(runs, columns)
     keys = [measure.key for measure in measures]
-    # Their values (runs, frames, measures); NaN in every run where one run has none.
-    values = np.array([run.rows(names, keys) for run in runs], np.float64)  # None becomes NaN
-    in_all_runs = np.asarray(np.isfinite(values).all(axis=0))
-    values[:, ~in_all_runs] = math.nan
+    # Their scores (runs, frames, measures); NaN in every run where one run has none.
+    scores = np.array([run.rows(names, keys) for run in runs], np.float64)  # None becomes NaN
+    in_all_runs = np.asarray(np.isfinite(scores).all(axis=0))
+    scores[:, ~in_all_runs] = math.nan
     # Sets of frames that count as independent in what is tested: the differences from the first.
     groups = groups_of(names, [runs[0].frames[name].group for name in names])
-    differences = np.concatenate([*(values[1:] - values[0])], axis=1)
+    differences = np.concatenate([*(scores[1:] - scores[0])], axis=1)  # a column a run and measure
     clusters = find_clusters(groups, differences)
     # Mean of each run by measure, and gains of each but the first.
-    means = [_means(of_run.tolist(), keys) for of_run in values]
-    gains = [{}, *_gains(values, means, measures, clusters)]
+    means = [_means(of_run.tolist(), keys) for of_run in scores]
+    gains = [{}, *_gains(scores, means, measures, clusters)]
     are_names_unique = len({run.name for run in runs}) == len(runs)
     compared = [
         ComparedRun(
@@ -116,7 +116,11 @@ def _shared_frames(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tuple[Measure, ...]:
-    """The measures that all runs have: those of these keys, or the main ones for None.
+    """The measures that all runs have, of which some are chosen.
+
+    Args:
+        runs: The runs.
+        columns: Keys of the measures that are wanted, in order. None: the main ones.
 
     Raises:
         UsageError: A key is of none of them.
@@ -128,7 +132,12 @@ def _shared_measures(runs: Sequence[Run], columns: Sequence[str] | None) -> tupl
 
 
 def _means(rows: Rows, keys: Sequence[str]) -> Means:
-    """The mean of each column over the rows that have a value there, by the column's key."""
+    """The mean of each column over the rows that have a value there, by the column's key.
+
+    Args:
+        rows: A row for each frame, with a value for each key; None or NaN for one it lacks.
+        keys: Keys of measures, one a column.
+    """
     return frame_means(dict(zip(keys, row, strict=True)) for row in rows)
 
 
@@ -148,7 +157,7 @@ def _means_before(
 
 
 def _gains(
-    values: NDArray[np.float64],
+    scores: NDArray[np.float64],
     means: Sequence[Means],
     measures: Sequence[Measure],
     clusters: Clusters,
@@ -156,13 +165,13 @@ def _gains(
     """Yields the gains of each run over the first, by the key of the measure; none of the first.
 
     Args:
-        values: (runs, frames, measures), NaN in all runs where one has none.
+        scores: (runs, frames, measures), NaN in all runs where one has none.
         means: Means of each run.
         measures: What the runs are compared by.
         clusters: Sets of the frames that count as independent.
     """
     # p of each run and measure, and the same adjusted for all of these tests.
-    reference, *others = values.transpose(0, 2, 1)  # of each run (measures, frames)
+    reference, *others = scores.transpose(0, 2, 1)  # of each run (measures, frames)
     p_values = np.empty((len(others), len(measures)))
     for run, of_run in enumerate(others):
         for place in range(len(measures)):

@@ -64,8 +64,11 @@ def _devices() -> list[str]:
     """A text for the processor, and for each GPU of CUDA."""
     capability = torch.backends.cpu.get_cpu_capability()
     cpu = f"cpu: {torch.get_num_threads()} threads, {capability}"
-    numbers = range(torch.cuda.device_count())
-    return [cpu, *(f"cuda:{n}: {torch.cuda.get_device_name(n)}" for n in numbers)]
+    gpus = [
+        f"cuda:{number}: {torch.cuda.get_device_name(number)}"
+        for number in range(torch.cuda.device_count())
+    ]
+    return [cpu, *gpus]
 
 
 def _cache() -> str:

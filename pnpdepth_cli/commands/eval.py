@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnpdepth_cli.commands.evaluation.frame_pairs import pair_frames
 from pnpdepth_cli.commands.evaluation.kitti_devkit import devkit_mean
 from pnpdepth_cli.commands.evaluation.scoring import FILES, score_frame, scores_of
 from pnpdepth_cli.commands.requests.eval_request import WITHOUT_SPARSE, EvalRequest
 from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order
-from pnpdepth_cli.commands.shared.results import ResultFrame, result_frames
+from pnpdepth_cli.commands.shared.results import ResultFrame
 from pnpdepth_cli.commands.shared.statistics import MIN_CLUSTERS, Clusters, find_clusters, interval
 from pnpdepth_cli.commands.shared.tables import Table, count_of, some_names
 from pnpdepth_cli.completion.two_depths import Agreement
 from pnpdepth_cli.dataset.agreement import unit_warning
-from pnpdepth_cli.dataset.frame_files import FrameFiles, find_files, groups_of, one_of_each
+from pnpdepth_cli.dataset.frame_files import FrameFiles
 from pnpdepth_cli.dataset.frame_record import FrameRecord
-from pnpdepth_cli.dataset.layouts import LAYOUTS, list_frames
 from pnpdepth_cli.dataset.result_record import versions
-from pnpdepth_cli.errors import InputError, PnpDepthError, UsageError
-from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
-from pnpdepth_cli.io.file_bytes import one_line, plain, read_json
+from pnpdepth_cli.errors import InputError
+from pnpdepth_cli.io.file_bytes import one_line, plain
 from pnpdepth_cli.io.formats import Reading
 from pnpdepth_cli.measures import COVERAGE, OF_SIGMA, Measure, choose_measures, frame_means
 from pnpdepth_cli.points import METRES
-from pnpdepth_cli.protocols import WHOLE, FramePart
 
 _LISTED = 3
 """Frames that are named of those with one kind of note."""
@@ -41,10 +36,6 @@ _COUNTS = ("pixels", "known", COVERAGE.key, "given", "median_ratio", "factor", "
 """What a row of CSV has beside the measures, as `score_frame` gives it."""
 _OPTIONS = {"prediction": "--pred-scale", "gt": "--gt-scale"}
 """The option that states the scale of a file, by the file's name in `FILES`."""
-_MARK = re.compile(r"(?<=.)[_.]depth$", re.DOTALL)
-"""The end of the stem of a depth file, as `refine` and others write it."""
-_KITTI_KIND = re.compile(r"_sync_(image|velodyne_raw|groundtruth_depth)_")
-"""The kind of file, which KITTI's selection names in the middle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +97,15 @@ def evaluate(
         PnpDepthError: For what concerns all frames, or if none could be scored.
     """
     # Every frame is scored, or has a record that says why it is not.
-    pairs, notes = _pair_frames(request.prediction, request.ground_truth, request.rules.part)
+    pairs, notes = pair_frames(request.prediction, request.ground_truth, request.rules.part)
+
+    def score(pair: tuple[FrameFiles, ResultFrame | None]) -> FrameRecord:
+        """The record of a frame with its prediction, if it has one."""
+        files, result = pair
+        return score_frame(files, result, request)
+
     records: list[FrameRecord] = []
-    for record in in_order(lambda pair: score_frame(*pair, request), pairs, THREADS):
+    for record in in_order(score, pairs, THREADS):
         records.append(record)
         on_frame(len(records), len(pairs))
     scored = [record for record in records if record.status == "done"]
@@ -201,180 +198,11 @@ def _intervals(
     if clusters.count < MIN_CLUSTERS:
         return ends
     for measure, column in zip(measures, values.T, strict=True):
-        low, high = interval(lambda mean: mean, [column], clusters)
+        low, high = interval(lambda mean: mean, [column], clusters)  # of the mean itself
         # No error is below 0, and no fraction above 1.
         highest = 1.0 if measure.percent else math.inf
         ends[measure.key] = max(low, 0.0), min(high, highest)
     return ends
-
-
-def _pair_frames(
-    prediction: Path, ground_truth: Path, part: FramePart | None
-) -> tuple[list[tuple[FrameFiles, ResultFrame | None]], list[str]]:
-    """The frames of the ground truth in its order, each with its prediction or None, and notes.
-
-    Args:
-        prediction: A depth file, or a folder of them.
-        ground_truth: A depth file, a folder of them, or a data set of a known layout.
-        part: Part of a data set's frames that is scored. None: the data set's own.
-
-    Raises:
-        InputError: A path is not there, or no name is common to both.
-        UsageError: One is a file and the other a folder.
-    """
-    # Two files, two folders, or a folder and a data set.
-    for path in (prediction, ground_truth):
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder; check the path")
-    layout, frames = _data_set(prediction, ground_truth)
-    are_many_true = layout is not None or ground_truth.is_dir()
-    if prediction.is_dir() != are_many_true:
-        raise UsageError(
-            "give two files, two folders, or a folder and a data set, not"
-            f" {prediction} and {ground_truth}"
-        )
-    # The predictions by name, and the frames with ground truth.
-    notes = list[str]()
-    predictions = _depth_files(prediction)
-    if layout is not None:
-        frames, note = _frames_with_truth(ground_truth, layout, frames, part)
-        notes.append(note)
-    elif ground_truth.is_dir():
-        frames = [FrameFiles(name=name, gt=gt) for name, gt in _depth_files(ground_truth).items()]
-    else:
-        frames = [FrameFiles(name=name, gt=ground_truth) for name in predictions]
-    # At least one name must be common to both.
-    names = [frame.name for frame in frames]
-    notes += _notes_on_names(predictions, names)
-    groups = groups_of(names, [frame.group for frame in frames])
-    pairs = [
-        _pair(replace(frame, group=group), predictions.get(frame.name))
-        for frame, group in zip(frames, groups, strict=True)
-    ]
-    return pairs, notes
-
-
-def _frames_with_truth(
-    folder: Path, layout: str, frames: Sequence[FrameFiles], part: FramePart | None
-) -> tuple[list[FrameFiles], str]:
-    """The frames of a data set that have ground truth, in the part that is scored, and a line.
-
-    Args:
-        folder: The data set.
-        layout: Name of its layout.
-        frames: Its frames.
-        part: Part of each frame that is scored. None: its own.
-
-    Raises:
-        InputError: No frame has ground truth.
-    """
-    with_truth = [
-        replace(frame, part=part or frame.part) for frame in frames if frame.gt is not None
-    ]
-    if not with_truth:
-        raise InputError(f"{folder} looks like {layout!r}, without ground truth; give its folder")
-    parts = ", ".join(sorted({str(frame.part) for frame in with_truth if frame.part != WHOLE}))
-    note = f"gt: layout {layout}; frames with ground truth: {len(with_truth):,}"
-    if parts:
-        note += f", of which {parts} is used"
-    return with_truth, note
-
-
-def _notes_on_names(predictions: Mapping[str, Path], names: Sequence[str]) -> list[str]:
-    """A warning if predictions have no ground truth of their name.
-
-    Args:
-        predictions: Depth files by the name of their frame.
-        names: Names of the frames with ground truth.
-
-    Raises:
-        InputError: None has.
-    """
-    extra = sorted(predictions.keys() - {*names})
-    if len(extra) == len(predictions):
-        raise InputError(
-            "no prediction has the name of a ground truth file: predictions are"
-            f" {some_names(predictions)}; ground truth is {some_names(sorted(names))}; name both"
-            " alike"
-        )
-    if not extra:
-        return []
-    return [
-        f"warning: {len(extra):,} of {len(predictions):,} predictions have no ground truth and"
-        f" are not scored: {some_names(extra)}"
-    ]
-
-
-def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
-    """The layout and the frames of a data set; None and no frames for another folder.
-
-    Args:
-        prediction: The predictions, which a batch may have refined from the data set.
-        folder: What may be a data set.
-    """
-    # As the batch read it, whose summary lies beside the predictions; else recognised anew.
-    summary = prediction / "summary.json"
-    layout_of_batch = read_json(summary).get("layout") if summary.is_file() else None
-    layouts = [layout_of_batch, None] if layout_of_batch in LAYOUTS else [None]
-    for layout in layouts:
-        # What is no data set may still be a folder of depth files.
-        with contextlib.suppress(InputError, OSError):
-            listed = list_frames(folder, layout)
-            return listed.layout, listed.frames
-    return None, []
-
-
-def _pair(files: FrameFiles, prediction: Path | None) -> tuple[FrameFiles, ResultFrame | None]:
-    """The frame and its prediction, with what the prediction's record says of the frame's files.
-
-    That is the sparse depth and the image that were used. A prediction whose record is damaged is
-    scored as one without a record.
-
-    Args:
-        files: The files of the frame.
-        prediction: The depth file. None: there is none, which is returned.
-    """
-    if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
-        files = replace(files, sparse=None)  # a scan, whose pixels are not known without a camera
-    if prediction is None:
-        return files, None
-    try:
-        (result,) = result_frames(prediction)
-    except PnpDepthError:
-        return files, ResultFrame(name=files.name, depth=prediction)
-    sparse = result.record.inputs.get("sparse")
-    if sparse is not None and sparse.kind == "depth":
-        path = Path(sparse.path)
-        files = replace(files, sparse=path if path.is_file() else files.sparse)
-    return replace(files, image=result.image or files.image), result
-
-
-def _frame_name(stem: str) -> str:
-    """The frame of a file with this stem: without `_depth` and KITTI's file kind."""
-    return _MARK.sub("", _KITTI_KIND.sub("_sync_", stem))
-
-
-def _depth_files(path: Path) -> dict[str, Path]:
-    """The depth files of a folder by their frame, sorted, or the one that the path is.
-
-    In a folder with files `x_depth`, all others are no depth.
-
-    Raises:
-        InputError: There is none, two are of one frame, or a folder inside cannot be read.
-    """
-    if not path.is_dir():
-        return {_frame_name(path.stem): path}
-    by_stem, problems = find_files(path, DEPTH_SUFFIXES)
-    marked = {stem: file for stem, file in by_stem.items() if _MARK.search(stem)}
-    files, ambiguous = one_of_each(
-        (_frame_name(stem), file) for stem, file in (marked or by_stem).items()
-    )
-    if lost := [*problems, *ambiguous]:
-        file, why = lost[0]
-        raise InputError(f"{file} {why}")
-    if not files:
-        raise InputError(f"{path} holds no depth file ({' '.join(DEPTH_SUFFIXES)}); check the path")
-    return dict(sorted(files.items()))
 
 
 def _readings(records: Sequence[FrameRecord], side: str) -> list[tuple[Reading, int]]:
@@ -430,18 +258,18 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
 
 def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
     """Yields lines on pixels without prediction or given to the network, and on scales."""
-    known = sum(_numbers(scored, "known"))
-    empty = known - sum(_numbers(scored, "predicted"))
+    with_truth = sum(_numbers(scored, "known"))
+    empty = with_truth - sum(_numbers(scored, "predicted"))
     if empty:
         yield (
-            f"warning: {count_of(empty, 'pixel')} ({empty / known:.2%}) of the ground truth without"
-            " prediction"
+            f"warning: {count_of(empty, 'pixel')} ({empty / with_truth:.2%}) of the ground truth"
+            " without prediction"
         )
-    given = sum(_numbers(scored, "given"))
-    if given and not request.rules.exclude_sparse:
+    with_point = sum(_numbers(scored, "given"))
+    if with_point and not request.rules.exclude_sparse:
         yield (
-            f"{given:,} of the scored pixels have a point of the sparse input; --exclude-sparse"
-            " leaves them out"
+            f"{with_point:,} of the scored pixels have a point of the sparse input;"
+            " --exclude-sparse leaves them out"
         )
     # How predictions were scaled, or that they should be.
     not_in_metres = [record.unit for record in scored if record.unit != METRES]
@@ -540,6 +368,7 @@ def frames_table(evaluation: Evaluation) -> Table:
         row += [scores.get(measure.key) for measure in evaluation.shown]
         row.append(frame.message)
         rows.append(row)
+    # Keys are headings, too; but coverage is a measure, whose heading a table knows.
     counts = [COVERAGE if key == COVERAGE.key else key for key in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)

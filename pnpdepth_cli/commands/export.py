@@ -71,11 +71,16 @@ def export_results(
     for folder in {path.parent for path in written}:
         make_folder(folder)
     numbers = itertools.count(1)
+
+    def on_frame() -> None:
+        """Shows that one more frame is written."""
+        show(next(numbers), len(frames))
+
     show(0, len(frames))
     with all_or_none(written):
         for frame in copied:
             frame.copy_image()
-        notes = export.write(output, frames, lambda: show(next(numbers), len(frames)))
+        notes = export.write(output, frames, on_frame)
     # In which unit, as the files themselves do not say it.
     unit = frames[0].result.record.unit
     if export.in_model_units and frames[0].unit_scale != 1:

@@ -26,7 +26,7 @@ def list_models() -> list[dict[str, object]]:
 
 
 def _describe(definition: ModelDefinition) -> dict[str, object]:
-    """The entry of a network, in JSON's own types.
+    """The entry of a network: texts and numbers by name, as JSON can hold them.
 
     Raises:
         ModelError: The network cannot be built.

@@ -76,9 +76,12 @@ class Comparison:
 
     def to_json(self) -> dict[str, object]:
         """Returns what `compare --json` prints; NaN and infinity are None."""
-        measures = [measure.to_json() for measure in self.measures]
-        own = {"clusters": self.clusters.to_json(), "measures": measures}
-        return {"command": "compare", **plain(vars(self) | own)}
+        # Fields that say themselves what JSON has of them; all others are plain values.
+        converted = {
+            "clusters": self.clusters.to_json(),
+            "measures": [measure.to_json() for measure in self.measures],
+        }
+        return {"command": "compare", **plain(vars(self) | converted)}
 
 
 def numbers_of(values: Iterable[str]) -> dict[str, float] | None:

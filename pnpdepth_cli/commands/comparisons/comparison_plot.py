@@ -90,7 +90,15 @@ def plot_comparison(comparison: Comparison, path: Path, *, overwrite: bool = Fal
 def _plot_measure(
     measure: Measure, lines: Mapping[str, Line], axis: _Axis, above: Axes, below: Axes
 ) -> None:
-    """Draws a measure before and after refinement into the panel above, the improvement below."""
+    """Draws a measure before and after refinement into the panel above, the improvement below.
+
+    Args:
+        measure: What is drawn.
+        lines: The lines by their label, which is empty where there is only one.
+        axis: The option along the axis.
+        above: Panel of the measure.
+        below: Panel of the improvement.
+    """
     for number, (label, line) in enumerate(lines.items()):
         colour = f"C{number}"  # matplotlib's name of the n-th colour of its cycle
         before, after = _means_along(line, measure)
@@ -107,7 +115,10 @@ def _plot_measure(
 
 
 def _means_along(line: Line, measure: Measure) -> NDArray[np.float64]:
-    """(2, points) the means before and after refinement, in the unit of tables; NaN if unknown."""
+    """(2, points) the means before, then after refinement, of each point along a line.
+
+    They are in the unit of tables, and NaN where a run lacks the measure.
+    """
     means = []
     for runs in line.values():
         pairs = [[run.before[measure.key], run.mean[measure.key]] for run in runs]
@@ -129,8 +140,9 @@ def _choose_axis(runs: Sequence[ComparedRun]) -> _Axis:
     candidates = [option for option in shared if option != _SEED] or [_SEED]
 
     def preference(option: str) -> tuple[bool, int]:
-        values = {run.varied[option] for run in runs}
-        return numbers_of(values) is not None, len(values)
+        """Whether all values of the option are numbers, and how many values there are."""
+        texts = {run.varied[option] for run in runs}
+        return numbers_of(texts) is not None, len(texts)
 
     along = max(candidates, key=preference)
     return _Axis(along, positions_of(run.varied[along] for run in runs))
@@ -138,22 +150,30 @@ def _choose_axis(runs: Sequence[ComparedRun]) -> _Axis:
 
 def _lines(runs: Sequence[ComparedRun], axis: _Axis) -> dict[str, Line]:
     """The lines of a plot by their label: one for each combination of the other options."""
+
+    def position(run: ComparedRun) -> float:
+        """Where the run lies on the axis."""
+        return axis.positions[run.varied[axis.option]]
+
     combinations = [*dict.fromkeys(_other_values(run, axis) for run in runs)]
     # A run without an option, as it has no effect there, makes no line of its own but is a point
     # of each line that has its other values.
     most = max(map(len, combinations))
     complete = [combination for combination in combinations if len(combination) == most]
     lines = defaultdict[str, Line](dict)
-    for run in sorted(runs, key=lambda run: axis.positions[run.varied[axis.option]]):
-        position = axis.positions[run.varied[axis.option]]
+    for run in sorted(runs, key=position):
         for combination in complete:
             if {*_other_values(run, axis)} <= {*combination}:
-                lines[", ".join(combination)].setdefault(position, []).append(run)
+                line = lines[", ".join(combination)]
+                line.setdefault(position(run), []).append(run)
     return lines
 
 
 def _other_values(run: ComparedRun, axis: _Axis) -> tuple[str, ...]:
-    """The values that tell the run's line from others, such as `loss=l1`."""
+    """The run's values of all options but that of the axis and the seed, such as `loss=l1`.
+
+    Runs of one line have the same.
+    """
     return tuple(
         f"{option}={value}"
         for option, value in run.varied.items()

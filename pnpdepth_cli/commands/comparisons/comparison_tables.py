@@ -18,12 +18,13 @@ _GAIN_COLUMNS = [declared.name for declared in fields(Gain)]
 
 def comparison_table(comparison: Comparison) -> Table:
     """Returns a row for each measure and run; all runs but the first have gain and p."""
+    # The rows; a significant gain has a colour, and the first run, which has no gains, none.
     rows: list[list[object]] = []
     for measure in comparison.measures:
         for run in comparison.runs:
             row = [measure.heading, run.name, measure.text(run.mean[measure.key])]
             if not run.gains:
-                rows.append([*row, *[_NOTHING] * 4])
+                rows.append([*row, _NOTHING, _NOTHING, _NOTHING, _NOTHING])
                 continue
             gain = run.gains[measure.key]
             style: Style = "dim"
@@ -38,6 +39,7 @@ def comparison_table(comparison: Comparison) -> Table:
                     _number_text(gain.p_adjusted, ".4f"),
                 ]
             )
+    # What the numbers are of, and how they were tested.
     frames = count_of(len(comparison.frames), "shared frame")
     gains = f"gains in per cent of the error of {comparison.reference.name}, positive is better"
     tests = f"intervals (95 %) and p-values {_tests_text(comparison)}"

@@ -74,15 +74,15 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
         log_squares = _sum(log_error**2) / count
         log_total = _sum(log_error)
         values = (
-            _sum(error) / count,
-            np.sqrt(_sum(error * error) / count),
-            _sum(inverse_error) / count,
-            np.sqrt(_sum(inverse_error**2) / count),
-            _sum(np.abs(log_error)) / count,
-            np.sqrt(log_squares),
-            np.sqrt(log_squares - log_total * log_total / (count * count)),
-            _sum(error / truth) / count,
-            _sum(error * error / (truth * truth)) / count,
+            _sum(error) / count,  # MAE
+            np.sqrt(_sum(error * error) / count),  # RMSE
+            _sum(inverse_error) / count,  # inverse MAE
+            np.sqrt(_sum(inverse_error**2) / count),  # inverse RMSE
+            _sum(np.abs(log_error)) / count,  # log MAE
+            np.sqrt(log_squares),  # log RMSE
+            np.sqrt(log_squares - log_total * log_total / (count * count)),  # scale invariant log
+            _sum(error / truth) / count,  # abs relative
+            _sum(error * error / (truth * truth)) / count,  # squared relative
         )
     return {m.key: float(value) for m, value in zip(DEVKIT_MEASURES, values, strict=True)}
 

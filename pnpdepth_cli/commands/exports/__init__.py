@@ -81,19 +81,22 @@ class ExportFrame:
         return self.pose
 
     def start_points(self, frames: int) -> PointCloud:
-        """Returns the frame's share of the points to begin with, in the world's coordinates.
+        """Returns as many points of the depth as this frame gives a splatting program to start.
+
+        They are coloured, and in the world's coordinates, in the unit of the result.
 
         Args:
-            frames: Number of frames, of which each has an equal share of `_START_POINTS`.
+            frames: Number of frames, each of which gives an equal part of `_START_POINTS`.
 
         Raises:
             InputError: The pose is unknown.
         """
         rgb = image_of_size(self.image, self.size)
         clouds = list(cloud_from_depth(self.valid_depth(), self.camera, rgb))
-        # Every n-th point of all, as many as the share.
+        # Every n-th point of the frame. The clouds are joined field by field: all xyz, all normals,
+        # all colours.
         step = max(1, sum(len(cloud.xyz) for cloud in clouds) * frames // _START_POINTS)
-        fields = (np.concatenate(field)[::step] for field in zip(*clouds, strict=True))
+        fields = [np.concatenate(parts)[::step] for parts in zip(*clouds, strict=True)]
         return PointCloud(*fields).transform(self.known_pose())
 
 

@@ -36,7 +36,13 @@ def _image_list(folder: Path) -> Path:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes the depth and normal maps, in units of the model; see `Export.write`."""
+    """Writes the depth and normal maps, in units of the model; returns lines for a person.
+
+    Args:
+        folder: Output folder, in which the folders of the files are.
+        frames: The frames.
+        done: Callback after each frame.
+    """
     for frame in frames:
         depth = frame.valid_depth()
         _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera))

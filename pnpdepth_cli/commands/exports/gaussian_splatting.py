@@ -62,13 +62,23 @@ def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
 
     It can be made if all poses are known and no image is distorted, as 3DGS has no lenses.
     """
-    can_be_made = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
+    if not all(frame.pose is not None and not frame.camera.has_lens for frame in frames):
+        return False
     present = model_files(_model(folder))
-    return can_be_made and (not present or present[0].read_bytes().startswith(_OURS))
+    return not present or present[0].read_bytes().startswith(_OURS)
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes inverse depth, its scale, and a model if it needs one; see `Export.write`."""
+    """Writes inverse depth, its scale, and a model if it needs one; returns lines for a person.
+
+    Args:
+        folder: Output folder, in which the folders of the files are.
+        frames: The frames.
+        done: Callback after each frame.
+
+    Raises:
+        InputError: No frame has known depth.
+    """
     # One scale for the inverse depth of all frames.
     scale = max(np.percentile(_inverse(frame)[0], _NEAREST_PERCENTILE) for frame in frames)
     if scale == 0:

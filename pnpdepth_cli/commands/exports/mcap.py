@@ -62,10 +62,20 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes the bag, its frames in the order of their times; see `Export.write`."""
+    """Writes the bag, its frames in the order of their times; returns lines for a person.
+
+    Args:
+        folder: Output folder, which is there.
+        frames: The frames.
+        done: Callback after each frame.
+
+    Raises:
+        PnpDepthError: An image is damaged, ROS has no model of a lens, or rosbags is not there.
+    """
     times_ns, notes = _times(frames)
 
     def outgoing() -> Iterator[OutgoingMessage]:
+        """Yields the messages of all frames; a frame is read when its turn comes."""
         for place in np.argsort(times_ns, kind="stable"):
             yield from _messages(frames[place], times_ns[place], notes)
             done()
@@ -190,6 +200,7 @@ def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
 
 def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
     """The fields of an Image of pixels (H, W) or (H, W, C), little-endian, rows without padding."""
+    # (H, bytes of a row)
     rows = np.ascontiguousarray(pixels.reshape(len(pixels), -1))
     data = rows.astype(rows.dtype.newbyteorder("<"), copy=False).view(np.uint8)
     return {
@@ -265,7 +276,10 @@ def _options_of_points(sparse: FileRecord) -> ReadOptions:
         keep_occluded=sparse.keep_occluded,
     )
     return ReadOptions(
-        unit_scale=sparse.unit_scale, registration="off", scan=scan, sample=sparse.sampled
+        unit_scale=sparse.unit_scale,
+        registration="off",  # it moves the image, not the points
+        scan=scan,
+        sample=sparse.sampled,
     )
 
 

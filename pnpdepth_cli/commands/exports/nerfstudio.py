@@ -46,7 +46,16 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes depth, start points, cameras and poses; see `Export.write`."""
+    """Writes depth, start points, cameras and poses; returns lines for a person.
+
+    Args:
+        folder: Output folder, in which the folders of the files are.
+        frames: The frames, whose poses are known.
+        done: Callback after each frame.
+
+    Raises:
+        InputError: The program cannot take the lenses or the depths.
+    """
     # The program takes lenses of one kind.
     lenses = sorted({frame.camera.lens for frame in frames})
     if len(lenses) > 1:

@@ -42,33 +42,45 @@ def with_adapted_weights(
         KeyboardInterrupt: The listener stops the batch.
     """
     request = own.request
-    result = dict[str, Records]()
+    of_frame = dict[str, Records]()
     for sequence, indices in sequences_of(frames).items():
         # A sequence is learnt from once, and its weights lie in a file of its name.
         name = quote(sequence, safe="") or "frames"
         weights = request.output / "adapted" / f"{name}.safetensors"
-        named = f"{sequence}: " if sequence else ""
-        spread = np.linspace(0, len(indices) - 1, min(len(indices), MOST_FRAMES)).round()
-        lessons = [request_of(request, frames[indices[int(number)]]) for number in spread]
+        count = min(len(indices), MOST_FRAMES)
+        places = np.linspace(0, len(indices) - 1, count).round().astype(int)
+        lessons = [request_of(request, frames[indices[place]]) for place in places]
+        # A sequence that cannot be learnt from is refined with the network's own weights.
         try:
-            why = _learn_once(own, lessons, weights, listener)
+            why_not = _learn_once(own, lessons, weights, listener)
         except (InputError, DivergedError) as error:
-            why = str(error)
-        if why is None:
-            listener.say(f"adapt: {named}{len(indices):,} frames are refined with {weights}")
+            why_not = str(error)
+        beginning = f"adapt: {sequence}: " if sequence else "adapt: "
+        if why_not is None:
+            listener.say(f"{beginning}{len(indices):,} frames are refined with {weights}")
             refine = replace(request.refine, checkpoint=weights)
             records = Records(replace(request, refine=refine))
         else:
-            listener.say(f"adapt: {named}the network's own weights are used: {why}")
+            listener.say(f"{beginning}the network's own weights are used: {why_not}")
             records = own
-        result |= dict.fromkeys([frames[index].name for index in indices], records)
-    return result
+        of_frame |= dict.fromkeys([frames[index].name for index in indices], records)
+    return of_frame
 
 
 def _learn_once(
     own: Records, lessons: Sequence[RefineRequest], weights: Path, listener: Listener
 ) -> str | None:
-    """Writes adapted weights unless these are there; returns why they are not used."""
+    """Writes adapted weights unless they are there; returns why not to use them, None if they help.
+
+    Args:
+        own: The records of the batch, with the network's own weights.
+        lessons: The frames to learn from, and how each is refined.
+        weights: File of the adapted weights; beside it lies a record of what was decided.
+        listener: Receives what was learnt, and may stop the batch.
+
+    Raises:
+        As `_learn`.
+    """
     # They are there if they were learnt with these settings, from these files.
     files = [
         {name: fingerprint(path).sha256 for name, path in input_files(lesson)} for lesson in lessons
@@ -77,7 +89,8 @@ def _learn_once(
     digest = hashlib.sha256(text.encode()).hexdigest()
     file = weights.with_suffix(".json")
     record: dict[str, str | None] = read_json(file) if file.exists() else {}
-    if record.get("digest") != digest or not (record.get("why") or weights.exists()):
+    is_decided = bool(record.get("why")) or weights.exists()
+    if record.get("digest") != digest or not is_decided:
         record = {"digest": digest, "why": _learn(lessons, weights, listener)}
         make_folder(file.parent)
         write_json(file, record)
@@ -85,7 +98,19 @@ def _learn_once(
 
 
 def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> str | None:
-    """Writes adapted weights if they are better beyond chance; returns why they are not."""
+    """Writes adapted weights if they are better beyond chance; returns why not, None if written.
+
+    Args:
+        lessons: The frames to learn from, and how each is refined.
+        path: File of the weights.
+        listener: Receives what was learnt, and may stop the batch.
+
+    Raises:
+        UsageError: The network takes no points.
+        InputError: A frame cannot be read.
+        DivergedError: The weights diverged.
+        KeyboardInterrupt: The listener stops the batch.
+    """
     from safetensors.torch import save_file  # these import torch
 
     from pnpdepth_cli.commands.refinement.requested import read_requested
@@ -98,15 +123,16 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
             raise KeyboardInterrupt
 
     # The network learns from the frames, if they are enough.
-    asked = lessons[0]
-    first = read_requested(asked)
-    if why := reason_not_to_learn(len(lessons), first):
-        return why
-    network = load_network(asked.model, asked.checkpoint, asked.device)
+    request = lessons[0]  # all are refined alike
+    first = read_requested(request)
+    if why_not := reason_not_to_learn(len(lessons), first):
+        return why_not
+    network = load_network(request.model, request.checkpoint, request.device)
     network = resolve_definition(network, first.registered())
     frames = ((lesson.files.name, read_requested(lesson)) for lesson in lessons)
     try:
-        learnt = learn(network, frames, seed=asked.method.seed, on_step=check)
+        learnt = learn(network, frames, seed=request.method.seed, on_step=check)
+    # The Python API's error does not know of the options.
     except UsageError as error:
         raise UsageError(
             "--adapt needs a network that takes points, such as compact, as the first --model"
@@ -114,9 +140,11 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
     if not learnt.is_better:
         return str(learnt)
     listener.say(f"adapt: {learnt}")
-    # All its tensors are written, those that learnt among them.
+    # All its tensors are written, those that learnt among them; each as memory of its own, which
+    # safetensors asks for.
     make_folder(path.parent)
     with weights_in_place(network, learnt.weights), atomic_path(path) as file:
-        state = network.module.state_dict().items()
-        save_file({name: value.cpu().clone().contiguous() for name, value in state}, file)
+        state = network.module.state_dict()
+        tensors = {name: tensor.cpu().clone().contiguous() for name, tensor in state.items()}
+        save_file(tensors, file)
     return None

@@ -46,6 +46,9 @@ _LABELS = {
 }
 """Titles of the panels of a figure, by the view of the page."""
 _CHANGE = "change"
+"""End of the keys of changes, which are fractions of the error before."""
+_KEY_LENGTH = 20
+"""Hexadecimal digits of a frame's key: 80 bits, so that no two frames have one."""
 _SETTINGS = (
     "model",
     "layer",
@@ -65,7 +68,7 @@ def check_batch_report(request: BatchRequest, folder: Path) -> None:
     """Raises OutputError for a folder that the report cannot or may not be written to.
 
     Args:
-        request: Request of the batch.
+        request: Request of the batch, whose results must not lie in the folder.
         folder: Folder of the report.
     """
     if Path(os.path.realpath(request.output)).is_relative_to(os.path.realpath(folder)):
@@ -87,7 +90,7 @@ def write_batch_report(
         summary: The batch's summary.
         records: The records of the frames.
     """
-    # What is measured, and on what.
+    # What is measured, and on which pixels or points.
     results = [(frame, frame.result) for frame in records if frame.result is not None]
     basis = next(iter(bases_of(summary.errors)), USED)
     columns = _columns(basis, summary.unit)
@@ -116,6 +119,7 @@ def write_batch_report(
 
     # A frame a time, so that memory does not grow with their number.
     def entries(images: Path) -> Iterator[dict[str, object]]:
+        """Yields the page's entry of each frame, whose images are linked in the folder."""
         for frame, result in results:
             views = _views(frame.name, result, request, images)
             yield _entry(frame, basis, columns) | views
@@ -125,20 +129,32 @@ def write_batch_report(
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
-    """What the report is made of."""
+    """What the report is made of, by which it is known later: the batch, seen from the folder."""
     output = os.path.relpath(os.path.realpath(request.output), os.path.realpath(folder))
     return {"command": "batch", "output": output}
 
 
 def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[str, object]:
-    """A frame's values on the basis of all frames; where it has none, what it has instead."""
-    own = basis if basis in record.errors else next(iter(bases_of(record.errors)), "")
-    values = _values(record.errors[basis]) if own == basis else {}
-    tag = BASES[own] if own not in ("", basis) else ""
+    """The page's entry of a frame: its values in these columns, its notes and its tag.
+
+    Args:
+        record: Record of a frame with a result.
+        basis: What the errors of all frames are shown on, a key of `measures.BASES`. A frame
+            without such errors has no values; a tag and a note say what it has instead.
+        columns: Columns of the table, of `_columns`.
+    """
+    values = dict[str, float | None]()
+    tag = ""
+    basis_of_frame = basis
+    if basis in record.errors:
+        values = _values(record.errors[basis])
+    else:
+        basis_of_frame = next(iter(bases_of(record.errors)), "")
+        tag = BASES.get(basis_of_frame, "")
     return {
         "name": record.name,
         "values": [values.get(measure.key) for measure in columns],
-        "notes": _notes(record, own),
+        "notes": _notes(record, basis_of_frame),
         "tag": "diverged" if record.status == "diverged" else tag,
     }
 
@@ -146,14 +162,25 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
 def _views(
     name: str, result: ResultRecord, request: BatchRequest, images: Path
 ) -> dict[str, object]:
-    """Links the images of a frame, unless they were deleted; returns the page's entry of them."""
+    """Links the images of a frame; returns the page's entry of them.
+
+    The entry says where each view of the page lies in which image. Its "key" is None if an image
+    was deleted, and then nothing is linked.
+
+    Args:
+        name: Name of the frame.
+        result: The frame's result, which names its images.
+        request: The batch, below whose output they lie.
+        images: Folder for images of the report.
+    """
     files = {kind: request.output / path for kind, path in result.outputs.items()}
     figures = result.figures
-    there = all(kind in files and files[kind].exists() for kind in figures)
-    if "preview" not in figures or not there:
+    are_all_there = all(kind in files and files[kind].exists() for kind in figures)
+    if "preview" not in figures or not are_all_there:
         return {"key": None}
     # The start of its images' names: fit for a file, and of this frame alone.
-    key = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:20]
+    digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()
+    key = digest[:_KEY_LENGTH]
     # The PNGs, and where each view of the page lies in them.
     views = dict[str, object]()
     for kind, figure in figures.items():
@@ -170,16 +197,30 @@ def _views(
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = report.save_view_3d(files["view"], images / f"{key}_view.js")
-    gains = figures.get("improvement")
-    of_gains = gains and {"ends": gains.ends, "unknown": gains.unknown, "footer": gains.footer}
+    improvement = figures.get("improvement")
+    map_entry = None
+    if improvement is not None:
+        map_entry = {
+            "ends": improvement.ends,
+            "unknown": improvement.unknown,
+            "footer": improvement.footer,
+        }
     scale_m = figures["preview"].scale_m
-    return {"key": key, "views": views, "view_mb": view_mb, "scale_m": scale_m, "map": of_gains}
+    return {"key": key, "views": views, "view_mb": view_mb, "scale_m": scale_m, "map": map_entry}
 
 
 def _columns(basis: str, unit: str) -> list[Measure]:
-    """Errors before and after on a basis; with changes unless it is the points used."""
+    """The columns of the page's table: errors before and after, and their changes.
+
+    A change at the points that were used means nothing, so there is none on that basis.
+
+    Args:
+        basis: What the errors are measured on, a key of `measures.BASES`.
+        unit: Unit of the depths.
+    """
+    keys = ("mae",) if basis == VALIDATION else ("rmse", "mae")  # what each basis has
     columns = []
-    for measure in choose_measures(MEASURES, ("mae",) if basis == VALIDATION else ("rmse", "mae")):
+    for measure in choose_measures(MEASURES, keys):
         change, before, after = (
             replace(
                 measure, key=f"{measure.key}_{column}", title=f"{measure.title} {column}", unit=unit
@@ -193,15 +234,27 @@ def _columns(basis: str, unit: str) -> list[Measure]:
 
 
 def _values(stages: dict[str, Scores]) -> dict[str, float | None]:
+    """The values of all columns that `_columns` may have, by key; None for what is unknown.
+
+    Args:
+        stages: Errors before and after, by stage.
+    """
     values = dict[str, float | None]()
     for key in ("rmse", "mae"):
-        before, after = (stages[stage].get(key) for stage in (BEFORE, AFTER))
+        before = stages[BEFORE].get(key)
+        after = stages[AFTER].get(key)
         change = after / before - 1 if before and after is not None else None
-        values |= {f"{key}_before": before, f"{key}_after": after, f"{key}_{_CHANGE}": change}
+        values |= {f"{key}_{BEFORE}": before, f"{key}_{AFTER}": after, f"{key}_{_CHANGE}": change}
     return values
 
 
 def _notes(record: FrameRecord, basis: str) -> list[str]:
+    """What the page says below a frame: why it diverged, what its errors are of, and warnings.
+
+    Args:
+        record: Record of the frame.
+        basis: What its errors are measured on, a key of `measures.BASES`; empty if it has none.
+    """
     notes = [record.message] if record.message else []
     if basis:
         after = record.errors[basis][AFTER]
@@ -215,25 +268,26 @@ def _notes(record: FrameRecord, basis: str) -> list[str]:
 
 
 def _facts(summary: BatchSummary, of_first: Mapping[str, object]) -> list[tuple[str, str]]:
-    """What was refined, and how: the settings that decide the results, by their options.
+    """What was refined, and how: names and texts, such as the settings that decide the results.
 
     Args:
         summary: The batch's summary.
         of_first: The settings of the first result, with nothing left open.
     """
     counts = summary.counts
-    settings = {**summary.settings, **of_first}
     frames = [
-        f"{counts[kind]:,} {kind.replace('_', ' ')}"
-        for kind in ("done", "diverged", "failed", "pending", "with_warnings")
-        if counts[kind]
+        f"{counts[status]:,} {status.replace('_', ' ')}"
+        for status in ("done", "diverged", "failed", "pending", "with_warnings")
+        if counts[status]
     ]
-    weights = summary.weights
-    return [
+    facts = [
         ("frames of", f"{summary.source} (layout {summary.layout})"),
         ("frames", ", ".join(frames)),
         ("results in", summary.output),
         ("method", summary.method),
-        *([("mean weights", mean_weights_text(weights))] if weights else []),
-        *((name, str(settings[name])) for name in _SETTINGS if settings.get(name)),
     ]
+    if summary.weights:
+        facts.append(("mean weights", mean_weights_text(summary.weights)))
+    settings = {**summary.settings, **of_first}
+    facts += [(name, str(settings[name])) for name in _SETTINGS if settings.get(name)]
+    return facts

@@ -32,8 +32,11 @@ from pnpdepth_cli.protocols import find_protocol
 
 CSV = "summary.csv"
 JSON = "summary.json"
+_PREDICTED_SUFFIXES = (*DEPTH_SUFFIXES, *frame_files.IMAGE_SUFFIXES, ".bin")
+"""Suffixes of depth maps of networks: formats of depth, images, and COLMAP's dense maps."""
 _SEARCHED = 3
-"""Frames of a sequence of which it is searched how image and points belong together."""
+"""Frames at the start of a sequence for which it is searched how image and points belong together;
+the others are of the same sensors."""
 ESTIMATED = "estimated from the images"
 """Where the motion of frames without poses is from."""
 
@@ -43,17 +46,19 @@ class BatchFrames:
     """The frames of a batch."""
 
     layout: str
+    """Name of the layout of the source."""
     frames: Sequence[FrameFiles]
     """All frames of the source."""
     chosen: Sequence[FrameFiles]
     """Frames of these that the names, the limit and the shard choose."""
     unmatched: Sequence[str]
+    """Files that are in no frame, and why, a line each."""
     poses: str | None
     """Where the poses of the frames are from, as a line; None without poses."""
 
 
 def find_frames(request: BatchRequest) -> BatchFrames:
-    """Returns the frames of the source.
+    """Returns the frames of the source, and those of them that this run refines.
 
     Raises:
         InputError: If there is none, or a result would have no files of its own.
@@ -73,18 +78,18 @@ def find_frames(request: BatchRequest) -> BatchFrames:
     for sequence in sequences_of(frames).values():
         for index in sequence[_SEARCHED:]:
             frames[index] = replace(frames[index], is_first=False)
-    # The part of the frames that this run refines.
-    number, of = request.shard or (1, 1)
+    # The frames that this run refines: those of the names, every n-th, the first, of a shard.
     chosen = [frame for frame in frames if fnmatchcase(frame.name, request.names or "*")]
     if not chosen:
         raise UsageError(
             f"no frame of {source} has a name like {request.names!r}; the first is {frames[0].name}"
         )
-    chosen = chosen[:: request.every][: request.limit][number - 1 :: of]
+    shard, shards = request.shard or (1, 1)
+    chosen = chosen[:: request.every][: request.limit][shard - 1 :: shards]
+    # Only these need a depth map of the user's network.
     if request.depth is not None:
-        with_depths = _with_depths(request.depth, chosen)
-        by_name = {frame.name: frame for frame in with_depths}
-        chosen = with_depths
+        chosen = _with_depths(request.depth, chosen)
+        by_name = {frame.name: frame for frame in chosen}
         frames = [by_name.get(frame.name, frame) for frame in frames]
     return BatchFrames(
         layout=layout,
@@ -96,9 +101,16 @@ def find_frames(request: BatchRequest) -> BatchFrames:
 
 
 def _check_folder(source: Path, output: Path, frames: Sequence[FrameFiles]) -> None:
-    """Raises OutputError if the output holds the frames or their files."""
-    read = (file for frame in frames for file in (frame.image, frame.sparse, frame.gt))
-    folders = {source, *(frame_files.file_of(file).parent for file in read if file is not None)}
+    """Raises OutputError if the output folder holds the frames or their files.
+
+    Args:
+        source: The folder or the list of the frames.
+        output: The output folder.
+        frames: The frames.
+    """
+    files = [file for frame in frames for file in (frame.image, frame.sparse, frame.gt)]
+    folders = {source}
+    folders |= {frame_files.file_of(file).parent for file in files if file is not None}
     if any(folder.is_dir() and _is_inside(folder, output) for folder in folders):
         raise OutputError(
             f"{output} holds the frames; name a folder of its own, such as {output / 'out'}"
@@ -108,7 +120,18 @@ def _check_folder(source: Path, output: Path, frames: Sequence[FrameFiles]) -> N
 def _check_usable(
     request: BatchRequest, layout: str, frames: Sequence[FrameFiles], lost: Sequence[Unmatched]
 ) -> None:
-    """Raises InputError if there is no frame, and UsageError if none has what is asked for."""
+    """Raises an error if there is no frame, or none has what is asked for.
+
+    Args:
+        request: The batch.
+        layout: Name of the layout of the source.
+        frames: Its frames.
+        lost: Files that are in no frame, and why.
+
+    Raises:
+        InputError: There is no frame.
+        UsageError: None has sparse depth, or ground truth to draw it from, or a confidence mask.
+    """
     source = request.source
     if not frames:
         first = ""
@@ -136,11 +159,15 @@ def _check_usable(
 def _with_depths(folder: Path, frames: Sequence[FrameFiles]) -> list[FrameFiles]:
     """The frames with their depth maps of a folder, by the name of the frame or of its image.
 
+    Args:
+        folder: The depth maps that a network predicted.
+        frames: The frames, all of which need one.
+
     Raises:
         InputError: A frame has none.
     """
-    maps, _ = frame_files.find_files(folder, (*DEPTH_SUFFIXES, *frame_files.IMAGE_SUFFIXES, ".bin"))
-    found = list[FrameFiles]()
+    maps, _ = frame_files.find_files(folder, _PREDICTED_SUFFIXES)
+    with_depths = list[FrameFiles]()
     for frame in frames:
         image = frame.image_file
         names = [frame.name] if image is None else [frame.name, image.stem]
@@ -150,30 +177,44 @@ def _with_depths(folder: Path, frames: Sequence[FrameFiles]) -> list[FrameFiles]
                 f"--depth {folder} has no depth map named {' or '.join(dict.fromkeys(names))};"
                 " name each as its frame or its image"
             )
-        found.append(replace(frame, depths=(path,)))
-    return found
+        with_depths.append(replace(frame, depths=(path,)))
+    return with_depths
 
 
 def _with_poses(
     request: BatchRequest, frames: list[FrameFiles]
 ) -> tuple[list[FrameFiles], str | None]:
-    """The frames with their poses and neighbours, and where the poses are from, as a line."""
+    """The frames with their poses and neighbours, and where the poses are from, as a line.
+
+    The line is None if there are no poses and no neighbours.
+
+    Args:
+        request: The batch, which may name a file of poses, and asks for neighbours.
+        frames: All frames, some with poses of their layout.
+
+    Raises:
+        InputError: The poses cannot be read or are of other frames, and are needed.
+        UsageError: Poses or neighbours are asked for of frames that cannot have them.
+    """
     # Poses of a file, or the frames' own.
     path = request.poses
     beside = request.source / POSES_FILE  # as `pnpdepth frames` writes it
-    if path is None and not any(f.pose for f in frames) and beside.is_file():
+    if path is None and not any(frame.pose for frame in frames) and beside.is_file():
         path = beside
     source = "the layout's"
     if path is not None:
         if any(frame.sparse is not None and frame.sparse.is_dir() for frame in frames):
             raise UsageError("--poses: the COLMAP model has those of its images; leave it out")
+        # A file that nobody named, for records alone, is left out if it does not fit.
         try:
-            rows, how = poses_of_frames(path, [frame.name for frame in frames], request.pose_kind)
+            poses, how = poses_of_frames(path, [frame.name for frame in frames], request.pose_kind)
         except InputError as error:
             if request.poses is not None or request.accumulate:
                 raise
             return frames, f"note: {error}; records get no poses"
-        frames = [replace(f, pose=as_pose(row)) for f, row in zip(frames, rows, strict=True)]
+        frames = [
+            replace(frame, pose=as_pose(pose)) for frame, pose in zip(frames, poses, strict=True)
+        ]
         source = f"{path}, {how}"
     if request.accumulate:
         frames = _with_neighbours(frames, request.accumulate, source)
@@ -186,7 +227,10 @@ def _with_poses(
 
 
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
-    """Returns the indices of the frames of each sequence, which one camera took, in order."""
+    """Returns the indices of the frames of each sequence, in order, by the sequence's name.
+
+    A sequence is what one camera took in one go: the cameras of a drive are sequences of their own.
+    """
     groups = groups_of([frame.name for frame in frames], [frame.group for frame in frames])
     sequences: dict[str, list[int]] = {}
     for index, (frame, group) in enumerate(zip(frames, groups, strict=True)):
@@ -196,66 +240,101 @@ def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
 
 
 def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[FrameFiles]:
-    """The frames, each with those at most `reach` before and after it in its sequence."""
-    result = [*frames]
-    for sequence in sequences_of(frames).values():
-        for number, index in enumerate(sequence):
-            near = range(max(0, number - reach), min(number + reach + 1, len(sequence)))
+    """The frames, each with those at most `reach` before and after it in its sequence.
+
+    Args:
+        frames: All frames, in order.
+        reach: How many frames before, and as many after, are neighbours of one.
+        source: Where poses are from, for a person.
+
+    Raises:
+        UsageError: A neighbour has no points, or neither image nor pose.
+    """
+    with_neighbours = [*frames]
+    for indices in sequences_of(frames).values():
+        for place, index in enumerate(indices):
+            first = max(0, place - reach)
+            last = min(place + reach, len(indices) - 1)
             neighbours = [
-                _neighbour(frames[index], frames[sequence[place]], abs(place - number), source)
-                for place in near
-                if place != number
+                _neighbour(frames[index], frames[indices[near]], abs(near - place), source)
+                for near in range(first, last + 1)
+                if near != place
             ]
-            result[index] = replace(frames[index], neighbours=tuple(neighbours))
-    return result
+            with_neighbours[index] = replace(frames[index], neighbours=tuple(neighbours))
+    return with_neighbours
 
 
-def _neighbour(frame: FrameFiles, other: FrameFiles, apart: int, source: str) -> Neighbour:
-    """The other frame as a neighbour, with the motion that poses from the source give."""
-    if other.sparse is not None and other.sparse.is_dir():
+def _neighbour(frame: FrameFiles, near: FrameFiles, apart: int, source: str) -> Neighbour:
+    """A near frame as a neighbour of a frame, with the motion that their poses give.
+
+    Args:
+        frame: The frame that gets the points of the other.
+        near: The other one.
+        apart: How many frames it is before or after.
+        source: Where poses are from, for a person.
+
+    Raises:
+        UsageError: The neighbour has no points that can be moved, or neither image nor pose.
+    """
+    if near.sparse is not None and near.sparse.is_dir():
         raise UsageError(
-            f"{other.name}: --accumulate takes depth maps or scans, not a COLMAP model; leave it"
-            " out"
+            f"{near.name}: --accumulate takes depth maps or scans, not a COLMAP model; leave it out"
         )
-    if other.sparse is None and other.gt is None:
+    if near.sparse is None and near.gt is None:
         raise UsageError(
-            f"{other.name}: --accumulate takes depth maps or scans, not images alone; leave it out"
+            f"{near.name}: --accumulate takes depth maps or scans, not images alone; leave it out"
         )
-    if frame.pose is None or other.pose is None:
-        if other.image is None:
-            raise UsageError(f"{other.name}: --accumulate of frames without images needs --poses")
-        return Neighbour(files=other, motion=None, poses=ESTIMATED, apart=apart)
-    # The motion is from the neighbour's coordinates to the frame's.
+    if frame.pose is None or near.pose is None:
+        if near.image is None:
+            raise UsageError(f"{near.name}: --accumulate of frames without images needs --poses")
+        return Neighbour(files=near, motion=None, poses=ESTIMATED, apart=apart)
+    # Both poses (R, t) lead to the world, so (Rᵀ R_near, Rᵀ (t_near − t)) leads from the
+    # neighbour's coordinates to the frame's.
     pose = np.array(frame.pose)
-    motion = np.array(other.pose)
+    motion = np.array(near.pose)
     motion[:, 3] -= pose[:, 3]
     motion = pose[:, :3].T @ motion
-    return Neighbour(files=other, motion=as_pose(motion), poses=source, apart=apart)
+    return Neighbour(files=near, motion=as_pose(motion), poses=source, apart=apart)
 
 
 def request_of(request: BatchRequest, frame: FrameFiles) -> RefineRequest:
-    """Returns how a frame of `find_frames` is refined."""
+    """Returns the request by which one frame of a batch is read and refined.
+
+    Args:
+        request: The batch.
+        frame: A frame of `find_frames`.
+    """
     return replace(request.refine, files=frame, reading=request.reading)
 
 
 def _as_requested(request: BatchRequest, frame: FrameFiles) -> FrameFiles:
-    """The frame; options of the user go before what the data set states of all its frames."""
-    least = request.refine.files.min_confidence
+    """The frame with the user's least confidence, the protocol's part, and where points are from.
+
+    A least confidence that the data set has for this one frame goes before the user's.
+
+    Args:
+        request: The batch, which may have a least confidence, a protocol, and points to sample.
+        frame: The frame as the data set has it.
+    """
     if frame.sparse_mask is not None and frame.min_confidence is None:
-        frame = replace(frame, min_confidence=least)
+        frame = replace(frame, min_confidence=request.refine.files.min_confidence)
     if request.protocol is not None:
         frame = replace(frame, part=find_protocol(request.protocol).part or frame.part)
     if request.reading.sample is None:
         return frame
-    # points are sampled from the ground truth, else from the projected scan
+    # Points are sampled from the ground truth, else from the projected scan.
+    truth = frame.gt
     scan = frame.sparse
-    is_scan = scan is not None and scan.suffix.lower() in frame_files.SCAN_ONLY_SUFFIXES
-    return replace(frame, sparse=None, gt=scan if frame.gt is None and is_scan else frame.gt)
+    if truth is None and scan is not None:
+        truth = scan if scan.suffix.lower() in frame_files.SCAN_ONLY_SUFFIXES else None
+    return replace(frame, sparse=None, gt=truth)
 
 
 def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
-    """Yields the files that are read for a frame, with their part."""
-    files, scan = request.files, request.reading.scan
+    """Yields the files that are read for a frame: what each is, such as "image", and its path."""
+    files = request.files
+    scan = request.reading.scan
+    # None where the frame has no such file.
     sources = {"image": files.image, "sparse": files.sparse, "gt": files.gt}
     for number, depth in enumerate(files.depths, 1):
         sources[f"depth {number}"], _ = file_and_part(depth)
@@ -283,18 +362,24 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
 
 
 def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
-    """Raises InputError for a frame whose results have no files of their own."""
+    """Raises InputError for a frame whose results would need a file of another or no valid name.
+
+    Args:
+        frames: All frames of the batch.
+        refine: How a frame is refined, which says which files a result has.
+    """
     endings = [path.name for path in refine.outputs_in(Path(), "").values()]
-    owners = dict.fromkeys((CSV, JSON), "the batch")  # by the file
+    owners = dict.fromkeys((CSV, JSON), "the batch")  # who writes a file or folder, by its path
     for frame in frames:
         # Names that differ in Unicode normalisation only are one file on macOS.
         name = unicodedata.normalize("NFC", frame.name)
         shown = one_line(repr(frame.name))
         files = [name + ending for ending in endings]
+        folders = [str(folder) for folder in PurePosixPath(name).parents]
         problem = frame_files.name_problem(frame.name)
         if name.startswith(".batch"):
             problem = "is one of the batch's own"
-        for path in (*files, *map(str, PurePosixPath(name).parents)):
+        for path in (*files, *folders):
             if path in owners:
                 problem = f"needs a file of {owners[path]}"
         if problem is not None:
@@ -303,4 +388,5 @@ def _check_names(frames: Sequence[FrameFiles], refine: RefineRequest) -> None:
 
 
 def _is_inside(path: Path, folder: Path) -> bool:
+    """Whether a path is the folder or lies in it, links followed."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))

@@ -57,6 +57,9 @@ _NO_SETTINGS = (
 """Fields that say where something lies, whose content is compared instead, or that add a file or a
 line."""
 _OWN_SUMMARY = b'{\n  "command": "batch"'
+"""Beginning of a summary.json that a batch wrote."""
+_POSE_DECIMALS = 6
+"""Decimals of a pose that count as a setting: a micrometre, as processors round differently."""
 
 
 class Records:
@@ -72,14 +75,14 @@ class Records:
         """What decides the results."""
 
     def outputs_of(self, frame: FrameFiles) -> Outputs:
-        """Returns the files of a frame's result."""
-        output, refine = self.request.output, self.request.refine
-        return refine.outputs_in(output, frame.name)
+        """Returns the files of a frame's result, by kind."""
+        return self.request.refine.outputs_in(self.request.output, frame.name)
 
     def check_new(self, frames: Iterable[FrameFiles]) -> None:
         """Raises OutputError if no batch has written to the folder, and a result exists there."""
         output = self.request.output
-        with suppress(InputError):
+        # A batch wrote there if its summary is there, or its lock, which is there from the start.
+        with suppress(InputError):  # there is no summary, or it cannot be read
             if read_bytes(output / JSON).startswith(_OWN_SUMMARY):
                 return
         if any(output.glob(LOCKS)):
@@ -93,7 +96,7 @@ class Records:
                 )
 
     def find(self, frame: FrameFiles) -> FrameRecord | str:
-        """Returns the record of a frame with its present settings, or why there is none."""
+        """Returns the record of a frame with its present settings, or in a few words why not."""
         outputs = self.outputs_of(frame)
         if not outputs["record"].exists():
             # The record is removed before the other files are written again.
@@ -103,12 +106,17 @@ class Records:
         except InputError:
             return "record damaged"
         present = self._digest(request_of(self.request, frame))
-        return record if record.batch and record.batch.settings == present else "other settings"
+        if record.batch is None or record.batch.settings != present:
+            return "other settings"
+        return record
 
     def reason_to_refine(self, frame: FrameFiles) -> str | None:
-        """Returns why a frame is to be refined; None if it is done with its settings and files."""
+        """Returns in a few words why a frame is to be refined; None if it is done.
+
+        It is done if it has a result with its present settings and files.
+        """
         record = self.find(frame)
-        if isinstance(record, str):
+        if isinstance(record, str):  # why there is none
             return record
         if record.batch is None or record.status == "failed":
             return "failed before"
@@ -123,15 +131,28 @@ class Records:
         return None if all(path.exists() for path in written) else "result missing"
 
     def state(self, request: RefineRequest) -> BatchState:
-        """Returns by what a frame is known to be done: its settings, and the files as they are."""
+        """Returns by what a frame is known to be done: its settings, and its files as they are.
+
+        Args:
+            request: What is asked of the frame.
+
+        Raises:
+            InputError: A file cannot be read.
+        """
         inputs = {name: fingerprint(path) for name, path in input_files(request)}
         return BatchState(settings=self._digest(request), inputs=inputs)
 
     def fail(self, request: RefineRequest, error: Exception | None) -> FrameRecord:
-        """Writes a record that says why a frame failed, and returns it."""
+        """Writes a record that says why a frame failed, and returns it.
+
+        Args:
+            request: What was asked of the frame.
+            error: What ended it. One that is no `PnpDepthError` is a bug, and said to be one.
+        """
         files = request.files
         message = str(error)
         if error is not None and not isinstance(error, PnpDepthError):
+            # Where it was raised, as no traceback is kept.
             line = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(line.filename).name}, line {line.lineno}"
             message = f"a bug of pnpdepth: {type(error).__name__}: {error} ({where})"
@@ -149,47 +170,57 @@ class Records:
         return record
 
     def _digest(self, request: RefineRequest) -> str:
-        """The SHA-256 of the settings that decide the frame's result."""
+        """The SHA-256 of all settings of a frame; two frames with the same were refined alike."""
         settings = self.settings | _settings_of(request)
         pose = request.files.pose
         if pose is not None:
-            # To a micrometre, as processors round differently; + 0.0 makes 0 of −0.
-            settings["pose"] = [[round(value, 6) + 0.0 for value in row] for row in pose]
+            # + 0.0 makes 0 of −0, which JSON tells apart.
+            settings["pose"] = [[round(x, _POSE_DECIMALS) + 0.0 for x in row] for row in pose]
         text = json.dumps(settings, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _settings_of(request: RefineRequest) -> dict[str, object]:
-    """The settings, but no files, that decide a frame's result, in JSON's own types."""
-    values = dict[str, object]()
+    """The settings that change a frame's result if they change, but no files, by their names."""
+    # All fields of the request and its groups, side by side.
+    fields = dict[str, object]()
     for name, value in vars(request).items():
-        values |= vars(value) if name in GROUPS else {name: value}
-    values = {name: value for name, value in values.items() if name not in _NO_SETTINGS}
-    if neighbours := request.files.neighbours:
-        values["neighbours"] = [(neighbour.motion, neighbour.apart) for neighbour in neighbours]
+        fields |= vars(value) if name in GROUPS else {name: value}
+    settings = {name: value for name, value in fields.items() if name not in _NO_SETTINGS}
+    # Of neighbours and scans, what is no file.
+    neighbours = request.files.neighbours
+    if neighbours:
+        settings["neighbours"] = [(neighbour.motion, neighbour.apart) for neighbour in neighbours]
+    scan = asdict(request.reading.scan)
+    settings["scan"] = {name: value for name, value in scan.items() if name not in _NO_SETTINGS}
     # Devices of one kind give equal results, so shards may use one each.
-    values["device"] = request.device.split(":")[0]
-    scan = asdict(request.reading.scan).items()
-    values["scan"] = {name: value for name, value in scan if name not in _NO_SETTINGS}
-    return dict(plain(values))
+    settings["device"] = request.device.split(":")[0]
+    return dict(plain(settings))
 
 
 def _code_of(request: RefineRequest) -> dict[str, object]:
     """The program's version, and names and digests of the networks' and the user's own files."""
-    method = vars(request.method).values()
-    code = [value for value in method if isinstance(value, str) and value.endswith(".py")]
-    files = [_identity(spec) for spec in (request.model, *request.more_models, *code)]
+    # A setting such as the loss may be a Python file of the user's.
+    names = [name for name in vars(request.method).values() if isinstance(name, str)]
+    user_files = [name for name in names if name.endswith(".py")]
+    files = [_identity(spec) for spec in (request.model, *request.more_models, *user_files)]
+    name_of_model, _ = files[0]
+    checkpoint = request.checkpoint
     return {
         "version": __version__,
-        "model": files[0][0],
+        "model": name_of_model,
         "files": files,
-        "checkpoint": request.checkpoint and _identity(str(request.checkpoint)),
+        "checkpoint": None if checkpoint is None else _identity(str(checkpoint)),
     }
 
 
 def _identity(spec: str) -> tuple[str, str | None]:
-    """A file's name with its :PART but without its folder, and its digest; or another name."""
+    """The name and the SHA-256 of a file; the spec and None if it names no file.
+
+    The name has no folder, so that a batch may be moved, but the part of FILE:PART.
+    """
     path, part = file_and_part(Path(spec))
     if not path.exists():
         return spec, None
-    return f"{path.name}:{part}".rstrip(":"), fingerprint(path).sha256
+    name = f"{path.name}:{part}" if part else path.name
+    return name, fingerprint(path).sha256

@@ -1,53 +1,18 @@
-"""Refines the frames of a batch in this process, or on a Ray cluster.
-
-In a process, threads read frames in advance, the network refines, and other threads write. The
-network runs only in the calling thread, as it is patched while it is cut. The queues between the
-threads are bounded, so memory does not grow with the number of frames. The actors of a cluster
-refine a few frames a call in the same way.
-"""
+"""Refines the frames of a batch that are to be done, in this process or on a Ray cluster."""
 
 from __future__ import annotations
 
-import functools
-import itertools
-import logging
-import os
-import socket
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
-from types import ModuleType
-from typing import Any
+from collections.abc import Generator, Mapping, Sequence
 
-from pnpdepth_cli.budget import max_pixels_given, set_max_pixels
-from pnpdepth_cli.commands.many_frames.find_frames import request_of
+from pnpdepth_cli.commands.many_frames.in_process import open_method, refine_frames
+from pnpdepth_cli.commands.many_frames.ray_workers import refine_on_workers
 from pnpdepth_cli.commands.many_frames.records import Records
-from pnpdepth_cli.commands.refinement.requested import load_method, read_requested
-from pnpdepth_cli.commands.refinement.write_refined import write_refined
-from pnpdepth_cli.commands.requests.batch_request import LOCAL, BatchRequest, Listener
-from pnpdepth_cli.commands.requests.refine_request import RefineRequest
-from pnpdepth_cli.commands.shared.pipeline import THREADS, in_order, timed
-from pnpdepth_cli.dataset.frame_as_read import ReadFrame
+from pnpdepth_cli.commands.requests.batch_request import Listener
 from pnpdepth_cli.dataset.frame_files import FrameFiles
-from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
-from pnpdepth_cli.errors import DeviceError, InputError, ModelError, StorageError, UsageError
-from pnpdepth_cli.frames.frame import Refined
-from pnpdepth_cli.frames.method import Method
-from pnpdepth_cli.io.file_bytes import one_line
+from pnpdepth_cli.dataset.frame_record import FrameRecord
 
 DECIDING = 16
 """Number of frames that decide together how images are moved to the points."""
-
-_CONNECT_S = 5.0
-"""Seconds for a cluster to answer."""
-_FRAMES_OF_A_CALL = 8
-"""Frames that are read and written beside the network; fewer where that leaves workers idle."""
-_TRIES = 3
-"""How often a frame is tried whose worker dies."""
-_DEATHS = 2 * _TRIES
-"""Deaths of workers, before any frame is refined, that end the batch."""
 
 
 def refine_all(
@@ -61,8 +26,10 @@ def refine_all(
 
     Args:
         to_do: The frames to refine.
-        frames: All frames of the batch, of which some decide for every run and shard.
-        of_frame: The records that each frame belongs to, by its name.
+        frames: All frames of the batch. What neither user nor network states is found on some of
+            them, so that it is the same in every run and shard.
+        of_frame: The records that each frame belongs to, by its name. Frames with the same records
+            are refined with the same weights.
         worked: Whether a frame was refined with these settings before.
         listener: Receives notes, and may stop the batch.
 
@@ -73,353 +40,20 @@ def refine_all(
         DeviceError: The cluster cannot be used.
     """
     for records in dict.fromkeys(of_frame[frame.name] for frame in to_do):
-        # The frames that are refined alike.
-        wanted = [frame for frame in to_do if of_frame[frame.name] is records]
-        alike = [frame for frame in frames if of_frame[frame.name] is records]
-        deciding = [alike[number] for number in spread(len(alike))]
+        # The frames that are refined alike, and those on which is found what nobody states.
+        to_do_alike = [frame for frame in to_do if of_frame[frame.name] is records]
+        all_alike = [frame for frame in frames if of_frame[frame.name] is records]
+        deciding = [all_alike[place] for place in spread(len(all_alike))]
         if records.request.ray is not None:
-            yield from _refine_on_workers(deciding, wanted, records, worked, listener)
+            yield from refine_on_workers(deciding, to_do_alike, records, worked, listener)
         else:
-            with _open_method(records.request, deciding) as method:
-                yield from _refine_frames(wanted, method, records, worked, listener.stopped)
+            with open_method(records.request, deciding) as method:
+                yield from refine_frames(to_do_alike, method, records, worked, listener.stopped)
         if listener.stopped():
             return
 
 
 def spread(count: int) -> list[int]:
-    """Returns at most `DECIDING` numbers from 0 to count - 1, with both among them."""
-    return sorted({i * (count - 1) // (DECIDING - 1) for i in range(DECIDING)})
-
-
-@contextmanager
-def _open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
-    """Yields the method, whose open settings these frames decide; None if none can be read."""
-    frames = _readable(request, deciding)
-    first = next(frames, None)
-    if first is None:
-        yield None
-        return
-    # Where a network states no input range, two others decide as well.
-    behind = deciding[1:]
-    two = [behind[i] for i in sorted({len(behind) // 2, len(behind) - 1})] if behind else []
-    method = load_method(request.refine, first, lambda: [*_readable(request, two)])
-    # The images share a registration.
-    if first.register == "auto":
-        method.share_registration(itertools.chain([first], frames))
-    with method:
-        yield method
-
-
-def _readable(request: BatchRequest, frames: Iterable[FrameFiles]) -> Iterator[ReadFrame]:
-    """The contents of the frames that can be read. UsageError if an option is wrong, for all."""
-    for files in frames:
-        try:
-            yield read_requested(request_of(request, files))
-        except UsageError:
-            raise
-        except Exception:  # concerns this frame only, whose record will say so
-            continue
-
-
-@dataclass(kw_only=True)
-class _Work:
-    """A frame on its way: what was read and refined, or the error that ended it."""
-
-    request: RefineRequest
-    seconds: dict[str, float] = field(default_factory=dict)
-    state: BatchState | None = None
-    frame: ReadFrame | None = None
-    refined: Refined | None = None
-    error: Exception | None = None
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Measures the time of the block; an error in it is this frame's alone, and kept."""
-        try:
-            with timed(self.seconds, name):
-                yield
-        except Exception as error:
-            self.error = error
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Steps:
-    """What is done with each frame: it is read, refined and written."""
-
-    method: Method | None
-    """None: no frame could be read when the batch began."""
-    records: Records
-    worked: bool
-    """Whether a frame was refined with these settings before."""
-    stopped: Callable[[], bool]
-
-    def read(self, files: FrameFiles) -> _Work:
-        """Reads a frame, with what identifies its files; in a thread."""
-        work = _Work(request=request_of(self.records.request, files))
-        with work.step("read"):
-            work.state = self.records.state(work.request)
-            work.frame = read_requested(work.request)
-        return work
-
-    def refine(self, reading: Iterable[_Work]) -> Iterator[_Work]:
-        """Refines the frames, in this thread; an error may be of all until one was refined."""
-        proven = self.worked or self.method is None
-        for work in reading:
-            if self.stopped():
-                return
-            if work.frame is not None:
-                with work.step("refine"):
-                    if self.method is None:
-                        raise InputError("no frame could be read when the batch began; try again")
-                    with_stages = work.frame.gt is not None
-                    work.refined = self.method.refine(work.frame, with_stages=with_stages)
-            proven |= work.refined is not None
-            fatal = StorageError if proven else (StorageError, ModelError, UsageError)
-            if isinstance(work.error, fatal):
-                raise work.error
-            yield work
-
-    def write(self, work: _Work) -> FrameRecord:
-        """Writes the result of a frame, or why there is none; in a thread."""
-        if work.refined is None or work.frame is None or self.method is None:
-            return self.records.fail(work.request, work.error)
-        try:
-            return write_refined(
-                work.request,
-                self.records.outputs_of(work.request.files),
-                self.method,
-                work.frame,
-                work.refined,
-                work.seconds,
-                batch=work.state,
-                folder=self.records.request.output,
-            )
-        except StorageError:
-            raise
-        except Exception as error:  # concerns this frame only
-            return self.records.fail(work.request, error)
-
-
-def _refine_frames(
-    frames: Iterable[FrameFiles],
-    method: Method | None,
-    records: Records,
-    worked: bool,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Generator[FrameRecord, None, None]:
-    """Refines and writes each frame; yields the record of each, in their order.
-
-    An error is of its frame alone, unless nothing more can be written, or it is of the network or
-    the settings before any frame was refined.
-    """
-    steps = _Steps(method=method, records=records, worked=worked, stopped=stopped)
-    with (
-        closing(in_order(steps.read, frames, THREADS)) as reading,
-        closing(in_order(steps.write, steps.refine(reading), THREADS)) as done,
-    ):
-        yield from done
-
-
-@dataclass(kw_only=True)
-class Worker:
-    """Refines frames in a process of the cluster; a Ray actor."""
-
-    records: Records
-    deciding: Sequence[FrameFiles]
-    """The frames that decide what is open for all."""
-    folder: Path
-    """The folder that relative paths start from."""
-    max_pixels: int | None
-    threads: int
-    stack: ExitStack = field(default_factory=ExitStack)
-
-    def refine(self, frames: Sequence[FrameFiles], worked: bool) -> list[FrameRecord]:
-        """Returns the records of frames as `_refine_frames`; DeviceError without the files."""
-        return list(_refine_frames(frames, self.method, self.records, worked))
-
-    @functools.cached_property
-    def method(self) -> Method | None:
-        """The method, open until the process ends, which is made like the driver's first."""
-        import cv2
-        import torch
-
-        request = self.records.request
-        for path in (self.folder / request.source, self.folder / request.output):
-            if not path.exists():
-                raise DeviceError(
-                    f"node {socket.gethostname()} does not see {path}; all nodes must share it"
-                )
-        os.chdir(self.folder)
-        torch.set_num_threads(self.threads)
-        cv2.setNumThreads(self.threads)
-        set_max_pixels(self.max_pixels)
-        return self.stack.enter_context(_open_method(request, self.deciding))
-
-
-@dataclass(kw_only=True)
-class _Call:
-    """Frames that one worker refines, and how often a worker died of them."""
-
-    frames: Sequence[FrameFiles]
-    deaths: int = 0
-
-
-def _refine_on_workers(
-    deciding: Sequence[FrameFiles],
-    to_do: Sequence[FrameFiles],
-    records: Records,
-    worked: bool,
-    listener: Listener,
-) -> Iterator[FrameRecord]:
-    """Refines and writes frames on Ray workers; yields the records as they are done.
-
-    A worker that dies is replaced, and its frames are tried again one by one, by any worker.
-    """
-    with _connected(records.request.ray or LOCAL) as ray:
-        devices, start = _plan(ray, deciding, records)
-        count = min(devices, len(to_do))
-        listener.say(f"Ray: {count:,} workers")
-        workers = _Workers(
-            ray=ray,
-            start=start,
-            records=records,
-            listener=listener,
-            worked=worked,
-            waiting=deque(_calls(to_do, count)),
-            idle=[start() for _ in range(count)],
-        )
-        while workers.hand_out():
-            yield from workers.next_records()
-
-
-@dataclass(kw_only=True)
-class _Workers:
-    """The workers of a cluster, the calls that they run, and those that wait."""
-
-    ray: ModuleType
-    start: Callable[[], Any]
-    """Starts a worker, a Ray actor."""
-    records: Records
-    listener: Listener
-    worked: bool
-    """Whether a frame was refined, so that no error of another is of all."""
-    waiting: deque[_Call]
-    idle: list[Any]
-    running: dict[Any, tuple[Any, _Call]] = field(default_factory=dict)
-    """The worker and the call of each result that Ray will have."""
-    deaths: int = 0
-
-    def hand_out(self) -> bool:
-        """Gives calls to the workers. False: none runs, so that all is done."""
-        # Until a frame is refined, only one worker has a call, as its error may be of all.
-        while self.idle and self.waiting and (self.worked or not self.running):
-            if self.listener.stopped():
-                break
-            worker = self.idle.pop()
-            call = self.waiting.popleft()
-            self.running[worker.refine.remote(call.frames, self.worked)] = worker, call
-        if not self.running:
-            return False
-        # Workers without a call end, and leave their device to those that have one.
-        while self.idle and self.worked:
-            self.ray.kill(self.idle.pop())
-        return True
-
-    def next_records(self) -> list[FrameRecord]:
-        """Waits for the end of any call, and returns the records of its frames.
-
-        Raises:
-            DeviceError: Workers die before any frame is refined.
-            Exception: What the call raised, which is of all frames.
-        """
-        (ended, *_), _ = self.ray.wait([*self.running])
-        worker, call = self.running.pop(ended)
-        try:
-            done: list[FrameRecord] = self.ray.get(ended)
-        except self.ray.exceptions.RayTaskError as error:
-            raise error.cause from None
-        except self.ray.exceptions.RayError as error:
-            # The worker died: another one takes its place, and its frames wait again.
-            reason = one_line(error)
-            self.deaths += 1
-            if self.deaths == _DEATHS and not self.worked:
-                raise DeviceError(f"Ray workers die: {reason}") from None
-            self.listener.say(f"warning: a worker died ({reason})")
-            worker = self.start()
-            again, done = _after_death(call, self.records, reason)
-            self.waiting.extend(again)
-        self.idle.append(worker)
-        self.worked |= any(record.status != "failed" for record in done)
-        return done
-
-
-def _calls(to_do: Sequence[FrameFiles], workers: int) -> Iterator[_Call]:
-    """Yields the frames in parts of a few; the first is one frame, which proves the network."""
-    size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (4 * workers)))
-    yield _Call(frames=to_do[:1])
-    for first in range(1, len(to_do), size):
-        yield _Call(frames=to_do[first : first + size])
-
-
-def _after_death(
-    call: _Call, records: Records, reason: str
-) -> tuple[list[_Call], list[FrameRecord]]:
-    """The calls that follow when a worker died, and the record of a frame that is given up.
-
-    Only a frame that was alone in its call is known to be what the worker died of.
-    """
-    deaths = call.deaths + 1 if len(call.frames) == 1 else call.deaths
-    if deaths < _TRIES:
-        return [_Call(frames=[frame], deaths=deaths) for frame in call.frames], []
-    error = DeviceError(f"its worker died {deaths} times: {reason}")
-    return [], [records.fail(request_of(records.request, call.frames[0]), error)]
-
-
-def _plan(
-    ray: ModuleType, deciding: Sequence[FrameFiles], records: Records
-) -> tuple[int, Callable[[], Any]]:
-    """Returns the number of devices of the cluster, and a function that starts a worker on one."""
-    # A GPU has its share of the cores; Ray has libraries use as many threads.
-    device = records.request.refine.device
-    total = ray.cluster_resources()
-    gpus = device == "cuda"
-    devices = int(total.get("GPU" if gpus else "CPU", 0))
-    if not devices:
-        raise DeviceError(f"the Ray cluster has no device {device}; change --device")
-    cores = max(1, int(total["CPU"] // devices)) if gpus else 1
-    actor = ray.remote(Worker).options(
-        num_cpus=cores, num_gpus=int(gpus), scheduling_strategy="SPREAD"
-    )
-    # All workers have the same job.
-    return devices, functools.partial(
-        actor.remote,
-        records=records,
-        deciding=deciding,
-        folder=Path.cwd(),
-        max_pixels=max_pixels_given(),
-        threads=cores,
-    )
-
-
-@contextmanager
-def _connected(address: str) -> Iterator[ModuleType]:
-    """Yields Ray, connected. UsageError if it is not installed, DeviceError without a cluster."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray is imported and by its processes
-    try:
-        import ray
-    except ImportError:
-        raise UsageError("--ray needs Ray: pip install 'pnpdepth[ray]'") from None
-    try:
-        if address not in (LOCAL, "auto"):  # Ray takes minutes to find out that nothing answers
-            host, _, port = address.removeprefix("ray://").rpartition(":")
-            socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (Exception, SystemExit) as error:
-        raise DeviceError(
-            f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"
-            " it with `ray start --head`, or leave the address out"
-        ) from None
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
+    """Returns at most `DECIDING` numbers from 0 to count − 1, evenly spaced, with both ends."""
+    last = count - 1
+    return sorted({step * last // (DECIDING - 1) for step in range(DECIDING)})

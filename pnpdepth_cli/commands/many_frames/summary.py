@@ -20,9 +20,13 @@ from pnpdepth_cli.measures import AFTER, BASES, COVERAGE, GT, MEASURES, frame_me
 from pnpdepth_cli.points import METRES
 
 _MEASURED = (*(measure.key for measure in MEASURES), COVERAGE.key)
+"""Keys of what is averaged over frames; others, such as numbers of pixels, are not."""
 _MAIN = tuple(measure.key for measure in MEASURES if measure.main)
+"""Keys of the measures whose correlation tells whether frames are independent."""
 _RUN_STAGES = ("read", "refine", "write")
+"""What the seconds of each frame are listed for."""
 _NUMBER = re.compile(r"\d[\d.,]*")
+"""A number in a note."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,19 +64,20 @@ class BatchSummary:
 
 def write_summary(
     request: BatchRequest,
-    found: BatchFrames,
+    batch: BatchFrames,
     settings: Mapping[str, object],
     records: Sequence[FrameRecord],
 ) -> BatchSummary:
     """Writes `summary.json`, with the records as its `frames`, and `summary.csv`.
 
-    Returns what both are made of.
-
     Args:
-        request: The batch.
-        found: Its frames.
+        request: What is asked of the batch.
+        batch: Its frames.
         settings: What decides the results.
-        records: The records of the frames that are done or failed.
+        records: The records of the frames that are done, diverged or failed.
+
+    Returns:
+        What both files are made of.
     """
     # Frames that failed are counted, and have no part in means.
     refined = [record for record in records if record.status != "failed"]
@@ -81,18 +86,18 @@ def write_summary(
     summary = BatchSummary(
         source=str(request.source),
         output=str(request.output),
-        layout=found.layout,
+        layout=batch.layout,
         method=request.refine.method.method,
         settings=settings,
-        counts=_counts(found, records),
+        counts=_counts(batch, records),
         unit=" and ".join(sorted({record.unit for record in refined})) or METRES,
         columns=request.columns,
-        notes=_notes([record for record in refined if GT in record.errors]),
+        notes=_notes_on_clusters([record for record in refined if GT in record.errors]),
         errors=_means(refined),
         titles=_titles(results, weights),
         weights=weights,
         frame_notes=_frame_notes(refined),
-        unmatched=[*found.unmatched],
+        unmatched=[*batch.unmatched],
         varied=dict(request.varied),
     )
     # The files, with all records.
@@ -102,29 +107,39 @@ def write_summary(
     return summary
 
 
-def _counts(found: BatchFrames, records: Sequence[FrameRecord]) -> dict[str, int]:
-    """Numbers of frames, as `BatchSummary.counts` has them."""
+def _counts(batch: BatchFrames, records: Sequence[FrameRecord]) -> dict[str, int]:
+    """Numbers of frames, as `BatchSummary.counts` has them.
+
+    Args:
+        batch: The frames of the batch.
+        records: The records of those that are done, diverged or failed.
+    """
     statuses = Counter[str](record.status for record in records)
     refined = [record for record in records if record.status != "failed"]
-    worse = [record.worse_than_linear for record in refined]
-    chosen = {frame.name for frame in found.chosen}
+    worse = [record.worse_than_linear for record in refined]  # None: it is not compared
+    chosen = {frame.name for frame in batch.chosen}
     not_done = [record for record in records if record.status != "done" and record.name in chosen]
     return {
-        "frames": len(found.frames),
+        "frames": len(batch.frames),
         "done": statuses["done"],
         "diverged": statuses["diverged"],
         "failed": statuses["failed"],
         "with_warnings": sum(bool(record.warnings) for record in refined),
         "compared": len(worse) - worse.count(None),
         "worse": worse.count(True),
-        "pending": len(found.frames) - len(records),
+        "pending": len(batch.frames) - len(records),
         "chosen": len(chosen),
         "chosen_not_done": len(not_done),
     }
 
 
 def _weights_of(results: Sequence[ResultRecord]) -> dict[str, dict[str, float]]:
-    """Mean, least and largest weight of each expert; one that a frame lacks has none there."""
+    """Mean, least and largest weight of each expert over the frames, by the expert's name.
+
+    The experts are what is fused to the result: the depth of each network, and linear
+    interpolation. One that a frame lacks has weight 0 there; frames without weights, as of other
+    methods, are left out.
+    """
     of_frames = [result.weights for result in results if result.weights]
     weights = dict[str, dict[str, float]]()
     for name in dict.fromkeys(name for of_frame in of_frames for name in of_frame):
@@ -140,7 +155,12 @@ def _weights_of(results: Sequence[ResultRecord]) -> dict[str, dict[str, float]]:
 def _titles(
     results: Sequence[ResultRecord], weights: Mapping[str, Mapping[str, float]]
 ) -> dict[str, str]:
-    """What each stage is, in words, with the mean weights; empty without any result."""
+    """What each stage of a frame is, in words, by stage; empty without any result.
+
+    Args:
+        results: The results of the batch, which are all made alike.
+        weights: Weights of experts, of `_weights_of`, whose means the titles have.
+    """
     if not results:
         return {}
     longest = max(results, key=lambda result: len(result.loss))  # it did not diverge early
@@ -149,24 +169,33 @@ def _titles(
 
 
 def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
-    """Frames by their notes, warnings first; of notes that differ in numbers, the first stays."""
-    # The note of each frame, by what it says without its numbers.
-    kinds = defaultdict[str, dict[str, str]](dict)
+    """The names of the frames that have a note, by the note; warnings come first.
+
+    Notes that differ in numbers only are one, with the numbers of its first frame, whom it names.
+    """
+    # The note of each frame, by what it says without its numbers, then by the frame's name.
+    by_text = defaultdict[str, dict[str, str]](dict)
     for record in records:
         for note in record.notes:
             if note.startswith(("warning", "note")) or ", unsure (" in note:
-                kinds[_NUMBER.sub("", note)].setdefault(record.name, note)
-    noted: dict[str, list[str]] = {}
-    for note_of in kinds.values():
-        first, note = next(iter(note_of.items()))
-        if len({*note_of.values()}) > 1:
-            note += f" (numbers of {first})"
-        noted[note] = list(note_of)
-    return dict(sorted(noted.items(), key=lambda item: not item[0].startswith("warning")))
+                text = _NUMBER.sub("", note)
+                by_text[text].setdefault(record.name, note)
+    frames_of_notes: dict[str, list[str]] = {}
+    for note_of_frame in by_text.values():
+        names = [*note_of_frame]
+        note = note_of_frame[names[0]]
+        if len({*note_of_frame.values()}) > 1:
+            note += f" (numbers of {names[0]})"
+        frames_of_notes[note] = names
+
+    def is_no_warning(entry: tuple[str, list[str]]) -> bool:
+        return not entry[0].startswith("warning")
+
+    return dict(sorted(frames_of_notes.items(), key=is_no_warning))  # False comes first
 
 
 def _means(records: Iterable[FrameRecord]) -> dict[str, dict[str, Scores]]:
-    """The mean errors over frames, by basis and stage, with their number."""
+    """The mean errors over frames, by basis and stage, with "frames", the number of frames."""
     of_stages = defaultdict[tuple[str, str], list[Scores]](list)
     for record in records:
         for basis, stages in record.errors.items():
@@ -175,32 +204,39 @@ def _means(records: Iterable[FrameRecord]) -> dict[str, dict[str, Scores]]:
                 of_stages[basis, stage].append(measured)
     means: dict[str, dict[str, Scores]] = {}
     for (basis, stage), frames in of_stages.items():
+        # A frame without any value, as where nothing is known, does not count.
         count = sum(any(value is not None for value in scores.values()) for scores in frames)
         means.setdefault(basis, {})[stage] = {"frames": count, **frame_means(frames)}
     return means
 
 
-def _notes(records: Sequence[FrameRecord]) -> list[str]:
-    """How many frames with ground truth count as independent."""
+def _notes_on_clusters(records: Sequence[FrameRecord]) -> list[str]:
+    """A line on how many frames count as independent, if not all of them do.
+
+    Args:
+        records: The records of the frames with ground truth.
+    """
     if len(records) < 2:
         return []
     names = [record.name for record in records]
     groups = groups_of(names, [record.group for record in records])
     errors = [[record.errors[GT][AFTER].get(key) for key in _MAIN] for record in records]
-    return find_clusters(groups, np.array(errors, np.float64)).notes()
+    return find_clusters(groups, np.array(errors, np.float64)).notes()  # None becomes NaN
 
 
 def _table(summary: BatchSummary, records: Iterable[FrameRecord]) -> Table:
-    """A row for each record, with errors of ground truth first."""
+    """A row for each record, with errors of ground truth first.
+
+    Args:
+        summary: The summary, whose errors say which columns of errors there are.
+        records: The records of the frames that are done, diverged or failed.
+    """
     # The columns of errors are those that any frame has.
     shown = _MEASURED if summary.columns is None else (*summary.columns, COVERAGE.key)
-    measured = [
-        (basis, stage, key)
-        for basis in BASES
-        for stage, scores in summary.errors.get(basis, {}).items()
-        for key in shown
-        if key in scores
-    ]
+    measured = list[tuple[str, str, str]]()
+    for basis in BASES:
+        for stage, scores in summary.errors.get(basis, {}).items():
+            measured += [(basis, stage, key) for key in shown if key in scores]
     columns = ["name", "status", "message", "points", "held_out_points", "improved_fraction"]
     for basis, stage, key in measured:
         name = f"{key}_{stage}"

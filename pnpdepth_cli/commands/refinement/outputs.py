@@ -250,7 +250,13 @@ def _write_view(path: Path, inputs: ReadFrame, frame: Refined, camera: Camera) -
 
 
 def _codes(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.float64]:
-    """1…65535, logarithmic from `near` to `far`, of depth in between; 0 where it is 0, unknown."""
+    """(H, W) codes 1…65535, logarithmic from `near` to `far`; 0 where the depth is 0, unknown.
+
+    Args:
+        depth: (H, W) metres, from `near` to `far` where known.
+        near: Depth of code 1, above 0.
+        far: Depth of code 65535.
+    """
     known = depth > 0
     position = np.log(np.where(known, depth, near) / near) / math.log(far / near)
     return np.where(known, 1 + np.rint(position * (LARGEST_CODE - 1)), 0)
@@ -281,8 +287,4 @@ def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.ui
 
 def _base64(values: NDArray[np.number], kind: str) -> str:
     """The values in base64, row by row, as numbers of a kind such as `<f4`, NumPy's name of it."""
-    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
-
-
-def _text(values: NDArray[np.number], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

@@ -13,7 +13,7 @@ from pnpdepth_cli.models.network import load_network
 
 
 def read_requested(request: RefineRequest) -> ReadFrame:
-    """Returns the frame that is asked for, as `read_frame` reads it."""
+    """Returns the frame of the request's files, as `read_frame` reads it."""
     return read_frame(
         request.files,
         request.read_options,
@@ -26,12 +26,16 @@ def read_requested(request: RefineRequest) -> ReadFrame:
 def load_method(
     request: RefineRequest, first: ReadFrame, more: Callable[[], Sequence[ReadFrame]] = tuple
 ) -> Method:
-    """Returns the method that is asked for; this first frame decides what networks leave open.
+    """Returns the method that the request asks for, with its networks loaded.
+
+    What neither the request nor a network states, such as the layer or the range of the input, is
+    found on the first frame.
 
     Args:
         request: Networks and settings of the refinement.
-        first: The first frame.
-        more: Function of further frames, which decide as well; called only if a network needs it.
+        first: The first frame that is refined.
+        more: Function that returns further frames on which it is found as well; called only if a
+            network needs them.
 
     Raises:
         UsageError: The request combines what cannot be combined.

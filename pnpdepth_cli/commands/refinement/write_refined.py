@@ -70,13 +70,14 @@ def write_refined(
         with timed(seconds, "write"):
             figures = write_outputs(outputs, inputs, frame, names_of_depths(result))
         # The record, which says which of them there are.
+        written = {
+            kind: path
+            for kind, path in outputs.items()
+            if kind != "improvement" or kind in figures  # not every frame can have that one
+        }
         result = replace(
             result,
-            outputs={
-                kind: path.relative_to(folder).as_posix() if folder else str(path)
-                for kind, path in outputs.items()
-                if kind != "improvement" or kind in figures
-            },
+            outputs={kind: _path_in_record(path, folder) for kind, path in written.items()},
             depth_scale=scale if format_of_suffix(outputs["depth"]).integer else None,
             figures=figures,
             seconds=seconds,
@@ -106,3 +107,8 @@ def _score(
         notes=(*inputs.notes, *notes_of_networks),
         with_baselines=request.baselines,
     )
+
+
+def _path_in_record(path: Path, folder: Path | None) -> str:
+    """The path as a record has it: from the output folder of a batch if there is one."""
+    return str(path) if folder is None else path.relative_to(folder).as_posix()

@@ -160,7 +160,7 @@ class BatchRequest:
             raise UsageError("--pose-kind is for --poses")
         if self.ray is not None and self.refine.device not in ("cpu", "cuda"):
             raise UsageError("--ray computes on --device cpu, or on all GPUs with --device cuda")
-        choose_measures(MEASURES, self.columns)
+        choose_measures(MEASURES, self.columns)  # raises for an unknown key
 
     @property
     def is_of_bag(self) -> bool:
@@ -173,7 +173,8 @@ class BatchRequest:
     def reading(self) -> ReadOptions:
         """How the files of every frame are read, with the points that the protocol has.
 
-        Points that the user asks for go before those of the protocol.
+        Points that the user asks for go before those of the protocol. Which LiDAR points of a
+        background behind others are removed is the protocol's alone.
         """
         options = self.refine.reading
         if self.protocol is None:

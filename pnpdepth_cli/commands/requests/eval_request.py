@@ -103,7 +103,7 @@ class EvalRequest:
             raise UsageError(
                 f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"
             )
-        choose_measures((*self.measures, *OF_SIGMA), self.columns)
+        choose_measures((*self.measures, *OF_SIGMA), self.columns)  # raises for an unknown key
 
     @cached_property
     def rules(self) -> Protocol:
@@ -150,7 +150,7 @@ class EvalRequest:
 
     @property
     def scoring(self) -> dict[str, object]:
-        """The rules that decide figures, by their names."""
+        """All rules on which scores depend, by their names; runs with others are not compared."""
         rules = self.rules
         return {
             "min_depth": rules.min_depth,

@@ -59,7 +59,7 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def peak_memory_mb(device: torch.device) -> dict[str, float]:
-    """Returns the peak memory of the process, and of the GPU if one is used, in 10^6 bytes."""
+    """Returns the peak memory of the "process", and of the "gpu" if one is used, in 10^6 bytes."""
     peak = {"process": round(_peak_resident_bytes() / 1e6, 1)}
     if device.type == "cuda":
         import torch

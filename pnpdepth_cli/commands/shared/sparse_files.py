@@ -86,7 +86,7 @@ def write_sparse_files(
     write_sparse(files["sparse"], points.xy, points.depth, image)
     if rgb is not None:
         overlay(rgb, points.xy, points.depth, files["overlay"])
-    # The record.
+    # The record, without entries of a file that do not apply to its kind.
     content = {
         "version": __version__,
         **settings,
@@ -98,7 +98,7 @@ def write_sparse_files(
             "farthest": float(points.depth.max()),
             "dropped": dict(points.dropped),
         },
-        "size": [points.size[1], points.size[0]],
+        "size": [points.size[1], points.size[0]],  # width, height
         "notes": notes,
         "outputs": plain(files),
     }

@@ -76,7 +76,9 @@ class Table:
     @property
     def headings(self) -> list[str]:
         """The headings of the columns."""
-        return [c.heading if isinstance(c, Measure) else c for c in self.columns]
+        return [
+            column.heading if isinstance(column, Measure) else column for column in self.columns
+        ]
 
     @property
     def cells(self) -> list[list[Cell]]:
@@ -86,7 +88,7 @@ class Table:
     def csv(self) -> str:
         """Returns the cells as they are, None and NaN empty, below the keys of the measures."""
         buffer = io.StringIO()
-        keys = [c.key if isinstance(c, Measure) else c for c in self.columns]
+        keys = [column.key if isinstance(column, Measure) else column for column in self.columns]
         rows = [list(map(_plain_cell, row)) for row in self.rows]
         csv.writer(buffer, lineterminator="\n").writerows([keys, *rows])
         return buffer.getvalue()
@@ -196,7 +198,9 @@ def bases_of(errors: Errors) -> list[str]:
 def means_tables(
     errors: Errors, unit: str, titles: Mapping[str, str], keys: Sequence[str] | None = None
 ) -> list[Table]:
-    """Returns the mean errors of a batch, a table for each basis that is shown.
+    """Returns the mean errors of a batch: one table against ground truth, one at held-out points.
+
+    Without either, the one table is at validation points, else at the points used.
 
     Args:
         errors: Mean errors by basis, then by stage.
@@ -204,6 +208,7 @@ def means_tables(
         titles: What each stage is, in words, in the order of the rows.
         keys: Keys of the measures, in the order of the columns. None: the main ones.
     """
+    # A row for each baseline that was scored besides, under its own name.
     baselines = {name: name for name in BASELINES if name not in titles}
     rows = {**titles, **baselines}
     return [
@@ -212,7 +217,9 @@ def means_tables(
 
 
 def refinement_tables(record: FrameRecord) -> list[Table]:
-    """Returns the errors of a refined frame, a table for each basis that is shown.
+    """Returns the errors of a refined frame: a table against ground truth, one at held-out points.
+
+    Without either, the one table is at validation points, else at the points used.
 
     Raises:
         InputError: The frame has no result.
@@ -317,14 +324,24 @@ def names_of_depths(result: ResultRecord) -> tuple[str, str]:
 
 
 def weights_text(weights: Mapping[str, float]) -> str:
-    """Returns the weights of experts by their names as text, without those that would be 0 %."""
+    """Returns as text how much each network, or interpolation, weighs in a fused result.
+
+    What would be 0 % is left out.
+
+    Args:
+        weights: Weights, fractions of 1, by name.
+    """
     return ", ".join(
         f"{name} {weight:.0%}" for name, weight in weights.items() if weight >= _LEAST_WEIGHT
     )
 
 
 def mean_weights_text(weights: Mapping[str, Mapping[str, float]]) -> str:
-    """Returns mean and range of each expert's weight in the frames of a batch, as text."""
+    """Returns as text how much each network, or interpolation, weighs in the results of a batch.
+
+    Args:
+        weights: Mean, least and largest weight over the frames, by name.
+    """
     return ", ".join(
         f"{name} {weight['mean']:.0%} ({weight['least']:.0%} to {weight['largest']:.0%})"
         for name, weight in weights.items()
