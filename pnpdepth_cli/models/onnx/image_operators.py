@@ -27,7 +27,7 @@ _RESIZE = ("mode", "coordinate_transformation_mode", "nearest_mode", "cubic_coef
 _RESIZE_OPSET = 12
 """Version of the standard in which onnxruntime is asked for these weights."""
 _IR_VERSION = 8
-"""Version of the file format. By default onnx writes its newest, which an old onnxruntime refuses."""
+"""Version of the file format; onnx's default is its newest, which an old onnxruntime refuses."""
 _MAX_POOL = {1: F.max_pool1d, 2: F.max_pool2d, 3: F.max_pool3d}
 """Functions by the number of spatial axes."""
 
