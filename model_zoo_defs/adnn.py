@@ -18,6 +18,7 @@ project's own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -30,21 +31,29 @@ from model_zoo_defs._same_padding import same_padding
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 FILTERS = (8, 16, 32)
+"""Filters of each layer."""
 KERNELS = (11, 5, 3)
+"""Pixels of the filters' sides."""
 STRIDE = 2
 ITERATIONS = 10
-TUNED = Settings(layer="solve", lr="3%", update="adam")  # of `-tiny`
-BIAS_SCALE = 1e-3  # stored biases are a thousand times the thresholds
+TUNED = Settings(layer="solve", lr="3%", update="adam")
+"""Settings of refinement for `-tiny`."""
+BIAS_SCALE = 1e-3
+"""Thresholds over the biases that are stored."""
 
 Three = tuple[Tensor, Tensor, Tensor]
+"""A tensor of each layer, the shallow one first."""
 
 
 class State(NamedTuple):
-    """Of each layer: the codes z, their non-negative copies y, and the multipliers λ of z = y."""
+    """What ADMM iterates: in each layer codes z, and copies y ≥ 0 that shall equal them."""
 
     codes: Three
+    """z of each layer, (B, filters, h, w)."""
     copies: Three
+    """y of each layer, of the same shapes."""
     multipliers: Three
+    """λ of z = y of each layer, of the same shapes."""
 
 
 def analysed(x: Tensor, kernel: Tensor) -> Tensor:
@@ -54,18 +63,23 @@ def analysed(x: Tensor, kernel: Tensor) -> Tensor:
 
 
 def synthesised(codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
-    """Returns the sum of filters (n, c, k, k) weighted by codes: (B, c, h, w).
+    """Returns the sum of filters weighted by codes, (B, c, h, w): the adjoint of `analysed`.
 
-    The adjoint of `analysed`; codes are (B, n, ⌈h/2⌉, ⌈w/2⌉), size is (h, w).
+    Args:
+        codes: (B, n, ⌈h/2⌉, ⌈w/2⌉).
+        kernel: Filters (n, c, k, k).
+        size: (h, w).
     """
+    # What SAME padding had added before the map is cut off.
     top, left = (same_padding(length, kernel.shape[-1], STRIDE)[0] for length in size)
     x = F.conv_transpose2d(codes, kernel, stride=STRIDE)
     return x[..., top : top + size[0], left : left + size[1]]
 
 
 def shrunk(x: Tensor, bias: Tensor, multiplier: Tensor) -> Tensor:
-    """Returns x soft-thresholded by |bias| minus the multiplier, and not below 0."""
-    return F.relu(x - (bias.abs() * BIAS_SCALE - multiplier))
+    """Returns x lowered by a threshold, |bias| minus the multiplier, and not below 0."""
+    threshold = bias.abs() * BIAS_SCALE - multiplier
+    return F.relu(x - threshold)
 
 
 class Step(nn.Module):
@@ -74,19 +88,31 @@ class Step(nn.Module):
     def forward(
         self, state: State, sparse: Tensor, known: Three, kernels: Three, biases: Three
     ) -> State:
-        """Returns the state after the iteration; `known` (1 or 0) masks what each layer fits."""
-        codes, copies, multipliers = (list(of_layers) for of_layers in state)
-        for i, kernel in enumerate(kernels):
-            target = known[i] * copies[i - 1] if i else sparse
-            start = copies[i] - multipliers[i]
-            explained = known[i] * synthesised(start, kernel, _size(target))
-            codes[i] = analysed(target - explained, kernel) / 2 + start
-            if i + 1 < len(kernels):
-                above = synthesised(codes[i + 1], kernels[i + 1], _size(codes[i]))
-                copies[i] = shrunk(codes[i] + above, biases[i], multipliers[i]) / 2
+        """Returns the state after the iteration.
+
+        Args:
+            state: State before it.
+            sparse: (B, 1, H, W) metres, 0 = unknown: what the first layer fits.
+            known: 1 where each layer fits its input, else 0 (`covered`).
+            kernels: Filters (n, c, k, k) of each layer.
+            biases: Bias () of each layer.
+        """
+        codes = list(state.codes)
+        copies = list(state.copies)
+        multipliers = list(state.multipliers)
+        for layer, kernel in enumerate(kernels):
+            # The codes that explain the layer's input, near the copies.
+            target = sparse if layer == 0 else known[layer] * copies[layer - 1]
+            start = copies[layer] - multipliers[layer]
+            explained = known[layer] * synthesised(start, kernel, _size(target))
+            codes[layer] = analysed(target - explained, kernel) / 2 + start
+            # The copies near the codes and near what the deeper layer has of them.
+            if layer + 1 < len(kernels):
+                above = synthesised(codes[layer + 1], kernels[layer + 1], _size(codes[layer]))
+                copies[layer] = shrunk(codes[layer] + above, biases[layer], multipliers[layer]) / 2
             else:
-                copies[i] = shrunk(codes[i], biases[i], multipliers[i])
-            multipliers[i] = multipliers[i] + codes[i] - copies[i]
+                copies[layer] = shrunk(codes[layer], biases[layer], multipliers[layer])
+            multipliers[layer] = multipliers[layer] + codes[layer] - copies[layer]
         return State(_three(codes), _three(copies), _three(multipliers))
 
 
@@ -99,6 +125,7 @@ class Solve(nn.Module):
         self.step = Step()
 
     def forward(self, sparse: Tensor, kernels: Three, biases: Three) -> Tensor:
+        """Returns the codes after all iterations; filters and biases are those of each layer."""
         known = covered((sparse > 0).to(sparse), kernels)
         state = first_state(sparse, known, kernels, biases)
         for _ in range(self.iterations):
@@ -107,9 +134,10 @@ class Solve(nn.Module):
 
 
 class Synthesis(nn.Module):
-    """Codes of one layer → the map they synthesise, of `size`."""
+    """Synthesis as a submodule, so that the network can be cut behind it."""
 
     def forward(self, codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
+        """Returns the map of this size that codes of one layer synthesise."""
         return synthesised(codes, kernel, size)
 
 
@@ -124,26 +152,39 @@ class Adnn(nn.Module):
         self.layers = nn.ModuleList(Synthesis() for _ in filters)
         self.kernels = tuple(f"kernel{i}" for i in range(len(filters)))
         self.biases = tuple(f"bias{i}" for i in range(len(filters)))
-        for i, (count, kernel) in enumerate(zip(filters, KERNELS, strict=True)):
-            shape = (count, filters[i - 1] if i else 1, kernel, kernel)
-            deviation = (2 / (kernel * kernel * count)) ** 0.5
-            self.register_parameter(f"kernel{i}", nn.Parameter(deviation * torch.randn(shape)))
-            self.register_parameter(f"bias{i}", nn.Parameter(torch.ones(())))
+        channels = 1
+        for layer, (count, side) in enumerate(zip(filters, KERNELS, strict=True)):
+            shape = (count, channels, side, side)
+            deviation = (2 / (side * side * count)) ** 0.5
+            self.register_parameter(f"kernel{layer}", nn.Parameter(deviation * torch.randn(shape)))
+            self.register_parameter(f"bias{layer}", nn.Parameter(torch.ones(())))
+            channels = count
 
     def forward(self, sparse: Tensor) -> Tensor:
+        """Returns depth from sparse depth."""
         kernels = _three([getattr(self, name) for name in self.kernels])
         biases = _three([getattr(self, name) for name in self.biases])
-        codes = self.solve(sparse, kernels, biases)
+        x = self.solve(sparse, kernels, biases)
+        # Synthesis through all layers, each of which doubles the size.
         sizes = [_size(sparse)]
         for _ in kernels[1:]:
-            sizes.append((-(-sizes[-1][0] // STRIDE), -(-sizes[-1][1] // STRIDE)))
-        for i in reversed(range(len(kernels))):
-            codes = self.layers[i](codes, kernels[i], sizes[i])
-        return codes  # type: ignore[no-any-return]
+            height, width = sizes[-1]
+            sizes.append((math.ceil(height / STRIDE), math.ceil(width / STRIDE)))
+        for layer in reversed(range(len(kernels))):
+            x = self.layers[layer](x, kernels[layer], sizes[layer])
+        return x  # type: ignore[no-any-return]
 
 
 def covered(mask: Tensor, kernels: Three) -> Three:
-    """Returns the mask of known pixels (B, 1, H, W), and of the codes that cover any of them."""
+    """Returns which entries of each layer's input, 1 or 0, have to be explained by its codes.
+
+    Of the first layer these are the known pixels, of a deeper one the codes whose filter covers any
+    that have to be explained in the layer before.
+
+    Args:
+        mask: (B, 1, H, W), 1 where depth is known, else 0.
+        kernels: Filters (n, c, k, k) of each layer.
+    """
     masks = [mask]
     for kernel in kernels[:-1]:
         count = analysed(masks[-1], torch.ones_like(kernel[:1, :1]))
@@ -152,35 +193,44 @@ def covered(mask: Tensor, kernels: Three) -> Three:
 
 
 def first_state(sparse: Tensor, known: Three, kernels: Three, biases: Three) -> State:
-    """Returns the codes of one forward pass, with multipliers of 0."""
+    """Returns the state that ADMM starts from: one pass through all layers, multipliers of 0.
+
+    The arguments are those of `Step`.
+    """
     codes: list[Tensor] = []
     copies: list[Tensor] = []
-    for i, kernel in enumerate(kernels):
-        codes.append(analysed(known[i] * copies[i - 1] if i else sparse, kernel))
-        copies.append(shrunk(codes[i], biases[i], torch.zeros_like(codes[i])))
+    for layer, kernel in enumerate(kernels):
+        target = sparse if layer == 0 else known[layer] * copies[layer - 1]
+        codes.append(analysed(target, kernel))
+        copies.append(shrunk(codes[layer], biases[layer], torch.zeros_like(codes[layer])))
     return State(_three(codes), _three(copies), _three([torch.zeros_like(z) for z in codes]))
 
 
 def from_tensorflow(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the state dict with kernels (k, k, c, n), TensorFlow's order, as (n, c, k, k)."""
-    return {
-        name: tensor.permute(3, 2, 0, 1)
-        if tensor.ndim == 4 and tensor.shape[2] != tensor.shape[3]
-        else tensor
-        for name, tensor in state.items()
-    }
+    """Returns the state dict with kernels (k, k, c, n), TensorFlow's order, as (n, c, k, k).
+
+    Kernels in torch's order, whose last two sides are equal, stay as they are.
+    """
+    converted = {}
+    for name, tensor in state.items():
+        is_tensorflow_kernel = tensor.ndim == 4 and tensor.shape[2] != tensor.shape[3]
+        converted[name] = tensor.permute(3, 2, 0, 1) if is_tensorflow_kernel else tensor
+    return converted
 
 
-def _three(parts: list[Tensor]) -> Three:
-    first, second, third = parts
+def _three(tensors: list[Tensor]) -> Three:
+    """Returns a list of three as a tuple."""
+    first, second, third = tensors
     return first, second, third
 
 
 def _size(x: Tensor) -> tuple[int, int]:
+    """Returns (height, width) of a map (…, h, w)."""
     return x.shape[-2], x.shape[-1]
 
 
 def _definition(name: str, summary: str) -> ModelDefinition:
+    """Returns the definition of a network of this name; that of "-tiny" has weights."""
     own = name.endswith("-tiny")
     weights = Path(__file__).parent / "weights" / f"{name}.safetensors"
     return ModelDefinition(

@@ -67,41 +67,50 @@ from pnpdepth_cli.models.definition import (
 )
 
 PROPAGATED = ("s4", "s2")
+"""Levels at which depth is also propagated among neighbouring cells."""
 
 
 class Outputs(NamedTuple):
-    """Everything the network computes; training looks at all of it.
-
-    depths: metres at 1/16, 1/8, 1/4, 1/2 and full size; features (B, 16, h, w) and residual of
-    the level at 1/2.
-    """
+    """Everything the network computes; training looks at all of it."""
 
     depths: list[Tensor]
+    """Metres (B, 1, h, w) at 1/16, 1/8, 1/4, 1/2 and full size."""
     features: Tensor
+    """(B, 16, H / 2, W / 2)."""
     hints: Tensor
+    """(B, 4, H / 2, W / 2): log depth so far, mean and std of the points' residuals, density."""
 
 
-Level = tuple[Tensor, Tensor, Tensor]
-"""Depth in metres, features, and residual of a level."""
+class Level(NamedTuple):
+    """What the decoder gives at one size (h, w)."""
+
+    depth: Tensor
+    """Metres (B, 1, h, w)."""
+    features: Tensor
+    """(B, c, h, w); at full size those of 1/2."""
+    hints: Tensor
+    """(B, 4, h, w): log depth so far, mean and std of the points' residuals, density; likewise."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """What the decoder starts from.
-
-    median (B, 1, 1, 1) and moments of the points, the fits through the points, and the prior.
-    """
+    """What the decoder starts from."""
 
     median: Tensor
+    """Median log depth of the points (B, 1, 1, 1)."""
     moments: Tensor
+    """Sums over the points (B, 4, H / 2, W / 2), see `Points.moments`."""
     fit: Fit
+    """Planes through the points, at 1/16."""
     guide: Prior | None
+    """The other network's depth; None without."""
 
 
 class Stage(nn.Module):
     """Runs a function as a submodule, so that a cut behind it remembers what it gave."""
 
     def forward(self, run: Callable[..., Any], *inputs: Any) -> Any:
+        """Returns run(*inputs)."""
         return run(*inputs)
 
 
@@ -109,16 +118,19 @@ class Compact(nn.Module):
     """Dense depth (B, 1, H, W) in metres from rgb (B, 3, H, W) and sparse (B, 1, H, W) metres.
 
     H and W are multiples of 32; 0 in `sparse` is unknown. Without any point the answer is
-    finite, with median depth taken as 1 m. prior (B, 1, H, W): a dense depth in metres, aligned
-    to the points, 0 where unknown.
+    finite, with median depth taken as 1 m.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        width, deep = DECODER_CHANNELS, ENCODER_CHANNELS
+        # Features of the image, and the first depth through the points.
+        width = DECODER_CHANNELS
+        deep = ENCODER_CHANNELS
         self.encoder = Encoder()
         self.inlier_weights = InlierWeights()
         self.fit = PointFit()
+        # The decoder. Each level sees the coarser features, those of the image, the hints, and what
+        # else there is: planes at 1/16, their distance to 1/8, the image's own pixels at 1/2.
         hints = 4  # depth so far, residual, its std, fraction of known pixels
         channels = {
             "s32": deep["s32"],
@@ -140,6 +152,7 @@ class Compact(nn.Module):
                 for level in ("s16", "s8", "s4", "s2")
             }
         )
+        # The step to full size: weights of 3 x 3 depths for each of 2 x 2 pixels.
         self.enlarge = nn.Conv2d(width["s2"], 36, 1)
         nn.init.normal_(self.enlarge.weight, std=1e-2)
         self.enlarge.bias = nn.Parameter(bilinear_logits())
@@ -156,16 +169,26 @@ class Compact(nn.Module):
         self._full_size: list[Tensor] | None = None
 
     def forward(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Tensor:
+        """Returns depth in metres at full size; inside `coarse`, at 1/4.
+
+        Args:
+            rgb: (B, 3, H, W), normalised as ImageNet is.
+            sparse: (B, 1, H, W) metres, 0 = unknown.
+            prior: Another network's depth (B, 1, H, W) in metres, aligned to the points, 0 where
+                unknown; None without.
+        """
+        # The levels are computed one by one, as they are asked for.
         levels = self._levels(rgb, sparse, prior)
         if self._full_size is None:
-            *_, (depth, _, _) = levels
-            return depth
-        depth, _, _ = next(islice(levels, list(STRIDES).index("s4"), None))
-        if not self._full_size or not torch.is_grad_enabled():
+            *_, finest = levels
+            return finest.depth
+        at_quarter = next(islice(levels, list(STRIDES).index("s4"), None))
+        is_first = not self._full_size
+        if is_first or not torch.is_grad_enabled():
             with torch.no_grad():
-                *_, (full_size, _, _) = levels
-            self._full_size.append(full_size)
-        return depth
+                *_, finest = levels
+            self._full_size.append(finest.depth)
+        return at_quarter.depth
 
     @contextmanager
     def coarse(self) -> Iterator[list[Tensor]]:
@@ -184,20 +207,30 @@ class Compact(nn.Module):
             self._full_size = None
 
     def sigma(self, outputs: Outputs) -> Tensor:
-        """The expected absolute error of log depth (B, 1, H, W); no gradient reaches the depth."""
+        """Returns the expected |error| of log depth (B, 1, H, W); no gradient reaches the depth.
+
+        Args:
+            outputs: Outputs of the frame, by `outputs`.
+        """
         return cast(Tensor, self.scale(outputs.features.detach(), outputs.hints.detach()))
 
     def outputs(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None = None) -> Outputs:
-        """The depths of all levels and what the other outputs are computed from."""
+        """Returns the depths of all levels and what σ is computed from; arguments as of forward."""
         levels = list(self._levels(rgb, sparse, prior))
-        return Outputs([depth for depth, _, _ in levels], *levels[-1][1:])
+        finest = levels[-1]
+        return Outputs([level.depth for level in levels], finest.features, finest.hints)
 
     def _levels(self, rgb: Tensor, sparse: Tensor, prior: Tensor | None) -> Iterator[Level]:
-        """The decoder, level by level; full size has the features and hints of 1/2."""
+        """Yields the decoder's levels at 1/16, 1/8, 1/4, 1/2 and full size.
+
+        The arguments are those of forward. Inside, depth is log depth minus the points' median.
+        """
         # Features of the image and of the points; planes at 1/16 are the first depth.
         image = self.encoder(rgb)
         start = self.start(self._started, rgb, sparse, prior, image["s16"], image["s32"])
-        moments, fit, guide = start.moments, start.fit, start.guide
+        moments = start.moments
+        fit = start.fit
+        guide = start.guide
         features = self.decoder["s32"](image["s32"])
         depth = fit.estimates.mean(1, keepdim=True)
         extra = [fit.estimates - depth, fit.distance]
@@ -214,8 +247,8 @@ class Compact(nn.Module):
             residual = residual_of(moments, before, stride)
             density = torch.log1p(residual.density * stride * stride)
             hints = [before, residual.mean, residual.std, density]
-            parts = [resize(features, size), image[level], *hints, *extra]
-            inputs = [torch.cat([x.to(features.dtype) for x in parts], 1)]
+            maps = [resize(features, size), image[level], *hints, *extra]
+            inputs = [torch.cat([one_map.to(features.dtype) for one_map in maps], 1)]
             # What the prior says, if there is one.
             of_prior = None
             if guide is not None and fit.of_prior is not None:
@@ -227,7 +260,7 @@ class Compact(nn.Module):
             depth = self.heads[level](features, before, candidates, residual, of_prior)
             if level in self.propagation:
                 depth = self.propagation[level](features, depth, moments, stride)
-            yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
+            yield Level(torch.exp(depth + start.median), features, torch.cat(hints, 1))
             # Further inputs of the next level.
             extra = [resize(fit.distance, (size[0] * 2, size[1] * 2))] if level == "s16" else []
             if level == "s4":
@@ -235,11 +268,20 @@ class Compact(nn.Module):
                 features = self.narrow(features)
         # Full size.
         depth = self._enlarge(features, depth, guide, fit.of_prior)
-        yield torch.exp(depth + start.median), features, torch.cat(hints, 1)
+        yield Level(torch.exp(depth + start.median), features, torch.cat(hints, 1))
 
     def _started(
         self, rgb: Tensor, sparse: Tensor, prior: Tensor | None, near: Tensor, far: Tensor
     ) -> Start:
+        """Returns what the decoder starts from: weighed points, and planes through them.
+
+        Args:
+            rgb: As of forward.
+            sparse: As of forward.
+            prior: As of forward.
+            near: Features of the image at 1/16.
+            far: Features of the image at 1/32.
+        """
         points = Points(sparse)
         cloud = Cloud.of(points, rgb)
         points.weigh(self.inlier_weights(points, cloud))
@@ -249,10 +291,17 @@ class Compact(nn.Module):
     def _enlarge(
         self, features: Tensor, depth: Tensor, prior: Prior | None, fit: PriorFit | None
     ) -> Tensor:
-        """Full size: every pixel a mixture of the 3 x 3 depths at 1/2 around it.
+        """Returns depth at full size (B, 1, H, W): each pixel a mixture of 3 x 3 depths at 1/2.
 
         The change of the prior from the same mixture of its own values is added in part.
+
+        Args:
+            features: Features at 1/2.
+            depth: Log depth at 1/2 minus the median, (B, 1, H / 2, W / 2).
+            prior: The other network's depth; None without.
+            fit: Fit of the points' residuals against it; None without.
         """
+        # (B, 9, 4, H / 2, W / 2): weights of the neighbours for each of the 2 x 2 pixels.
         weights = self.enlarge(features).float()
         weights = weights.reshape(len(depth), 9, 4, *depth.shape[-2:]).softmax(1)
         mixed = (weights * neighbours(depth).unsqueeze(2)).sum(1)
@@ -262,9 +311,10 @@ class Compact(nn.Module):
             logit = self.enlarge_prior(features).float() + self.gain_prior * reliability
             blurred = (weights * neighbours(value).unsqueeze(2)).sum(1)
             change = F.pixel_unshuffle(prior.value, 2) - blurred
-            # a 3 x 3 neighbourhood and a pixel all known
-            known = (-F.max_pool2d(-valid, 3, 1, 1)) * F.pixel_unshuffle(prior.valid, 2)
-            mixed = mixed + torch.sigmoid(logit) * known * change
+            # Where the pixel and all of its neighbours at 1/2 are known.
+            are_neighbours_known = -F.max_pool2d(-valid, 3, 1, 1)
+            are_known = are_neighbours_known * F.pixel_unshuffle(prior.valid, 2)
+            mixed = mixed + torch.sigmoid(logit) * are_known * change
         return F.pixel_shuffle(mixed, 2)
 
 

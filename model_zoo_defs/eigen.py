@@ -31,39 +31,52 @@ from pnpdepth_cli.models.definition import (
 )
 
 SIZE = (228, 304)
-OUT = (55, 74)  # rows and columns of the output
-DEEP = (6, 8)  # of the coarse network's last feature map
+"""Rows and columns of the input."""
+OUT = (55, 74)
+"""Rows and columns of the output."""
+DEEP = (6, 8)
+"""Rows and columns of the coarse network's last feature map."""
 
 
 class Coarse(nn.Module):
-    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304)."""
+    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304).
+
+    Args:
+        channels: Channels of the five convolutions.
+        hidden: Numbers between the two fully connected layers.
+    """
 
     def __init__(self, channels: tuple[int, int, int, int, int], hidden: int) -> None:
         super().__init__()
-        one, two, three, four, five = channels
-        self.conv1 = nn.Conv2d(3, one, 11, stride=4)
-        self.conv2 = nn.Conv2d(one, two, 5, padding=2)
-        self.conv3 = nn.Conv2d(two, three, 3, padding=1)
-        self.conv4 = nn.Conv2d(three, four, 3, padding=1)
-        self.conv5 = nn.Conv2d(four, five, 3, stride=2)
-        self.fc1 = nn.Linear(five * DEEP[0] * DEEP[1], hidden)
+        first, second, third, fourth, fifth = channels
+        self.conv1 = nn.Conv2d(3, first, 11, stride=4)
+        self.conv2 = nn.Conv2d(first, second, 5, padding=2)
+        self.conv3 = nn.Conv2d(second, third, 3, padding=1)
+        self.conv4 = nn.Conv2d(third, fourth, 3, padding=1)
+        self.conv5 = nn.Conv2d(fourth, fifth, 3, stride=2)
+        self.fc1 = nn.Linear(fifth * DEEP[0] * DEEP[1], hidden)
         self.fc2 = nn.Linear(hidden, OUT[0] * OUT[1])
         self.relu = nn.ReLU()
         self.pool = nn.MaxPool2d(2)
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, rgb: Tensor) -> Tensor:
+        """Returns coarse log depth from the image."""
         x = self.pool(self.relu(self.conv1(rgb)))
         x = self.pool(self.relu(self.conv2(x)))
         x = self.relu(self.conv4(self.relu(self.conv3(x))))
         x = self.relu(self.conv5(x)).flatten(1)
         x = self.fc2(self.dropout(self.relu(self.fc1(x))))
-        y: Tensor = x.reshape(-1, 1, *OUT)
-        return y
+        log_depth: Tensor = x.reshape(-1, 1, *OUT)
+        return log_depth
 
 
 class Fine(nn.Module):
-    """Log depth (B, 1, h, w) from rgb (B, 3, H, W) and the coarse log depth (B, 1, h, w)."""
+    """Log depth (B, 1, h, w) from rgb (B, 3, H, W) and the coarse log depth (B, 1, h, w).
+
+    Args:
+        channels: Channels inside the network, one of which is the coarse log depth.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -74,14 +87,21 @@ class Fine(nn.Module):
         self.pool = nn.MaxPool2d(2)
 
     def forward(self, rgb: Tensor, coarse: Tensor) -> Tensor:
+        """Returns log depth from the image and the coarse log depth."""
         x = self.pool(self.relu(self.conv1(rgb)))
         x = self.relu(self.conv2(torch.cat([x, coarse], dim=1)))
-        y: Tensor = self.conv3(x)
-        return y
+        log_depth: Tensor = self.conv3(x)
+        return log_depth
 
 
 class Eigen(nn.Module):
-    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304)."""
+    """Log depth (B, 1, 55, 74) from rgb (B, 3, 228, 304).
+
+    Args:
+        channels: Channels of the coarse network's five convolutions.
+        hidden: Numbers between its two fully connected layers.
+        fine: Channels of the fine network.
+    """
 
     def __init__(
         self,
@@ -95,15 +115,17 @@ class Eigen(nn.Module):
         self.fine = Fine(fine)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        y: Tensor = self.fine(rgb, self.coarse(rgb))
-        return y
+        """Returns log depth from the image."""
+        log_depth: Tensor = self.fine(rgb, self.coarse(rgb))
+        return log_depth
 
 
 def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Returns the tensors of a coarse and a fine file under the names of `Eigen`.
 
     Args:
-        state: Each name is preceded by that of its file, as in "coarse_model_12.conv1.weight".
+        state: Tensors by name, each preceded by that of its file, as in
+            "coarse_model_12.conv1.weight".
 
     Raises:
         ValueError: One of the two files is missing, or there are two of a kind.
@@ -117,11 +139,15 @@ def read_two_files(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     renamed: dict[str, Tensor] = {}
     files: dict[str, str] = {}
     for name, tensor in state.items():
-        file, _, rest = name.partition(".")
-        part = next((p for p in ("coarse", "fine") if file.startswith(p)), file)
-        if files.setdefault(part, file) != file:
-            raise ValueError(f"{files[part]} and {file} are both the {part} network; keep one")
-        renamed[f"{part}.{rest}"] = tensor
+        file, _, own_name = name.partition(".")
+        # A file of any other name keeps it, and its tensors are refused as unexpected.
+        networks = (network for network in ("coarse", "fine") if file.startswith(network))
+        network = next(networks, file)
+        if files.setdefault(network, file) != file:
+            raise ValueError(
+                f"{files[network]} and {file} are both the {network} network; keep one"
+            )
+        renamed[f"{network}.{own_name}"] = tensor
     return renamed
 
 

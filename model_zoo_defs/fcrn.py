@@ -36,7 +36,9 @@ from pnpdepth_cli.models.definition import (
 )
 
 SIZE = (228, 304)
-BLOCKS = {"res2": 3, "res3": 4, "res4": 6, "res5": 3}  # ResNet-50
+"""Rows and columns of the input."""
+BLOCKS = {"res2": 3, "res3": 4, "res4": 6, "res5": 3}
+"""Number of blocks of each stage of ResNet-50."""
 UP_PROJECTIONS = ("layer2x", "layer4x", "layer8x", "layer16x")
 
 
@@ -49,12 +51,20 @@ class MaxPoolSame(nn.Module):
     """3×3 max pooling at stride 2 with TensorFlow's SAME padding."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, c, ⌈h/2⌉, ⌈w/2⌉) from (B, c, h, w)."""
         rows, columns = (same_padding(length, 3, 2) for length in x.shape[-2:])
         return F.max_pool2d(F.pad(x, (*columns, *rows), value=-torch.inf), 3, 2)
 
 
 class Bottleneck(nn.Module):
-    """1×1 (with the stride), 3×3, 1×1, added to the input or to its 1×1 projection."""
+    """A block of ResNet-50: convolutions 1×1 (with the stride), 3×3, 1×1, added to its input.
+
+    Args:
+        channels: Channels of the input.
+        middle: Channels of the 3×3 convolution; the output has four times as many.
+        stride: Stride of the first convolution.
+        project: Whether the sum is with a 1×1 projection of the input, as its shape is another.
+    """
 
     def __init__(self, channels: int, middle: int, stride: int, *, project: bool) -> None:
         super().__init__()
@@ -69,6 +79,7 @@ class Bottleneck(nn.Module):
         self.bn_branch1 = batch_norm(out) if project else None
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, 4·middle, h/stride, w/stride) from (B, channels, h, w)."""
         y = F.relu(self.bn_branch2a(self.branch2a(x)))
         y = F.relu(self.bn_branch2b(self.branch2b(y)))
         y = self.bn_branch2c(self.branch2c(y))
@@ -78,7 +89,10 @@ class Bottleneck(nn.Module):
 
 
 class Unpooling(nn.Module):
-    """Twice the size: four convolutions whose outputs interleave, each a quarter of the pixels."""
+    """Twice the size: four convolutions whose outputs interleave, each a quarter of the pixels.
+
+    Like a 5×5 convolution of the input with zeros between its pixels, but without the zeros.
+    """
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -89,18 +103,23 @@ class Unpooling(nn.Module):
         self.BN = batch_norm(out)
 
     def forward(self, x: Tensor) -> Tensor:
-        around = F.pad(x, (1, 1, 1, 1))
-        a = self.ConvA(around)
-        b = self.ConvB(around[..., :-1, :])
-        c = self.ConvC(around[..., :-1])
-        d = self.ConvD(around[..., :-1, :-1])
-        # Rows a, b, a, b, … and c, d, c, d, …
-        even = torch.stack([a, b], dim=3)
-        odd = torch.stack([c, d], dim=3)
-        batch, channels, height, _, width = even.shape
-        y = torch.stack([even, odd], dim=5).reshape(batch, channels, 2 * height, 2 * width)
-        normed: Tensor = self.BN(y)
-        return normed
+        """Returns (B, out, 2h, 2w) from (B, channels, h, w)."""
+        padded = F.pad(x, (1, 1, 1, 1))
+        # The pixels of even rows in the even columns, and of odd rows there.
+        a = self.ConvA(padded)
+        b = self.ConvB(padded[..., :-1, :])
+        # The same in the odd columns.
+        c = self.ConvC(padded[..., :-1])
+        d = self.ConvD(padded[..., :-1, :-1])
+        # (B, out, h, 2, w): rows a, b, a, b, … and c, d, c, d, …
+        even_columns = torch.stack([a, b], dim=3)
+        odd_columns = torch.stack([c, d], dim=3)
+        batch, channels, height, _, width = even_columns.shape
+        # (B, out, h, 2, w, 2)
+        interleaved = torch.stack([even_columns, odd_columns], dim=5)
+        enlarged = interleaved.reshape(batch, channels, 2 * height, 2 * width)
+        normalised: Tensor = self.BN(enlarged)
+        return normalised
 
 
 class UpProjection(nn.Module):
@@ -115,6 +134,7 @@ class UpProjection(nn.Module):
         self.br2 = Unpooling(channels, out)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, channels/2, 2h, 2w) from (B, channels, h, w)."""
         y = self.BN(self.Conv(F.relu(self.br1(x))))
         return F.relu(y + self.br2(x))
 
@@ -123,6 +143,9 @@ class FCRN(nn.Module):
     """Depth (B, 1, 128, 160) in metres from rgb (B, 3, 228, 304).
 
     At any other input size, the output's sides are 16 × ⌈side / 32⌉.
+
+    Args:
+        width: Channels of the first convolution, 64 as published; all others follow from it.
     """
 
     def __init__(self, width: int = 64) -> None:
@@ -134,13 +157,16 @@ class FCRN(nn.Module):
         self.pool = MaxPoolSame()
         channels = width
         self.trunk: list[str] = []
-        for stage, (name, count) in enumerate(BLOCKS.items()):
+        for stage, (stage_name, count) in enumerate(BLOCKS.items()):
             middle = width * 2**stage
             for letter in "abcdef"[:count]:
-                stride = 2 if letter == "a" and stage > 0 else 1
-                block = Bottleneck(channels, middle, stride, project=letter == "a")
-                self.add_module(f"{name}{letter}", block)
-                self.trunk.append(f"{name}{letter}")
+                # The first block of a stage changes the channels and, but for the first stage,
+                # halves the size.
+                is_first = letter == "a"
+                stride = 2 if is_first and stage > 0 else 1
+                name = f"{stage_name}{letter}"
+                self.add_module(name, Bottleneck(channels, middle, stride, project=is_first))
+                self.trunk.append(name)
                 channels = 4 * middle
         # Four up-projections, each to twice the size and half the channels.
         self.layer1 = nn.Conv2d(channels, channels // 2, 1)
@@ -154,6 +180,7 @@ class FCRN(nn.Module):
         self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))
 
     def forward(self, rgb: Tensor) -> Tensor:
+        """Returns depth from the image."""
         x = self.pool(self.relu(self.bn_conv1(self.conv1(rgb))))
         for name in self.trunk:
             x = self.get_submodule(name)(x)
@@ -171,11 +198,14 @@ KINDS = {
     "mean": "running_mean",
     "variance": "running_var",
 }
+"""Torch's name for each kind of array in the authors' files."""
 COUNTERS = ("global_step", "beta1_power", "beta2_power")
+"""Variables of the authors' optimiser."""
 PORTS = {
     "up1.conv1_1.weight": "XPFly1989/FCRN",
     "upSample.layer1.upper_branch.conv1.weight": "dontLoveBugs/FCRN_pytorch",
 }
+"""Ports to PyTorch whose files do not load, by a tensor that they have."""
 
 
 def read_authors(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
@@ -204,9 +234,9 @@ def read_authors(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
             continue  # the optimiser's own, such as conv1.weights.Momentum
         if kind not in KINDS:
             raise KeyError(f"{name} is none of {', '.join(KINDS)}")
-        renamed[f"{module_of(layer)}.{KINDS[kind]}"] = (
-            tensor.permute(3, 2, 0, 1) if kind == "weights" else tensor
-        )
+        if kind == "weights":
+            tensor = tensor.permute(3, 2, 0, 1)  # torch's order is (out, in, rows, columns)
+        renamed[f"{module_of(layer)}.{KINDS[kind]}"] = tensor
     return renamed
 
 
@@ -218,6 +248,7 @@ def module_of(layer: str) -> str:
     return re.sub(r"\.(br\d)_", r".\1.", layer)
 
 
+# Layers to cut at, from the image to the depth; the default is the paper's z.
 LAYERS = ("res4f", "res5c", "layer1_BN", *UP_PROJECTIONS[:3])
 DEFAULTS = Settings(layer="layer1_BN")
 TINY = Path(__file__).parent / "weights" / "fcrn-tiny.safetensors"

@@ -23,9 +23,12 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation, Settings
 
-FARTHEST = 200.0  # metres; our choice, so that depth stays finite
-TUNED = Settings(layer="decoder.s8", lr="10%")  # of `-tiny`, for 500 points
+FARTHEST = 200.0
+"""Metres; our choice, so that depth stays finite."""
+TUNED = Settings(layer="decoder.s8", lr="10%")
+"""Settings of refinement for `-tiny` and 500 points."""
 LEVELS = ("s16", "s8", "s4", "s2")
+"""Levels of the decoder: at 1/16, 1/8, 1/4 and 1/2 of the image's size."""
 
 
 def pointwise(channels: int, out: int) -> nn.Sequential:
@@ -34,20 +37,30 @@ def pointwise(channels: int, out: int) -> nn.Sequential:
 
 
 def separable(channels: int, out: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Returns ReLU, separable convolution, batch norm, twice; the first has the stride."""
-    parts: list[nn.Module] = []
+    """Returns ReLU, separable convolution, batch norm, twice: `channels` → `out` channels.
+
+    Args:
+        channels: Channels of the input.
+        out: Channels of the output.
+        kernel: Pixels of the kernels' sides.
+        stride: Stride of the first convolution.
+    """
+    layers: list[nn.Module] = []
     for count, step in ((channels, stride), (out, 1)):
-        parts += [
+        layers += [
             nn.ReLU(),
             nn.Conv2d(count, count, kernel, step, kernel // 2, groups=count, bias=False),
             nn.Conv2d(count, out, 1, bias=False),
             nn.BatchNorm2d(out),
         ]
-    return nn.Sequential(*parts)
+    return nn.Sequential(*layers)
 
 
 class Halved(nn.Module):
-    """Features at half the size: of the pixels (2i, 2j), and of the pixels (2i + 1, 2j + 1)."""
+    """Features at half the size: half of the channels each from the even and the odd pixels.
+
+    Even are the pixels (2i, 2j), odd the pixels (2i + 1, 2j + 1).
+    """
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -56,6 +69,7 @@ class Halved(nn.Module):
         self.norm = nn.BatchNorm2d(out)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, out, h/2, w/2) from (B, channels, h, w); the sides are even."""
         x = F.relu(x)
         even = self.even(x[..., ::2, ::2])
         odd = self.odd(x[..., 1::2, 1::2])
@@ -63,12 +77,18 @@ class Halved(nn.Module):
 
 
 def fitted(channels: int, width: int, halved: bool) -> nn.Module:
-    """Returns a layer that brings earlier features to `width` channels and the later ones' size."""
+    """Returns a layer that brings earlier features to the shape of the later ones.
+
+    Args:
+        channels: Channels of the earlier features.
+        width: Channels of the result.
+        halved: Whether the earlier features are twice as large as the later ones.
+    """
     return Halved(channels, width) if halved else pointwise(channels, width)
 
 
 def averaged(x: Tensor, stride: int = 1) -> Tensor:
-    """Returns the mean of 3×3 pixels; those outside are not counted."""
+    """Returns the means of 3×3 pixels, (B, c, h/stride, w/stride); those outside do not count."""
     return F.avg_pool2d(x, 3, stride, 1, count_include_pad=False)
 
 
@@ -93,17 +113,19 @@ class NormalCell(nn.Module):
         self.earlier3_too = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        p = self.earlier(earlier)
-        h = self.later(later)
-        parts = [
-            p,
-            self.later5(h) + self.earlier3(p),
-            self.earlier5(p) + self.earlier3_too(p),
-            averaged(h) + p,
-            2 * averaged(p),
-            self.later3(h) + h,
+        """Returns (B, 6·width, h, w) from the last two features, the later (B, later, h, w)."""
+        earlier = self.earlier(earlier)
+        later = self.later(later)
+        # The earlier features and five sums of two.
+        concatenated = [
+            earlier,
+            self.later5(later) + self.earlier3(earlier),
+            self.earlier5(earlier) + self.earlier3_too(earlier),
+            averaged(later) + earlier,
+            2 * averaged(earlier),
+            self.later3(later) + later,
         ]
-        return torch.cat(parts, dim=1)
+        return torch.cat(concatenated, dim=1)
 
 
 class ReductionCell(nn.Module):
@@ -118,28 +140,41 @@ class ReductionCell(nn.Module):
 
     def __init__(self, earlier: int | None, later: int, width: int, *, halved: bool) -> None:
         super().__init__()
+        # At the beginning, the last features count as those before, too.
         self.earlier = nn.Identity() if earlier is None else fitted(earlier, width, halved)
-        count = later if earlier is None else width
+        earlier_width = later if earlier is None else width
         self.later = pointwise(later, width)
         self.later5 = separable(width, width, 5, 2)
-        self.earlier7 = separable(count, width, 7, 2)
-        self.earlier7_too = separable(count, width, 7, 2)
-        self.earlier5 = separable(count, width, 5, 2)
+        self.earlier7 = separable(earlier_width, width, 7, 2)
+        self.earlier7_too = separable(earlier_width, width, 7, 2)
+        self.earlier5 = separable(earlier_width, width, 5, 2)
         self.first3 = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        p = self.earlier(earlier)
-        h = self.later(later)
-        first = self.later5(h) + self.earlier7(p)
-        largest = F.max_pool2d(h, 3, 2, 1)
-        second = largest + self.earlier7_too(p)
-        third = averaged(h, 2) + self.earlier5(p)
-        parts = [second, third, averaged(first) + second, self.first3(first) + largest]
-        return torch.cat(parts, dim=1)
+        """Returns (B, 4·width, h/2, w/2) from the last two features, the later (B, later, h, w)."""
+        earlier = self.earlier(earlier)
+        later = self.later(later)
+        # Sums of two at half the size; the first goes into two of those that are concatenated.
+        first = self.later5(later) + self.earlier7(earlier)
+        largest = F.max_pool2d(later, 3, 2, 1)
+        second = largest + self.earlier7_too(earlier)
+        third = averaged(later, 2) + self.earlier5(earlier)
+        fourth = averaged(first) + second
+        fifth = self.first3(first) + largest
+        return torch.cat([second, third, fourth, fifth], dim=1)
 
 
 class Stage(nn.Module):
-    """A reduction cell and `count` normal cells: the last two features → the last two features."""
+    """A reduction cell and normal cells: the last two features → the last two features.
+
+    Args:
+        earlier: Channels of the features before the last; None if there are none yet.
+        later: Channels of the last features.
+        reduced: Channels inside the reduction cell.
+        normal: Channels inside the normal cells.
+        count: Number of normal cells.
+        halved: Whether the earlier features are twice as large as the later ones.
+    """
 
     def __init__(
         self,
@@ -157,30 +192,40 @@ class Stage(nn.Module):
         self.earlier = later
         self.later = 4 * reduced
         for number in range(count):
-            cell = NormalCell(self.earlier, self.later, normal, halved=number == 0)
-            self.cells.append(cell)
+            # Before the first one, the reduction cell has halved the size.
+            is_first = number == 0
+            self.cells.append(NormalCell(self.earlier, self.later, normal, halved=is_first))
             self.earlier = self.later
             self.later = 6 * normal
 
     def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the last two features behind the stage from the last two before it."""
         for cell in self.cells:
-            both = cell(earlier, later)
+            newest = cell(earlier, later)
             earlier = later
-            later = both
+            later = newest
         return earlier, later
 
 
 class Encoder(nn.Module):
-    """(B, channels, H, W) → features at 1/2, 1/4, 1/8, 1/16, 1/32 as NASNet-A goes down."""
+    """(B, channels, H, W) → features at 1/2, 1/4, 1/8, 1/16, 1/32 as NASNet-A goes down.
+
+    Args:
+        channels: Channels of the input.
+        width: Filters of the normal cells at 1/8.
+        cells: Number of normal cells a stage.
+    """
 
     def __init__(self, channels: int, width: int, cells: int) -> None:
         super().__init__()
+        # A convolution to 1/2.
         stem = width * 8 // 11  # NASNet's 32 before its 44
         self.stem = nn.Conv2d(channels, stem, 3, 2, 1)  # without batch norm, as in the paper
         earlier = None
         later = stem
         halved = False
         self.channels = [stem]
+        # Stages to 1/4 (without normal cells), 1/8, 1/16 and 1/32.
         self.stages = nn.ModuleList()
         for reduced, normal, count in (
             (width // 4, 0, 0),
@@ -191,11 +236,13 @@ class Encoder(nn.Module):
             stage = Stage(earlier, later, reduced, normal, count, halved=halved)
             earlier = stage.earlier
             later = stage.later
+            # Behind a reduction cell alone, the earlier features are twice as large.
             halved = count == 0
             self.stages.append(stage)
             self.channels.append(later)
 
     def forward(self, x: Tensor) -> list[Tensor]:
+        """Returns the features, the largest first."""
         later = self.stem(x)
         earlier = later
         features = [later]
@@ -206,7 +253,7 @@ class Encoder(nn.Module):
 
 
 def convolved(channels: int, out: int) -> nn.Sequential:
-    """Returns 3×3 convolution, batch norm, ReLU."""
+    """Returns 3×3 convolution, batch norm, ReLU: `channels` → `out` channels."""
     return nn.Sequential(
         nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU()
     )
@@ -219,6 +266,7 @@ class Level(nn.Sequential):
         super().__init__(*convolved(channels, out))
 
     def forward(self, x: Tensor, *skips: Tensor) -> Tensor:
+        """Returns (B, out, 2h, 2w) from coarser features (B, c, h, w) and skips (B, d, 2h, 2w)."""
         x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
         return super().forward(torch.cat([x, *skips], dim=1))  # type: ignore[no-any-return, no-untyped-call]
 
@@ -235,18 +283,21 @@ class LateFusion(nn.Module):
         super().__init__()
         self.rgb = Encoder(3, width, cells)
         self.sparse = Encoder(1, width, cells)
+        # Both encoders' features at 1/32, and their skips at the other sizes.
         *skips, deepest = (2 * count for count in self.rgb.channels)
-        before = 4 * width
-        self.fuse = convolved(deepest, before)
+        channels = 4 * width
+        self.fuse = convolved(deepest, channels)
+        # Each level but the first has half the channels of the one before.
         self.decoder = nn.ModuleDict()
         for level, skip in zip(LEVELS, reversed(skips), strict=True):
-            out = before if level == "s16" else before // 2
-            self.decoder[level] = Level(before + skip, out)
-            before = out
-        self.inverse = nn.Conv2d(before, 1, 3, padding=1)
+            out = channels if level == "s16" else channels // 2
+            self.decoder[level] = Level(channels + skip, out)
+            channels = out
+        self.inverse = nn.Conv2d(channels, 1, 3, padding=1)
         nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        """Returns depth from image and sparse depth."""
         rgb_skips = self.rgb(rgb)
         sparse_skips = self.sparse(sparse)
         x = self.fuse(torch.cat([rgb_skips.pop(), sparse_skips.pop()], dim=1))
@@ -257,6 +308,10 @@ class LateFusion(nn.Module):
 
 
 def _definition(name: str, summary: str, width: int, cells: int) -> ModelDefinition:
+    """Returns the definition of a network of this name; that of "-tiny" has weights.
+
+    Width and cells are as in `LateFusion`.
+    """
     own = name.endswith("-tiny")
     weights = Path(__file__).parent / "weights" / f"{name}.safetensors"
     return ModelDefinition(

@@ -13,11 +13,12 @@ from torch import Tensor, nn
 
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
-_TINY = 1e-20  # as published: the sum of the confidences is 0 far from any point
+_TINY = 1e-20
+"""Added to the sum of the confidences, which is 0 far from any point; as published."""
 
 
 class NormalisedConv(nn.Module):
-    """(depth, confidence) → (depth, confidence), both (1, c, h, w)."""
+    """A convolution of depth that weighs each pixel by its confidence, plus a bias."""
 
     def __init__(self, channels: int, out: int, kernel: int) -> None:
         super().__init__()
@@ -29,6 +30,10 @@ class NormalisedConv(nn.Module):
         return self.weight
 
     def forward(self, depth: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns depth and confidence (1, out, h, w) from both as (1, channels, h, w).
+
+        The new confidence is the weighted mean of the old one.
+        """
         weight = self.positive_weight()
         padding = weight.shape[-1] // 2
         total = F.conv2d(confidence, weight, padding=padding)
@@ -38,7 +43,12 @@ class NormalisedConv(nn.Module):
 
 
 class NormalisedUNet(nn.Module):
-    """U-Net at full, 1/2, 1/4 and 1/8 size; the encoder levels use the same weights."""
+    """U-Net at full, 1/2, 1/4 and 1/8 size; the encoder levels use the same weights.
+
+    Args:
+        layer: Class of the convolutions.
+        channels: Channels inside the network.
+    """
 
     def __init__(self, layer: type[NormalisedConv] = NormalisedConv, channels: int = 2) -> None:
         super().__init__()
@@ -51,12 +61,18 @@ class NormalisedUNet(nn.Module):
         self.nconv7 = layer(channels, 1, 1)
 
     def forward(self, depth: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns dense depth and its confidence from sparse depth and its confidence.
+
+        All are (1, 1, H, W). Each level below is a pair of depth and confidence.
+        """
+        # Down.
         depth, confidence = self.nconv1(depth, confidence)
         depth, confidence = self.nconv2(depth, confidence)
         full = self.nconv3(depth, confidence)
         half = self.nconv3(*self.nconv2(*halved(*full)))
         quarter = self.nconv2(*halved(*half))
         eighth = self.nconv2(*halved(*quarter))
+        # Up, with the features of each level.
         quarter = self.nconv4(*beside(quarter, eighth))
         half = self.nconv5(*beside(half, quarter))
         full = self.nconv6(*beside(half, full))  # in the other order, as published
@@ -65,19 +81,27 @@ class NormalisedUNet(nn.Module):
 
 
 def halved(depth: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the most confident depth of each 2×2 block, and a quarter of its confidence."""
+    """Returns the most confident depth of each 2×2 block, and a quarter of its confidence.
+
+    From (1, c, h, w) to (1, c, h/2, w/2), both; each channel chooses for itself.
+    """
     largest, index = F.max_pool2d(confidence, 2, return_indices=True)
     chosen = depth.flatten(2).gather(2, index.flatten(2)).reshape(largest.shape)
     return chosen, largest / 4
 
 
 def beside(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Returns both pairs concatenated along channels, the coarser upsampled to the finer's size."""
+    """Returns depth and confidence of two levels concatenated along channels, in this order.
+
+    The pixels of the coarser level are repeated to the size of the finer one.
+
+    Args:
+        first: Depth and confidence (1, c, h, w) of one level.
+        second: Depth and confidence of the other.
+    """
     size = max(first[0].shape[-2:], second[0].shape[-2:])
-    depth, confidence = (
-        torch.cat([F.interpolate(a, size), F.interpolate(b, size)], dim=1)
-        for a, b in zip(first, second, strict=True)
-    )
+    depth = torch.cat([F.interpolate(first[0], size), F.interpolate(second[0], size)], dim=1)
+    confidence = torch.cat([F.interpolate(first[1], size), F.interpolate(second[1], size)], dim=1)
     return depth, confidence
 
 
@@ -85,6 +109,7 @@ class NConv(NormalisedUNet):
     """Sparse depth (1, 1, H, W) in metres, 0 = unknown → depth (1, 1, H, W)."""
 
     def forward(self, sparse: Tensor) -> Tensor:  # type: ignore[override]
+        """Returns dense depth from sparse depth, whose known pixels have a confidence of 1."""
         return super().forward(sparse, (sparse > 0).to(sparse))[0]
 
 

@@ -30,21 +30,21 @@ class SoftplusNormalisedConv(NormalisedConv):
         return F.softplus(self.weight_p, beta=10)
 
 
-def named(**parts: nn.Module) -> nn.Sequential:
-    """Returns a sequence whose parts have these names, those of the published weights."""
-    return nn.Sequential(OrderedDict(parts))
+def named(**layers: nn.Module) -> nn.Sequential:
+    """Returns layers in a row with these names, which the published weights have."""
+    return nn.Sequential(OrderedDict(layers))
 
 
 def two_convolutions(channels: int, out: int) -> nn.Sequential:
-    """Returns 3×3 convolution, batch norm, ReLU, twice."""
-    parts: list[nn.Module] = []
+    """Returns 3×3 convolution, batch norm, ReLU, twice: `channels` → `out` channels."""
+    layers: list[nn.Module] = []
     for count in (channels, out):
-        parts += [nn.Conv2d(count, out, 3, padding=1), nn.BatchNorm2d(out), nn.ReLU(inplace=True)]
-    return named(conv=nn.Sequential(*parts))
+        layers += [nn.Conv2d(count, out, 3, padding=1), nn.BatchNorm2d(out), nn.ReLU(inplace=True)]
+    return named(conv=nn.Sequential(*layers))
 
 
 def down(channels: int, out: int) -> nn.Sequential:
-    """Returns a halving of the size and two convolutions."""
+    """Returns a halving of the size and two convolutions: `channels` → `out` channels."""
     return named(mpconv=nn.Sequential(nn.MaxPool2d(2), two_convolutions(channels, out)))
 
 
@@ -56,6 +56,7 @@ class Up(nn.Module):
         self.conv = two_convolutions(channels, out)
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        """Returns (B, out, 2h, 2w) from coarse (B, c, h, w) and fine (B, d, 2h, 2w) features."""
         coarse = F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=True)
         return self.conv(torch.cat([fine, coarse], dim=1))  # type: ignore[no-any-return]
 
@@ -75,6 +76,7 @@ class ConfidenceUNet(nn.Module):
         self.outc = named(conv=nn.Conv2d(32, 1, 1))
 
     def forward(self, sparse: Tensor) -> Tensor:
+        """Returns the confidence (1, 1, h, w)."""
         full = self.inc(sparse)
         half = self.down1(full)
         quarter = self.down2(half)
@@ -92,6 +94,7 @@ class Pncnn(nn.Module):
         self.nconv = NormalisedUNet(SoftplusNormalisedConv)
 
     def forward(self, sparse: Tensor) -> Tensor:
+        """Returns dense depth from sparse depth."""
         depth: Tensor = self.nconv(sparse, self.conf_estimator(sparse))[0]
         return depth
 

@@ -24,14 +24,20 @@ from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Normalisation
 # Disparity is between FLOOR and GAIN + FLOOR, as published.
 GAIN = 10.0
 FLOOR = 0.01
-DOWN = (1, 2, 4, 8, 16, 16, 16)  # channels of conv1 … conv7, in units of `width`
+# Levels are counted from 1: conv1 … conv7 halve the size, upconv7 … upconv1 double it.
+LEVELS = range(1, 8)
+DOWN = (1, 2, 4, 8, 16, 16, 16)
+"""Channels of conv1 … conv7, in units of `width`."""
 DOWN_KERNELS = (7, 5, 3, 3, 3, 3, 3)
-UP = (1, 2, 4, 8, 16, 32, 32)  # channels of upconv1 … upconv7, in units of half a `width`
-PREDICTED = (1, 2, 3, 4)  # the levels that predict a disparity; 1 is full size
+"""Pixels of the kernels of conv1 … conv7."""
+UP = (1, 2, 4, 8, 16, 32, 32)
+"""Channels of upconv1 … upconv7, in units of half a `width`."""
+PREDICTED = (1, 2, 3, 4)
+"""Levels that predict a disparity; 1 is full size."""
 
 
 def down(channels: int, out: int, kernel: int) -> nn.Sequential:
-    """Returns a strided convolution and another one: half the size."""
+    """Returns a convolution at stride 2 and another: (B, channels, h, w) → (B, out, h/2, w/2)."""
     padding = (kernel - 1) // 2
     return nn.Sequential(
         nn.Conv2d(channels, out, kernel, stride=2, padding=padding),
@@ -42,7 +48,7 @@ def down(channels: int, out: int, kernel: int) -> nn.Sequential:
 
 
 def up(channels: int, out: int) -> nn.Sequential:
-    """Returns a transposed convolution: twice the size."""
+    """Returns a transposed convolution: (B, channels, h, w) → (B, out, 2h, 2w)."""
     return nn.Sequential(
         nn.ConvTranspose2d(channels, out, 3, stride=2, padding=1, output_padding=1),
         nn.ReLU(inplace=True),
@@ -50,7 +56,7 @@ def up(channels: int, out: int) -> nn.Sequential:
 
 
 def joined(channels: int, out: int) -> nn.Sequential:
-    """Returns a convolution of concatenated features."""
+    """Returns a convolution of concatenated features, `channels` in all: the size stays."""
     return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1), nn.ReLU(inplace=True))
 
 
@@ -65,25 +71,34 @@ def cropped(x: Tensor, like: Tensor) -> Tensor:
 
 
 class DispNet(nn.Module):
-    """Disparity (B, 1, H, W) from rgb (B, 3, H, W) in -1…1."""
+    """Disparity (B, 1, H, W) from rgb (B, 3, H, W) in -1…1.
+
+    Args:
+        width: Channels of the first convolution, 32 as published; all others follow from it.
+    """
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
-        encoded = [width * n for n in DOWN]
-        decoded = [width * n // 2 for n in UP]
-        for level in range(1, 8):
-            channels = encoded[level - 2] if level > 1 else 3
-            step = down(channels, encoded[level - 1], DOWN_KERNELS[level - 1])
-            self.add_module(f"conv{level}", step)
-        for level in range(7, 0, -1):
-            coarser = decoded[level] if level < 7 else encoded[-1]
-            out = decoded[level - 1]
-            skip = encoded[level - 2] if level > 1 else 0
+        # Channels by level.
+        encoded = dict(zip(LEVELS, [width * units for units in DOWN], strict=True))
+        decoded = dict(zip(LEVELS, [width * units // 2 for units in UP], strict=True))
+        kernels = dict(zip(LEVELS, DOWN_KERNELS, strict=True))
+        # Down, from the image.
+        channels = 3
+        for level in LEVELS:
+            self.add_module(f"conv{level}", down(channels, encoded[level], kernels[level]))
+            channels = encoded[level]
+        # Up, with the encoder's features of the level, and the disparity of the coarser one.
+        for level in reversed(LEVELS):
+            out = decoded[level]
+            skip = encoded[level - 1] if level > 1 else 0
             coarse_disparity = 1 if level < max(PREDICTED) else 0
-            self.add_module(f"upconv{level}", up(coarser, out))
+            self.add_module(f"upconv{level}", up(channels, out))
             self.add_module(f"iconv{level}", joined(out + skip + coarse_disparity, out))
             if level in PREDICTED:
                 self.add_module(f"predict_disp{level}", disparity(out))
+            channels = out
+        # The authors' initial weights.
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
                 nn.init.xavier_uniform_(layer.weight)
@@ -91,23 +106,26 @@ class DispNet(nn.Module):
                     nn.init.zeros_(layer.bias)
 
     def forward(self, rgb: Tensor) -> Tensor:
+        """Returns disparity from the image."""
         return self.pyramid(rgb)[0]
 
     def pyramid(self, rgb: Tensor) -> list[Tensor]:
         """Returns disparities at full, 1/2, 1/4 and 1/8 size; the training loss is on all four."""
+        # Down; the image counts as the features of full size.
         features = [rgb]
-        for level in range(1, 8):
+        for level in LEVELS:
             features.append(self.get_submodule(f"conv{level}")(features[-1]))
         x = features.pop()
+        # Up.
         disparities: list[Tensor] = []
-        for level in range(7, 0, -1):
+        for level in reversed(LEVELS):
             skip = features.pop()
             x = cropped(self.get_submodule(f"upconv{level}")(x), skip)
-            parts = [x, skip] if level > 1 else [x]
+            joint = [x, skip] if level > 1 else [x]
             if disparities:
-                larger = F.interpolate(disparities[-1], scale_factor=2.0, mode="bilinear")
-                parts.append(cropped(larger, skip))
-            x = self.get_submodule(f"iconv{level}")(torch.cat(parts, dim=1))
+                enlarged = F.interpolate(disparities[-1], scale_factor=2.0, mode="bilinear")
+                joint.append(cropped(enlarged, skip))
+            x = self.get_submodule(f"iconv{level}")(torch.cat(joint, dim=1))
             if level in PREDICTED:
                 disparities.append(GAIN * self.get_submodule(f"predict_disp{level}")(x) + FLOOR)
         return disparities[::-1]

@@ -26,7 +26,9 @@ from torch import Tensor, nn
 from pnpdepth_cli.models.definition import Fixed, ModelDefinition, Settings
 
 BLOCKS = {18: (2, 2, 2, 2), 50: (3, 4, 6, 3)}
-WIDTH = 64  # channels of the first stage, as published
+"""Number of blocks of each stage, by the layers of the ResNet."""
+WIDTH = 64
+"""Channels of the first stage, as published."""
 
 
 class BasicBlock(nn.Module):
@@ -43,13 +45,17 @@ class BasicBlock(nn.Module):
         self.downsample = shortcut(channels, width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        before = x if self.downsample is None else self.downsample(x)
+        """Returns the block's output; it is added to a projection of x if their shapes differ."""
+        added = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)))
-        return F.relu(self.bn2(self.conv2(x)) + before)
+        return F.relu(self.bn2(self.conv2(x)) + added)
 
 
 class Bottleneck(nn.Module):
-    """1×1, 3×3 (with the stride), 1×1 convolutions plus the identity; 4·width output channels."""
+    """1×1, 3×3, 1×1 convolutions plus the identity; the 3×3 one has the stride.
+
+    (B, c, h, w) → (B, 4·width, h/stride, w/stride).
+    """
 
     expansion = 4
 
@@ -64,14 +70,21 @@ class Bottleneck(nn.Module):
         self.downsample = shortcut(channels, 4 * width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        before = x if self.downsample is None else self.downsample(x)
+        """Returns the block's output; it is added to a projection of x if their shapes differ."""
+        added = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)))
         x = F.relu(self.bn2(self.conv2(x)))
-        return F.relu(self.bn3(self.conv3(x)) + before)
+        return F.relu(self.bn3(self.conv3(x)) + added)
 
 
 def shortcut(channels: int, out: int, stride: int) -> nn.Sequential | None:
-    """Returns a projection of a block's input to its output's shape; None if they are the same."""
+    """Returns a projection of a block's input to its output's shape; None if they are the same.
+
+    Args:
+        channels: Channels of the input.
+        out: Channels of the output.
+        stride: Stride of the block.
+    """
     if stride == 1 and channels == out:
         return None
     return nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out))
@@ -82,19 +95,21 @@ def stages(depth: int, width: int = WIDTH) -> tuple[list[nn.Sequential], int]:
 
     Args:
         depth: Number of layers of the ResNet, 18 or 50.
-        width: Input channels of the first stage.
+        width: Channels of the first stage's input, and inside its blocks.
     """
-    block = Bottleneck if depth >= 50 else BasicBlock
+    block_class = Bottleneck if depth >= 50 else BasicBlock
     channels = width
-    built = []
-    for index, count in enumerate(BLOCKS[depth]):
-        inner = width * 2**index
+    built_stages = []
+    for stage, count in enumerate(BLOCKS[depth]):
+        inner = width * 2**stage
         blocks = []
         for number in range(count):
-            blocks.append(block(channels, inner, 2 if index and not number else 1))
-            channels = inner * block.expansion
-        built.append(nn.Sequential(*blocks))
-    return built, channels
+            # The first block of a stage halves the size, but for the first stage.
+            stride = 2 if stage > 0 and number == 0 else 1
+            blocks.append(block_class(channels, inner, stride))
+            channels = inner * block_class.expansion
+        built_stages.append(nn.Sequential(*blocks))
+    return built_stages, channels
 
 
 class Unpooled(nn.Conv2d):
@@ -108,6 +123,7 @@ class Unpooled(nn.Conv2d):
         super().__init__(channels, out, 5, padding=2, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, out, 2h, 2w) from (B, channels, h, w)."""
         flipped = self.weight.flip(2, 3).transpose(0, 1)
         return F.conv_transpose2d(x, flipped, stride=2, padding=2, output_padding=1)
 
@@ -135,6 +151,7 @@ class UpProjection(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns the enlarged features."""
         return F.relu(self.upper_branch(x) + self.bottom_branch(x))
 
 
@@ -148,22 +165,25 @@ class SparseToDense(nn.Module):
 
     def __init__(self, depth: int = 50, width: int = WIDTH) -> None:
         super().__init__()
+        # ResNet on image and sparse depth, down to 1/32.
         self.conv1 = nn.Conv2d(4, width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.relu = nn.ReLU()
         self.maxpool = nn.MaxPool2d(3, 2, 1)
         (self.layer1, self.layer2, self.layer3, self.layer4), channels = stages(depth, width)
+        # Half the channels, and half of those with each up-projection.
+        self.conv2 = nn.Conv2d(channels, channels // 2, 1, bias=False)
         channels //= 2
-        self.conv2 = nn.Conv2d(2 * channels, channels, 1, bias=False)
         self.bn2 = nn.BatchNorm2d(channels)
-        self.decoder = nn.Sequential(
-            OrderedDict(
-                (f"layer{index + 1}", UpProjection(channels >> index)) for index in range(4)
-            )
-        )
-        self.conv3 = nn.Conv2d(channels >> 4, 1, 3, padding=1, bias=False)
+        up_projections = OrderedDict[str, nn.Module]()
+        for number in range(1, 5):
+            up_projections[f"layer{number}"] = UpProjection(channels)
+            channels //= 2
+        self.decoder = nn.Sequential(up_projections)
+        self.conv3 = nn.Conv2d(channels, 1, 3, padding=1, bias=False)
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
+        """Returns depth from image and sparse depth, at their size."""
         x = torch.cat([rgb, sparse], dim=1)
         size = x.shape[-2:]
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
@@ -172,6 +192,7 @@ class SparseToDense(nn.Module):
         return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
+# Sizes that the authors trained at.
 NYU = Fixed(228, 304)
 KITTI = Fixed(228, 912, "crop")
 
@@ -196,7 +217,13 @@ _KITTI = replace(
 
 
 def tiny(name: str, scenes: str, size: Fixed) -> ModelDefinition:
-    """Returns the definition of the small edition that ships, for one image size."""
+    """Returns the definition of a small edition that ships.
+
+    Args:
+        name: Name of the network, and of its file of weights.
+        scenes: Scenes that it was trained on, for the summary.
+        size: Image size that it takes.
+    """
     return replace(
         _NYU,
         name=name,

@@ -22,12 +22,14 @@ from torch import Tensor, nn
 from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Settings
 
 KERNELS = (11, 7, 5, 3, 3)
+"""Pixels of the kernels' sides, layer by layer."""
 CHANNELS = 16
-MIN_COUNT = 1e-5  # what is divided by where nothing is known
+MIN_COUNT = 1e-5
+"""What is divided by where nothing is known."""
 
 
 class SparseConv(nn.Module):
-    """(B, c, h, w) features, their (B, 1, h, w) mask → `out` features, mask grown by a kernel."""
+    """A convolution of known pixels only, divided by how many values it saw, plus a bias."""
 
     def __init__(self, channels: int, out: int, kernel: int) -> None:
         super().__init__()
@@ -37,9 +39,17 @@ class SparseConv(nn.Module):
         self.conv.weight.data.normal_(1, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns features (B, out, h, w), and where they are known (B, 1, h, w).
+
+        That is where any pixel under the kernel is.
+
+        Args:
+            x: Features (B, channels, h, w).
+            mask: (B, 1, h, w), 1 where they are known, else 0.
+        """
         kernel = self.conv.kernel_size[0]
-        known = F.avg_pool2d(mask, kernel, 1, kernel // 2, divisor_override=1)
-        count = (known * x.shape[1]).clamp_min(MIN_COUNT)
+        known_pixels = F.avg_pool2d(mask, kernel, 1, kernel // 2, divisor_override=1)
+        count = (known_pixels * x.shape[1]).clamp_min(MIN_COUNT)
         x = self.conv(x * mask) / count + self.bias.reshape(1, -1, 1, 1)
         return x, F.max_pool2d(mask, kernel, 1, kernel // 2)
 
@@ -52,6 +62,7 @@ class Block(nn.Module):
         self.sparse_conv = SparseConv(channels, out, kernel)
 
     def forward(self, pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Returns features and mask, as `SparseConv` does, from features and mask in one tuple."""
         x, mask = self.sparse_conv(*pair)
         return F.relu(x), mask
 
@@ -61,17 +72,19 @@ class SparseConvNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.sparse_convs = nn.Sequential(
-            *(
-                Block(CHANNELS if index else 1, CHANNELS, kernel)
-                for index, kernel in enumerate(KERNELS)
-            )
-        )
+        blocks = []
+        channels = 1
+        for kernel in KERNELS:
+            blocks.append(Block(channels, CHANNELS, kernel))
+            channels = CHANNELS
+        self.sparse_convs = nn.Sequential(*blocks)
+        # Untrained, the mean of the features.
         self.mask_conv = nn.Conv2d(CHANNELS + 1, 1, 1)
         self.mask_conv.weight.data[:, :CHANNELS] = 1 / CHANNELS
         self.mask_conv.bias.data.zero_()  # type: ignore[union-attr]
 
     def forward(self, sparse: Tensor) -> Tensor:
+        """Returns dense depth from sparse depth."""
         x, mask = self.sparse_convs((sparse, (sparse > 0).to(sparse)))
         return self.mask_conv(torch.cat([x, mask], 1))  # type: ignore[no-any-return]
 

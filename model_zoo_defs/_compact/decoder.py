@@ -36,22 +36,36 @@ NEIGHBOURS = (-0.5, 0.5, -0.5, 0.5, 2.5, 0.5, -0.5, 0.5, -0.5)
 
 
 def neighbours(x: Tensor) -> Tensor:
-    """The 3 x 3 neighbourhood of a map (B, 1, h, w) as channels (B, 9, h, w), edges repeated."""
+    """Returns the 3 x 3 neighbours in a map (B, 1, h, w) as channels (B, 9, h, w), edges repeated.
+
+    Row after row: channel 0 is the neighbour above and to the left, 4 the cell itself.
+    """
     height, width = x.shape[-2:]
     padded = F.pad(x, (1, 1, 1, 1), mode="replicate")
-    shifts = [(i, j) for i in range(3) for j in range(3)]
-    return torch.cat([padded[..., i : i + height, j : j + width] for i, j in shifts], dim=1)
+    corners = [(top, left) for top in range(3) for left in range(3)]
+    shifted = [padded[..., top : top + height, left : left + width] for top, left in corners]
+    return torch.cat(shifted, dim=1)
 
 
 def bilinear_logits() -> Tensor:
-    """Logits (36,) that make a softmax over 3 x 3 neighbours enlarge twofold bilinearly."""
-    ends = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.75, 0.25]])  # of the two halves of a cell
-    weights = torch.einsum("ai,bj->ijab", ends, ends).reshape(9, 4)
+    """Returns logits (36,) with which a softmax over 3 x 3 neighbours enlarges bilinearly.
+
+    That is to twice the size: 9 neighbours for each of the 2 x 2 pixels of a cell.
+    """
+    # Weights of the neighbours along one axis, for the first and the second half of a cell.
+    halves = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.75, 0.25]])
+    weights = torch.einsum("ai,bj->ijab", halves, halves).reshape(9, 4)
     return weights.clamp(min=1e-3).log().flatten()
 
 
 class Block(nn.Module):
-    """One level's features, (B, out, h, w), from all inputs of the level and hints of a prior."""
+    """One level's features from all inputs of the level and hints of a prior.
+
+    Args:
+        channels: Channels of the inputs.
+        out: Channels of the features.
+        hints: Channels of the prior's hints; 0 for a level that sees none.
+    """
 
     def __init__(self, channels: int, out: int, hints: int = 0):
         super().__init__()
@@ -64,28 +78,39 @@ class Block(nn.Module):
             nn.init.zeros_(self.enter_prior.weight)
 
     def forward(self, x: Tensor, hints: Tensor | None = None) -> Tensor:
+        """Returns (B, out, h, w) from inputs (B, channels, h, w), and hints (B, hints, h, w)."""
         x = self.enter(x) if hints is None else self.enter(x) + self.enter_prior(hints)
         x = F.relu(x)
         return F.relu(x + self.second(F.relu(self.first(x))))
 
 
 class Head(nn.Module):
-    """How the features of a level move its depth: weights of candidates, and a remainder."""
+    """How the features of a level move its depth: weights of candidates, and a remainder.
+
+    Args:
+        channels: Channels of the features.
+        candidates: Number of depths that a cell chooses among: 9 of its neighbourhood, or the
+            planes at 1/16.
+    """
 
     def __init__(self, channels: int, candidates: int):
         super().__init__()
         self.candidates = candidates
+        are_neighbours = candidates == 9
+        # Logits of the depth so far and of the candidates, logits of no correction and of the
+        # residuals in 3 x 3 cells, and a remainder.
         self.weigh = nn.Conv2d(channels, candidates + 1 + 10 + 1, 1)
         nn.init.normal_(self.weigh.weight, std=1e-2)
         bias = torch.zeros(candidates + 12)
-        bias[0] = KEEP if candidates == 9 else 0.0
+        bias[0] = KEEP if are_neighbours else 0.0
         bias[candidates + 1 : -1] = torch.tensor((STAY, *NEIGHBOURS))
         self.weigh.bias = nn.Parameter(bias)
+        # Logits of as many candidates that follow a prior.
         self.weigh_prior = nn.Conv2d(channels, candidates, 1)
         nn.init.zeros_(self.weigh_prior.weight)
-        side = torch.full((candidates,), PRIOR_SIDE if candidates == 9 else 0.0)
-        if candidates == 9:
-            side[4] = 0.0
+        side = torch.full((candidates,), PRIOR_SIDE if are_neighbours else 0.0)
+        if are_neighbours:
+            side[4] = 0.0  # the cell's own
         self.weigh_prior.bias = nn.Parameter(PRIOR_BIAS + side)
         self.gain_prior = nn.Parameter(torch.tensor(PRIOR_GAIN))
 
@@ -93,25 +118,36 @@ class Head(nn.Module):
         self, features: Tensor, before: Tensor, candidates: Tensor, residual: Residual,
         of_prior: tuple[Tensor, Tensor, Tensor] | None = None,
     ) -> Tensor:  # fmt: skip
-        """The depth of the level, (B, 1, h, w): `before` moved towards the weighted candidates.
+        """Returns the depth of the level: the one so far, moved and corrected by the points.
 
-        candidates (B, n, h, w) are depths; of_prior: as many more from the prior, where they are
-        known, and the reliability of the prior.
+        All depths are log depth minus the median.
+
+        Args:
+            features: Features of the level (B, channels, h, w).
+            before: Depth so far (B, 1, h, w).
+            candidates: Depths that a cell chooses among (B, n, h, w).
+            residual: Residuals of the points against the depth so far.
+            of_prior: As many candidates that follow the prior, where they are known, and the
+                prior's reliability; None without one.
         """
         weights = self.weigh(features).float()
-        follow, correct, rest = weights.tensor_split((self.candidates + 1, self.candidates + 11), 1)
+        follow, correct, remainder = weights.tensor_split(
+            (self.candidates + 1, self.candidates + 11), 1
+        )
         if of_prior is not None:
             more, valid, reliability = of_prior
             candidates = torch.cat([candidates, more], 1)
             logits = self.weigh_prior(features).float() + self.gain_prior * reliability
             logits = torch.where(valid > 0, logits, MASKED)
             follow = torch.cat([follow, logits], 1)
-        moved = (follow.softmax(1)[:, 1:] * (candidates - before)).sum(1, keepdim=True)
+        # Towards the candidates; the first weight is that of the depth so far.
+        move = (follow.softmax(1)[:, 1:] * (candidates - before)).sum(1, keepdim=True)
+        # By the residuals in 3 x 3 cells; the first weight is that of no correction.
         nothing = torch.zeros_like(residual.density)
         reliability = torch.cat([nothing, neighbours(residual.reliability)], dim=1)
         corrections = torch.cat([nothing, neighbours(residual.mean)], dim=1)
-        corrected = ((correct + reliability).softmax(1) * corrections).sum(1, keepdim=True)
-        return cast(Tensor, before + moved + corrected + rest)
+        correction = ((correct + reliability).softmax(1) * corrections).sum(1, keepdim=True)
+        return cast(Tensor, before + move + correction + remainder)
 
 
 class SpatialPropagation(nn.Module):
@@ -127,11 +163,19 @@ class SpatialPropagation(nn.Module):
         self.weigh = nn.Conv2d(channels, 9 + 1, 3, padding=1)
         nn.init.normal_(self.weigh.weight, std=1e-2)
         bias = torch.zeros(10)
-        bias[4], bias[9] = STAY_PUT, PULL
+        bias[4] = STAY_PUT  # the cell's own weight
+        bias[9] = PULL
         self.weigh.bias = nn.Parameter(bias)
 
     def forward(self, features: Tensor, depth: Tensor, moments: Tensor, stride: int) -> Tensor:
-        """The propagated depth (B, 1, h, w) of a level; `moments` as `Points.moments`."""
+        """Returns the propagated depth (B, 1, h, w) of a level.
+
+        Args:
+            features: Features of the level (B, channels, h, w).
+            depth: Log depth minus the median (B, 1, h, w).
+            moments: (B, 4, H / 2, W / 2), see `Points.moments`.
+            stride: Side of the level's cells in pixels.
+        """
         weights = self.weigh(features).float()
         follow = weights[:, :9].softmax(1)
         if stride > 2:
@@ -156,6 +200,7 @@ class SigmaHead(nn.Module):
         self.leave.bias = nn.Parameter(torch.tensor([-3.0]))
 
     def forward(self, features: Tensor, hints: Tensor) -> Tensor:
+        """Returns the error (B, 1, H, W) from features and hints (B, c, H / 2, W / 2)."""
         x = torch.cat([features, hints.to(features.dtype)], 1)
         log_scale = self.leave(F.relu(self.enter(x))).float()
         size = (2 * x.shape[-2], 2 * x.shape[-1])
@@ -163,7 +208,14 @@ class SigmaHead(nn.Module):
 
 
 def prior_hints(prior: Prior, fit: PriorFit, before: Tensor, level: str) -> Tensor:
-    """The prior as a level's features see it, (B, PRIOR_HINTS[level], h, w)."""
+    """Returns the prior as a level's features see it, (B, PRIOR_HINTS[level], h, w).
+
+    Args:
+        prior: The prior.
+        fit: Fit of the points' residuals against it, at 1/16.
+        before: Log depth so far minus the median, (B, 1, h, w).
+        level: Name of the level, of `STRIDES`.
+    """
     if level != "s16":
         return prior.hints(before, STRIDES[level])
     value, valid = prior.at(16)
@@ -172,18 +224,27 @@ def prior_hints(prior: Prior, fit: PriorFit, before: Tensor, level: str) -> Tens
 
 
 class PriorCandidates(NamedTuple):
-    """Depths (B, n, h, w) that follow a prior."""
+    """Depths that follow a prior, n for each cell."""
 
     depth: Tensor
+    """Log depth minus the median (B, n, h, w)."""
     known: Tensor
+    """(B, n, h, w), above 0 where the depth is known."""
     reliability: Tensor
+    """How much better the prior predicts than the points do, (B, n or 1, h, w) (`PriorFit`)."""
 
 
 def prior_candidates(prior: Prior, fit: PriorFit, depth: Tensor, level: str) -> PriorCandidates:
-    """The depths that follow the prior at a level, where they are known, and its reliability.
+    """Returns the depths that follow the prior at a level.
 
     At 1/16 the fits; elsewhere the depths of the coarser neighbours plus the change of the prior
     from there to here.
+
+    Args:
+        prior: The prior.
+        fit: Fit of the points' residuals against it, at 1/16.
+        depth: Log depth minus the median of the coarser level.
+        level: Name of the level, of `STRIDES`.
     """
     if level == "s16":
         return PriorCandidates(fit.estimates, fit.valid, fit.reliability)

@@ -18,7 +18,7 @@ STAGES = {
     "s32": ((112, 192, 5, 2, 6, 4),),
 }
 ENCODER_CHANNELS = {"s2": 16, "s4": 24, "s8": 40, "s16": 112, "s32": 192}
-# the pretrained features have a standard deviation of about 10
+# The pretrained features have a standard deviation of about 10.
 FEATURE_SCALE = 0.1
 
 
@@ -29,6 +29,7 @@ class SamePaddedConv(nn.Conv2d):
         super().__init__(channels, out, kernel, stride, padding=(kernel - 1) // 2, groups=groups)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, out, h / stride, w / stride) from (B, channels, h, w)."""
         # A kernel with a first row and column of zeros is padded alike at both ends, without a copy
         # of x.
         weight = self.weight if self.stride == (1, 1) else F.pad(self.weight, (1, 0, 1, 0))
@@ -44,12 +45,13 @@ class InvertedBottleneck(nn.Module):
         self.expand = nn.Conv2d(channels, hidden, 1) if expansion != 1 else None
         self.depthwise = SamePaddedConv(hidden, hidden, kernel, stride, groups=hidden)
         self.project = nn.Conv2d(hidden, out, 1)
-        self.residual = stride == 1 and channels == out
+        self.adds_input = stride == 1 and channels == out
 
     def forward(self, x: Tensor) -> Tensor:
+        """Returns (B, out, h / stride, w / stride) from (B, channels, h, w)."""
         y = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
         y = cast(Tensor, self.project(F.relu6(self.depthwise(y), inplace=True)))
-        return x + y if self.residual else y
+        return x + y if self.adds_input else y
 
 
 class Encoder(nn.Module):
@@ -64,6 +66,7 @@ class Encoder(nn.Module):
 
     @staticmethod
     def _blocks(rows: tuple[tuple[int, int, int, int, int, int], ...]) -> list[nn.Module]:
+        """Returns the blocks of a level from its rows in `STAGES`; a row's first has the stride."""
         blocks: list[nn.Module] = []
         for channels, out, kernel, stride, expansion, count in rows:
             blocks.append(InvertedBottleneck(channels, out, kernel, stride, expansion))
@@ -71,7 +74,8 @@ class Encoder(nn.Module):
         return blocks
 
     def forward(self, rgb: Tensor) -> dict[str, Tensor]:
-        # channels last is the faster layout for these convolutions, and slower for the decoder's
+        """Returns features (B, ENCODER_CHANNELS[level], h, w) by level, from rgb (B, 3, H, W)."""
+        # Channels last is the faster layout for these convolutions, and slower for the decoder's.
         x = F.relu6(self.stem(rgb.contiguous(memory_format=torch.channels_last)), inplace=True)
         features = {}
         for level, stage in self.stages.items():

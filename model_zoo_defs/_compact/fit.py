@@ -21,35 +21,40 @@ FIT_CHUNK = 1024
 
 
 def _cell_grid(height: int, width: int, like: Tensor) -> Tensor:
-    """Row and column of every cell's centre, (2, height, width), in cells."""
+    """Returns row and column of every cell's centre, (2, height, width), in cells.
+
+    On the device of the tensor `like`.
+    """
     rows = torch.arange(height, device=like.device, dtype=torch.float32) + 0.5
     columns = torch.arange(width, device=like.device, dtype=torch.float32) + 0.5
     return torch.stack(torch.meshgrid(rows, columns, indexing="ij"))
 
 
 class PriorFit(NamedTuple):
-    """Fits of the points' residuals against the prior, each (B, heads, h, w).
-
-    estimates: prior plus fitted residual; reliability: log of the std of the points' values
-    over the std of their residuals, both near the cell, positive where the prior explains
-    the points.
-    """
+    """Fits of the points' residuals against the prior at 1/16, each (B, heads, h, w)."""
 
     estimates: Tensor
+    """Log depth minus the median: the prior plus the fitted residual."""
     std: Tensor
+    """Standard deviation of the residuals near the cell."""
     reliability: Tensor
+    """Log of the standard deviation of the points' values over that of their residuals.
+
+    Both are near the cell; it is positive where the prior explains the points.
+    """
     valid: Tensor
+    """1 where the prior is known, at the cell and at points that count there, else 0."""
 
 
 class Fit(NamedTuple):
-    """Fits at 1/16: estimates (B, heads, h, w), log distance in cells to the nearest points.
-
-    of_prior: None without a prior.
-    """
+    """Planes through the points at 1/16."""
 
     estimates: Tensor
+    """Log depth minus the median, one for each head, (B, heads, h, w)."""
     distance: Tensor
+    """Log distance in cells to the nearest points, (B, 1, h, w)."""
     of_prior: PriorFit | None = None
+    """Fit of the residuals against the prior; None without a prior."""
 
 
 class PointFit(nn.Module):
@@ -71,32 +76,44 @@ class PointFit(nn.Module):
         self.floor = nn.Parameter(torch.tensor(0.3).log())
 
     def forward(self, near: Tensor, far: Tensor, points: Points, prior: Prior | None = None) -> Fit:
-        """The fits at 1/16 through the points and, with a prior, through residuals against it."""
+        """Returns planes at 1/16 through the points and, with a prior, the residuals against it.
+
+        Args:
+            near: Features of the image at 1/16.
+            far: Features of the image at 1/32.
+            points: The points, with inlier weights.
+            prior: Another network's depth; None without.
+        """
+        # Queries of all cells, and keys of those that have points in any image of the batch.
         height, width = near.shape[-2:]
-        features = F.relu(self.near(near) + resize(self.far(far), near.shape[-2:]))
+        features = F.relu(self.near(near) + resize(self.far(far), (height, width)))
         queries = self._per_head(self.query(features))
         keys = self._per_head(self.key(features))
         cells = self._cells(points, prior)
-        seen = cells[-1].any(0)
-        if not bool(seen.any()):
+        has_points = cells[-1].any(0)
+        if not bool(has_points.any()):
             return self._without_points(near, prior)
-        keys = keys[:, :, seen]
-        cells = [x[..., seen] for x in cells]
+        keys = keys[:, :, has_points]
+        cells = [values[..., has_points] for values in cells]
+        # Positions about the middle of the image.
         centres = _cell_grid(height, width, near).flatten(1)
         middle = centres.mean(1, keepdim=True)  # small numbers keep the moments exact
         centres = centres - middle
         cells[0] = cells[0] - middle
         # The moments are small differences of large sums, which bfloat16 would leave nothing of.
         with torch.autocast(near.device.type, enabled=False):
-            parts = [
-                self._fit(queries[:, :, i : i + FIT_CHUNK], centres[:, i : i + FIT_CHUNK], keys,
-                          *cells)
-                for i in range(0, height * width, FIT_CHUNK)
-            ]  # fmt: skip
-        rows = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
-        estimates, distance, *of_prior = (x.reshape(*x.shape[:-1], height, width) for x in rows)
+            fits_of_chunks = []
+            for first in range(0, height * width, FIT_CHUNK):
+                chunk = slice(first, first + FIT_CHUNK)
+                fits_of_chunks.append(
+                    self._fit(queries[:, :, chunk], centres[:, chunk], keys, *cells)
+                )
+        fits = [torch.cat(chunks, dim=-1) for chunks in zip(*fits_of_chunks, strict=True)]
+        maps = [values.reshape(*values.shape[:-1], height, width) for values in fits]
+        estimates, distance, *of_prior = maps
         if prior is None:
             return Fit(estimates, distance.unsqueeze(1))
+        # The prior is known where its own pixel is, and enough of what its residuals are fitted to.
         residual, std, reliability, support = of_prior
         value, valid = prior.at(16)
         valid = valid * (support > 1e-4)
@@ -105,7 +122,7 @@ class PointFit(nn.Module):
 
     @staticmethod
     def _without_points(near: Tensor, prior: Prior | None) -> Fit:
-        """The prior as it is; 0, the median, without a prior."""
+        """Returns the prior as it is; 0, the median, without a prior."""
         zeros = torch.zeros_like(near[:, :FIT_HEADS], dtype=torch.float32)
         distance = zeros[:, :1] + 5.0
         if prior is None:
@@ -115,24 +132,26 @@ class PointFit(nn.Module):
 
     @staticmethod
     def _per_head(x: Tensor) -> Tensor:
-        """(B, heads, cells, key) in float32."""
+        """Returns keys or queries (B, heads · key, h, w) as (B, heads, cells, key), in float32."""
         return x.float().reshape(len(x), FIT_HEADS, FIT_KEY, -1).transpose(2, 3)
 
     @staticmethod
     def _cells(points: Points, prior: Prior | None) -> list[Tensor]:
-        """Weighted means over the points of each cell, (B, cells) each.
+        """Returns weighted means over the points of each cell at 1/16, (B, cells) each.
 
-        In order: position (B, 2, cells), value and log weight; with a prior, the residual against
-        it and the fraction of points where it is known; last, whether the cell has a point.
+        In order: position in cells (B, 2, cells), value and log weight; with a prior, the residual
+        against it and the fraction of points where it is known; last, whether the cell has a point.
         """
+        # Sums over the points of each cell.
         weight = points.at(points.weight)
         value = points.at(points.value)
-        here = [position / 16.0 * weight.detach() for position in points.positions()]
-        parts = [torch.ones_like(weight), weight, value * weight, *here]
+        weighted_positions = [axis / 16.0 * weight.detach() for axis in points.positions()]
+        addends = [torch.ones_like(weight), weight, value * weight, *weighted_positions]
         if prior is not None:
-            parts += [prior.weight, prior.weight * prior.residual]
-        means = points.pooled(parts, 16)
-        count, density, value, at, of_prior = means.tensor_split((1, 2, 3, 5), 1)
+            addends += [prior.weight, prior.weight * prior.residual]
+        sums = points.pooled(addends, 16)
+        count, density, value, at, of_prior = sums.tensor_split((1, 2, 3, 5), 1)
+        # Divided by the weights.
         safe = density.clamp(min=1e-6)
         reliability = torch.log((density / count.clamp(min=1e-6)).clamp(min=1e-6))
         cells = [(at / safe.detach()).flatten(2), (value / safe).flatten(1), reliability.flatten(1)]
@@ -145,11 +164,22 @@ class PointFit(nn.Module):
         self, queries: Tensor, centres: Tensor, keys: Tensor, at: Tensor, value: Tensor,
         reliability: Tensor, *more: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        """Estimates (B, heads, cells) and log distance (B, cells) for some of the cells.
+        """Returns planes at a chunk of the cells, through the C cells that have points.
 
-        With a prior also the fit of the residuals against it, the std of the residuals, the
-        reliability and the fraction of the weights on cells where the prior is known, each
-        (B, heads, cells).
+        Args:
+            queries: Queries of the chunk's cells (B, heads, cells, key).
+            centres: Row and column of their centres (2, cells).
+            keys: Keys of the cells with points (B, heads, C, key).
+            at: Position of their points (B, 2, C), as `centres`.
+            value: Value of their points (B, C), log depth minus the median.
+            reliability: Log weight of their points (B, C).
+            *more: With a prior, residual and known fraction (B, C); then whether a cell of this
+                image has points, (B, C) bool.
+
+        Returns:
+            Estimates (B, heads, cells) and log distance (B, cells). With a prior also the fit of
+            the residuals against it, their standard deviation, the reliability and the fraction of
+            the weights on cells where the prior is known, each (B, heads, cells).
         """
         # How much each cell with points counts for each query: near, reliable and alike.
         *of_prior, known = more
@@ -187,8 +217,14 @@ class PointFit(nn.Module):
     def _plane(self, centres: Tensor, moments: Tensor) -> Tensor:
         """Returns the value (B, heads, cells) at the centres of the plane with these moments.
 
-        moments (B, heads, cells, 8): weighted means of y, x, z, yy, xx, xy, yz and xz.
+        The slope is damped by `ridge`.
+
+        Args:
+            centres: Row and column of the centres (2, cells).
+            moments: Weighted means (B, heads, cells, 8) of y, x, z, yy, xx, xy, yz and xz, where z
+                is the value at row y and column x.
         """
+        # Covariances about the means of y, x and z.
         my, mx, mz, yy, xx, xy, yz, xz = moments.unbind(-1)
         yy = (yy - my * my).clamp(min=0.0)
         xx = (xx - mx * mx).clamp(min=0.0)

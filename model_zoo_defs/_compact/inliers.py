@@ -55,7 +55,12 @@ class InlierWeights(nn.Module):
         nn.init.constant_(self.leave.bias, 4.0)  # weights of exactly 1
 
     def forward(self, points: Points, cloud: Cloud) -> Tensor:
-        """The weights (B, 1, H, W), 1 away from the points; the cloud is of these points."""
+        """Returns the weights (B, 1, H, W), 1 away from the points.
+
+        Args:
+            points: Points of the batch.
+            cloud: The same points with their neighbours.
+        """
         with torch.autocast(points.mask.device.type, enabled=False):
             log_odds = self.log_odds(cloud)[cloud.stand_in]
         images = torch.split(log_odds, list(cloud.of_images))
@@ -64,19 +69,23 @@ class InlierWeights(nn.Module):
         return torch.ones_like(points.mask).masked_scatter(points.mask > 0, weights)
 
     def log_odds(self, cloud: Cloud) -> Tensor:
-        """Log odds (n,) of being an inlier."""
-        known = cloud.found.float().mean(1)
-        state = F.relu(self.enter(torch.stack([known, cloud.log_spacing / 3], 1)))
-        pairs = [_pairs(cloud, some) for some in chunks(cloud)]
+        """Returns each point's log odds (n,) of being an inlier."""
+        # A state begins with the fraction of the neighbours that are there, and the spacing.
+        neighbour_fraction = cloud.found.float().mean(1)
+        state = F.relu(self.enter(torch.stack([neighbour_fraction, cloud.log_spacing / 3], 1)))
+        pairs = [_pairs(cloud, chunk) for chunk in chunks(cloud)]
         for messages in self.rounds:
             state = messages(state, cloud, pairs)
         return cast(Tensor, self.leave(F.relu(self.score(state))).squeeze(1))
 
     @staticmethod
     def _margin(logits: Tensor) -> Tensor:
-        """Log odds that spare doubtful points of an image with hardly any outlier."""
-        outliers = torch.sigmoid(-logits).sum() / max(1, len(logits))
-        spoilt = (outliers - CLEAN_FRACTION) / (SPOILT_FRACTION - CLEAN_FRACTION)
+        """Returns what an image's log odds (n,) gain: much if it has hardly any outlier.
+
+        That spares doubtful points, which lie on thin objects there.
+        """
+        outlier_fraction = torch.sigmoid(-logits).sum() / max(1, len(logits))
+        spoilt = (outlier_fraction - CLEAN_FRACTION) / (SPOILT_FRACTION - CLEAN_FRACTION)
         return CLEAN_MARGIN * (1.0 - spoilt.clamp(0.0, 1.0))
 
 
@@ -101,12 +110,22 @@ class Messages(nn.Module):
         nn.init.zeros_(self.change.weight)
 
     def forward(self, state: Tensor, cloud: Cloud, pairs: list[Tensor]) -> Tensor:
+        """Returns the new state (n, WIDTH) of every point.
+
+        Args:
+            state: State (n, WIDTH).
+            cloud: The points and their neighbours.
+            pairs: What is known of the points and their neighbours (`_pairs`), chunk by chunk.
+        """
         sent = self.neighbour(state) + self.bias
-        # A part of the points at a time.
-        parts = zip(chunks(cloud), pairs, strict=True)
-        messages = [self._received(sent, cloud, some, of_some) for some, of_some in parts]
+        # Messages of the neighbours, a chunk of the points at a time.
+        messages = [
+            self._received(sent, cloud, chunk, pairs_of_chunk)
+            for chunk, pairs_of_chunk in zip(chunks(cloud), pairs, strict=True)
+        ]
         received = torch.cat(messages) if messages else state.new_zeros((0, 2 * WIDTH))
-        images = [
+        # The mean state of each image's senders, for each of its points.
+        image_states = [
             states[sends].mean(0, keepdim=True).expand_as(states)
             for states, sends in zip(
                 torch.split(state, list(cloud.counts)),
@@ -114,13 +133,20 @@ class Messages(nn.Module):
                 strict=True,
             )
         ]
-        hidden = self.update(torch.cat([state, received, torch.cat(images)], 1))
+        hidden = self.update(torch.cat([state, received, torch.cat(image_states)], 1))
         return state + cast(Tensor, self.change(F.relu(hidden)))
 
-    def _received(self, sent: Tensor, cloud: Cloud, some: slice, pairs: Tensor) -> Tensor:
-        """Weighted mean and maximum (m, 2 WIDTH) of the messages to some of the points."""
-        near = cloud.near[some]
-        found = cloud.found[some].unsqueeze(2)
+    def _received(self, sent: Tensor, cloud: Cloud, chunk: slice, pairs: Tensor) -> Tensor:
+        """Returns weighted mean and maximum (m, 2 WIDTH) of the messages to a chunk of m points.
+
+        Args:
+            sent: What each point sends (n, MESSAGE).
+            cloud: The points and their neighbours.
+            chunk: Numbers of the m points.
+            pairs: What is known of them and their neighbours (m, NEIGHBOURS, 17).
+        """
+        near = cloud.near[chunk]
+        found = cloud.found[chunk].unsqueeze(2)
         hidden = F.relu(F.linear(pairs, self.pair).add_(F.embedding(near, sent)), inplace=True)
         message = F.relu(F.linear(hidden, self.message, self.message_bias), inplace=True) * found
         attention = F.linear(hidden, self.attention).masked_fill(~found, -1e4).softmax(1)
@@ -130,38 +156,48 @@ class Messages(nn.Module):
 
 
 def chunks(cloud: Cloud) -> list[slice]:
-    """The points in parts, which bounds the memory."""
+    """Returns the numbers of the points in chunks of at most CHUNK, which bounds the memory."""
     return [slice(first, first + CHUNK) for first in range(0, len(cloud.value), CHUNK)]
 
 
-def _pairs(cloud: Cloud, some: slice) -> Tensor:
-    """What is known of some points and their neighbours (m, NEIGHBOURS, 17), 0 without one."""
-    near = cloud.near[some]
-    found = cloud.found[some].unsqueeze(2)
+def _pairs(cloud: Cloud, chunk: slice) -> Tensor:
+    """Returns what is known of m points and their neighbours (m, NEIGHBOURS, 17), 0 without one.
+
+    In order: agreement in depth, agreement in colour, and where the neighbour is.
+
+    Args:
+        cloud: The points and their neighbours.
+        chunk: Numbers of the m points.
+    """
+    near = cloud.near[chunk]
+    found = cloud.found[chunk].unsqueeze(2)
+    # Log depth, row, column and colour of the neighbours minus those of the point.
     table = torch.cat([cloud.value.unsqueeze(1), cloud.position, cloud.colour], 1)
-    relative = F.embedding(near, table) - table[some].unsqueeze(1)
-    difference, shift, colour = relative[..., 0], relative[..., 1:3], relative[..., 3:]
+    relative = F.embedding(near, table) - table[chunk].unsqueeze(1)
+    difference = relative[..., 0]
+    shift = relative[..., 1:3]
+    colour = relative[..., 3:]
     distance = shift.square().sum(2, keepdim=True).sqrt()
-    spacing = cloud.log_spacing[some].view(-1, 1, 1).expand_as(distance)
+    spacing = cloud.log_spacing[chunk].view(-1, 1, 1).expand_as(distance)
     place = [shift / 2, distance / 2, 1 / (distance + 0.3), spacing / 3]
     return torch.cat([_agreement(difference), _similarity(colour), *place], 2) * found
 
 
 def _agreement(difference: Tensor) -> Tensor:
-    """Differences of log depth (...,) at several scales (..., AGREEMENT)."""
+    """Returns differences of log depth (...,) at several scales (..., AGREEMENT)."""
     signed = [torch.tanh(difference / scale) for scale in (0.02, 0.06, 0.2, 0.7)]
     same = [torch.exp(-difference.abs() / scale) for scale in (0.03, 0.1)]
     return torch.stack(signed + same, -1)
 
 
 def _similarity(difference: Tensor) -> Tensor:
-    """Differences of colour (..., 3) and of their size at several scales (..., COLOUR)."""
+    """Returns differences of colour (..., 3), and their size at several scales, (..., COLOUR)."""
     size = difference.abs().sum(-1, keepdim=True)
     near = [torch.exp(-size / scale) for scale in (0.3, 1.0)]
     return torch.cat([difference / 2, size / 3, *near], -1)
 
 
 def _matrix(rows: int, columns: int) -> nn.Parameter:
-    """Weights (rows, columns), initialised as those of `nn.Linear`."""
+    """Returns weights (rows, columns), initialised as those of `nn.Linear`."""
     bound = 1 / math.sqrt(columns)
     return nn.Parameter(torch.empty(rows, columns).uniform_(-bound, bound))

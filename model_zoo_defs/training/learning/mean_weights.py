@@ -18,17 +18,21 @@ from model_zoo_defs.training.learning.learner import export
 
 
 def mean_of(weights: Sequence[Mapping[str, Tensor]], parts: Sequence[float]) -> dict[str, Tensor]:
-    """The mean of weights of the same names and shapes, each counting as its part, in float32."""
+    """Returns the weighted mean of several weights of one network, in float32.
+
+    Args:
+        weights: Tensors by name, of the same names and shapes.
+        parts: How much each of them counts.
+    """
     total = sum(parts)
-    return {
-        name: torch.stack(
-            [
-                fraction / total * tensors[name].float()
-                for tensors, fraction in zip(weights, parts, strict=True)
-            ]
-        ).sum(0)
-        for name in weights[0]
-    }
+    mean = {}
+    for name in weights[0]:
+        addends = [
+            part / total * tensors[name].float()
+            for tensors, part in zip(weights, parts, strict=True)
+        ]
+        mean[name] = torch.stack(addends).sum(0)
+    return mean
 
 
 def main() -> None:

@@ -14,23 +14,34 @@ from numpy.typing import NDArray
 Depth = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+PATTERNS = ("uniform", "scan lines", "grid", "corners", "window", "zones")
+PATTERN_PROBABILITIES = (0.45, 0.25, 0.06, 0.1, 0.05, 0.09)
+
 
 def draw(rng: Generator, depth: Depth, grey: Depth) -> Depth:
-    """Points of one random pattern with random faults; `grey` (H, W) 0..1 is the image."""
-    kind = rng.choice(6, p=(0.45, 0.25, 0.06, 0.1, 0.05, 0.09))
-    if kind == 1:
+    """Returns points of one random pattern with random faults.
+
+    Args:
+        rng: Random numbers.
+        depth: Dense depth.
+        grey: The image (H, W) 0..1.
+    """
+    kind = PATTERNS[rng.choice(len(PATTERNS), p=PATTERN_PROBABILITIES)]
+    if kind == "scan lines":
         sparse = scan_lines(rng, depth)
-    elif kind == 5:
+    elif kind == "zones":
         sparse = zones(rng, depth)
     else:
         count = int(np.exp(rng.uniform(np.log(5.0), np.log(depth.size / 8))))
-        if kind == 4:
+        if kind == "window":
             sparse = keep(depth, window(rng, depth.shape) & uniform(rng, depth, 4 * count))
-        elif kind == 3:
+        elif kind == "corners":
             sparse = triangulated(rng, keep(depth, corners(rng, depth, grey, count)))
+        elif kind == "grid":
+            sparse = keep(depth, jittered_grid(rng, depth, count))
         else:
-            pattern = jittered_grid if kind == 2 else uniform
-            sparse = keep(depth, pattern(rng, depth, count))
+            sparse = keep(depth, uniform(rng, depth, count))
+    # Holes.
     if rng.random() < 0.25:
         empty = window if rng.random() < 0.6 else strip
         sparse = keep(sparse, ~empty(rng, depth.shape))
@@ -38,7 +49,7 @@ def draw(rng: Generator, depth: Depth, grey: Depth) -> Depth:
 
 
 def strip(rng: Generator, shape: tuple[int, ...]) -> Mask:
-    """The image on one side of a random line: 0.1 to 0.7 of its pixels."""
+    """Returns a mask of the image on one side of a random line: 0.1 to 0.7 of its pixels."""
     height, width = shape
     angle = rng.uniform(0.0, 2.0 * np.pi)
     rows, columns = np.indices(shape, dtype=np.float32)
@@ -47,7 +58,7 @@ def strip(rng: Generator, shape: tuple[int, ...]) -> Mask:
 
 
 def triangulated(rng: Generator, sparse: Depth) -> Depth:
-    """Points with triangulation errors: sigma grows with depth, 1 to 5 % are outliers."""
+    """Returns the points with errors of triangulation, which grow with depth, and outliers."""
     known = sparse > 0
     if not known.any():
         return sparse
@@ -61,18 +72,23 @@ def triangulated(rng: Generator, sparse: Depth) -> Depth:
 
 
 def zones(rng: Generator, depth: Depth) -> Depth:
-    """Points of a multi-zone time-of-flight sensor: one depth per zone, holes, mixed edges."""
-    rows, columns = (int(n) for n in rng.integers(6, 33, 2))
+    """Returns points of a time-of-flight sensor: a depth per zone, holes, mixed edges."""
+    # The middle pixel of each zone, and a pixel beside it.
+    row_count, column_count = (int(count) for count in rng.integers(6, 33, 2))
     height, width = depth.shape
-    r = ((np.arange(rows) + 0.5) * height / rows).astype(int)
-    c = ((np.arange(columns) + 0.5) * width / columns).astype(int)
-    at = np.ix_(r, c)
-    reach = np.minimum(int(rng.integers(1, 5)), min(height // rows, width // columns) // 2 + 1)
-    aside = np.ix_(np.clip(r + reach, 0, height - 1), np.clip(c + reach, 0, width - 1))
-    value, second = depth[at], depth[aside]
+    rows = ((np.arange(row_count) + 0.5) * height / row_count).astype(int)
+    columns = ((np.arange(column_count) + 0.5) * width / column_count).astype(int)
+    at = np.ix_(rows, columns)
+    zone_side = min(height // row_count, width // column_count)
+    reach = np.minimum(int(rng.integers(1, 5)), zone_side // 2 + 1)
+    aside = np.ix_(np.clip(rows + reach, 0, height - 1), np.clip(columns + reach, 0, width - 1))
+    value = depth[at]
+    second = depth[aside]
+    # At edges a zone gives a mean of both.
     mixed = (rng.random(value.shape) < rng.uniform(0.0, 0.5)) & (second > 0)
     fraction = rng.random(value.shape, dtype=np.float32)
     value = np.where(mixed & (value > 0), fraction * value + (1.0 - fraction) * second, value)
+    # Zones without an answer, by chance or beyond a range.
     returned = rng.random(value.shape) >= rng.uniform(0.0, 0.3)
     if rng.random() < 0.5:
         known = value[value > 0]
@@ -84,12 +100,12 @@ def zones(rng: Generator, depth: Depth) -> Depth:
 
 
 def keep(depth: Depth, mask: Mask) -> Depth:
-    """The depth where the mask is true, 0 elsewhere."""
+    """Returns the depth where the mask is true, 0 elsewhere."""
     return np.where(mask, depth, np.float32(0.0))
 
 
 def uniform(rng: Generator, depth: Depth, count: int) -> Mask:
-    """`count` known pixels, each as likely as any other (all of them where fewer are known)."""
+    """Returns a mask of `count` known pixels, each as likely as any other; or of all."""
     known = np.flatnonzero(depth)
     mask = np.zeros(depth.size, dtype=bool)
     mask[rng.choice(known, size=min(count, known.size), replace=False)] = True
@@ -97,7 +113,7 @@ def uniform(rng: Generator, depth: Depth, count: int) -> Mask:
 
 
 def jittered_grid(rng: Generator, depth: Depth, count: int) -> Mask:
-    """About `count` pixels on a regular grid, each moved by at most a random part of a step."""
+    """Returns a mask of about `count` pixels on a grid, each moved by at most a part of a step."""
     height, width = depth.shape
     step = max(1.0, (depth.size / count) ** 0.5)
     jitter = rng.choice((0.0, rng.uniform(0.0, 1.0)))
@@ -112,10 +128,10 @@ def jittered_grid(rng: Generator, depth: Depth, count: int) -> Mask:
 
 
 def corners(rng: Generator, depth: Depth, grey: Depth, count: int) -> Mask:
-    """`count` known pixels where the image has much gradient, as feature points have."""
+    """Returns a mask of `count` known pixels where the image `grey` (H, W) has much gradient."""
     dy, dx = np.gradient(grey)
     strength = np.hypot(dy, dx).ravel() + 1e-4
-    # the largest of strength^p times a random number (Efraimidis and Spirakis' reservoir keys)
+    # Drawn with weights strength^p: the largest keys of Efraimidis and Spirakis' reservoir.
     keys = np.log(rng.random(depth.size)) / (strength ** rng.uniform(0.7, 2.0))
     keys[depth.ravel() == 0] = -np.inf
     count = min(count, int(np.count_nonzero(depth)))
@@ -126,7 +142,7 @@ def corners(rng: Generator, depth: Depth, grey: Depth, count: int) -> Mask:
 
 
 def window(rng: Generator, shape: tuple[int, ...]) -> Mask:
-    """A random rectangle or ellipse of 10 to 80 per cent of the image's sides."""
+    """Returns a mask of a random rectangle or ellipse, of 10 to 80 per cent of the sides."""
     height, width = shape
     half = rng.uniform(0.05, 0.4, 2) * (height, width)
     centre = rng.uniform(0.1, 0.9, 2) * (height, width)
@@ -138,14 +154,15 @@ def window(rng: Generator, shape: tuple[int, ...]) -> Mask:
 
 
 def scan_lines(rng: Generator, depth: Depth) -> Depth:
-    """Points of a spinning LiDAR: slightly bowed lines, dense along them, nothing at the top.
+    """Returns points of a spinning LiDAR: slightly bowed lines, dense along them, none at the top.
 
     Some points lie behind the surface the camera sees at their pixel, because of the parallax
     between scanner and camera (`leak`).
     """
     height, width = depth.shape
+    # Pixels from line to line.
     spacing = float(np.exp(rng.uniform(np.log(1.5), np.log(height / 4))))
-    # single scanners are dense along the line, also when their lines are far apart
+    # Pixels along a line: single scanners are dense, also when their lines are far apart.
     stride = rng.uniform(1.0, 3.5)
     top = rng.uniform(0.0, 0.45) * height if rng.random() < 0.8 else 0.0
     lines = np.arange(top, height, spacing)
@@ -154,6 +171,7 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
     tilt = rng.uniform(-0.03, 0.03) * height
     position = across / width * 2.0 - 1.0
     rows = lines[:, None] + (bow * position**2 + tilt * position)[None, :]
+    # Points off their line, and some that do not return.
     rows = rows + rng.normal(0.0, 0.3, rows.shape)
     columns = across[None, :] + rng.uniform(-0.4, 0.4, rows.shape)
     returned = rng.random(rows.shape) >= rng.uniform(0.0, 0.4)
@@ -163,7 +181,7 @@ def scan_lines(rng: Generator, depth: Depth) -> Depth:
 
 
 def leak(rng: Generator, depth: Depth) -> Depth:
-    """The depth map with the background's depth at some pixels beside depth edges.
+    """Returns the depth map with the background's depth at some pixels beside depth edges.
 
     The background is visible past an edge k pixels away when the parallax between the two depths,
     focal x baseline x (1/near − 1/far), is more than k pixels.
@@ -172,6 +190,7 @@ def leak(rng: Generator, depth: Depth) -> Depth:
     if not known.size:
         return depth
     height, width = depth.shape
+    # For each pixel another one, some pixels away in about one direction.
     reach = rng.integers(1, 9, depth.shape)
     turn = rng.choice((-1.0, 1.0)) * rng.uniform(0.0, 0.5) + rng.choice(
         (0.0, np.pi / 2, -np.pi / 2)
@@ -180,6 +199,7 @@ def leak(rng: Generator, depth: Depth) -> Depth:
     rows = np.clip(rows + np.rint(reach * np.sin(turn)).astype(int), 0, height - 1)
     columns = np.clip(columns + np.rint(reach * np.cos(turn)).astype(int), 0, width - 1)
     behind = depth[rows, columns]
+    # Metres times pixels.
     focal_baseline = rng.uniform(2.0, 12.0) * float(np.percentile(known, 20))
     with np.errstate(divide="ignore", invalid="ignore"):
         parallax_px = focal_baseline * (1.0 / depth - 1.0 / behind)
@@ -188,13 +208,13 @@ def leak(rng: Generator, depth: Depth) -> Depth:
 
 
 def faults(rng: Generator, sparse: Depth) -> Depth:
-    """The points with random noise, outliers and shift against the image; each may be absent."""
+    """Returns the points with random noise, outliers and shift; each may be absent."""
     mask = sparse > 0
     out = sparse.copy()
+    # Noise in proportion to depth, or of structured light, with the square of the depth.
     if rng.random() < 0.5:
         out *= 1.0 + rng.uniform(0.0, 0.03) * rng.standard_normal(sparse.shape, dtype=np.float32)
     elif rng.random() < 0.3:
-        # structured light: the error grows with the square of the depth
         gain = rng.uniform(0.0, 0.02) / max(float(sparse.max()), 1e-3)
         out += gain * sparse**2 * rng.standard_normal(sparse.shape, dtype=np.float32)
     if rng.random() < 0.4:
@@ -207,10 +227,11 @@ def faults(rng: Generator, sparse: Depth) -> Depth:
 
 
 def outliers(rng: Generator, sparse: Depth, fraction: float) -> Depth:
-    """The points with a fraction of outliers: scaled, uniform in the depth range, or swapped."""
+    """Returns the points with a fraction of outliers: scaled, uniform in the range, or swapped."""
     rows, columns = np.nonzero(sparse)
     chosen = rng.random(len(rows)) < fraction
-    rows, columns = rows[chosen], columns[chosen]
+    rows = rows[chosen]
+    columns = columns[chosen]
     if not len(rows):
         return sparse
     known = sparse[sparse > 0]
@@ -230,30 +251,32 @@ def outliers(rng: Generator, sparse: Depth, fraction: float) -> Depth:
 
 
 def wrong_tracks(rng: Generator, sparse: Depth, fraction: float) -> Depth:
-    """The points with a fraction of outliers in groups of neighbours, each times one factor.
+    """Returns the points with a fraction of outliers in groups of neighbours, a factor each.
 
     Such are the points of wrong tracks of structure from motion.
     """
     rows, columns = np.nonzero(sparse)
     out = sparse.copy()
-    left = round(fraction * len(rows))
+    outliers_left = round(fraction * len(rows))
     spread = rng.uniform(0.2, 0.8)
     most = int(rng.integers(2, 13))
-    while left > 0:
-        size = min(max(int(rng.integers(2, most + 1)), len(rows) // 500), left)
-        one = int(rng.integers(len(rows)))
-        square = (rows - rows[one]) ** 2 + (columns - columns[one]) ** 2
+    while outliers_left > 0:
+        # The nearest points of a random one.
+        size = min(max(int(rng.integers(2, most + 1)), len(rows) // 500), outliers_left)
+        centre = int(rng.integers(len(rows)))
+        square = (rows - rows[centre]) ** 2 + (columns - columns[centre]) ** 2
         near = np.argpartition(square, size - 1)[:size]
         at = rows[near], columns[near]
         out[at] = sparse[at] * np.float32(np.exp(rng.normal(0.0, spread)))
-        left -= size
+        outliers_left -= size
     return out
 
 
-def _shifted(x: Depth, down: int, right: int) -> Depth:
-    height, width = x.shape
+def _shifted(sparse: Depth, down: int, right: int) -> Depth:
+    """Returns the points moved by whole pixels; those that leave the image are lost."""
+    height, width = sparse.shape
     reach = abs(down) + abs(right)
-    padded = np.pad(x, reach)
+    padded = np.pad(sparse, reach)
     top = reach - down
     left = reach - right
     return padded[top : top + height, left : left + width].copy()
@@ -262,9 +285,10 @@ def _shifted(x: Depth, down: int, right: int) -> Depth:
 def _mask_at(
     shape: tuple[int, ...], rows: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> Mask:
+    """Returns a mask of the pixels nearest to these positions; those outside are left out."""
     mask = np.zeros(shape, dtype=bool)
-    r = np.rint(rows).astype(int)
-    c = np.rint(columns).astype(int)
-    inside = (r >= 0) & (r < shape[0]) & (c >= 0) & (c < shape[1])
-    mask[r[inside], c[inside]] = True
+    row = np.rint(rows).astype(int)
+    column = np.rint(columns).astype(int)
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    mask[row[inside], column[inside]] = True
     return mask

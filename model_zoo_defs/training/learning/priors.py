@@ -32,11 +32,20 @@ def draw(
     other: Depth,
     fraction: float = PRIOR_FRACTION,
 ) -> Depth | None:
-    """A prior of a random kind for a `fraction` of the samples; `other` is an unrelated depth."""
+    """Returns a prior of a random kind, aligned to the points; None with 1 − `fraction`.
+
+    Args:
+        rng: Random numbers.
+        depth: Ground truth (H, W) in metres, 0 = unknown.
+        grey: The image (H, W) 0..1.
+        sparse: Points (H, W) in metres, 0 = unknown.
+        other: Depth of an unrelated frame, of any size.
+        fraction: Probability of a prior.
+    """
     if rng.random() >= fraction:
         return None
-    useless = rng.random() < NONSENSE_FRACTION
-    raw = nonsense(rng, depth.shape, other) if useless else damaged(rng, depth, grey)
+    is_useless = rng.random() < NONSENSE_FRACTION
+    raw = nonsense(rng, depth.shape, other) if is_useless else damaged(rng, depth, grey)
     prior = aligned(raw, sparse, affine=bool(rng.random() < 0.4))
     if rng.random() < 0.1:
         prior = np.where(window(rng, depth.shape), np.float32(0.0), prior)
@@ -44,39 +53,53 @@ def draw(
 
 
 def aligned(prior: Depth, sparse: Depth, *, affine: bool) -> Depth:
-    """The prior scaled to the points by the median ratio; affine in log depth on request.
+    """Returns the prior scaled to the points by the median ratio, or fitted in log depth.
 
-    The affine fit minimises the absolute residuals by reweighting; its slope stays in 0.3..3.
+    The fit minimises the absolute residuals by reweighting; its slope stays in 0.3..3.
+
+    Args:
+        prior: (H, W), 0 = unknown.
+        sparse: Points (H, W) in metres, 0 = unknown.
+        affine: Whether slope and offset of log depth are fitted.
     """
-    at = (sparse > 0) & (prior > 0)
-    if not at.any():
+    both = (sparse > 0) & (prior > 0)
+    if not both.any():
         return prior
-    x = np.log(prior[at])
-    y = np.log(sparse[at])
+    log_points = np.log(sparse[both])
+    log_at_points = np.log(prior[both])
     slope = 1.0
-    offset = float(np.median(y - x))
-    if affine and len(x) >= 5:
+    offset = float(np.median(log_points - log_at_points))
+    if affine and len(log_points) >= 5:
         for _ in range(5):
-            weight = 1.0 / np.maximum(np.abs(slope * x + offset - y), 0.02)
+            residual = slope * log_at_points + offset - log_points
+            weight = 1.0 / np.maximum(np.abs(residual), 0.02)
             weight /= weight.sum()
-            mx = float(weight @ x)
-            my = float(weight @ y)
-            variance = float(weight @ (x - mx) ** 2) + 1e-4
-            slope = float(np.clip(weight @ ((x - mx) * (y - my)) / variance, 0.3, 3.0))
-            offset = my - slope * mx
+            mean_at_points = float(weight @ log_at_points)
+            mean_points = float(weight @ log_points)
+            centred = log_at_points - mean_at_points
+            variance = float(weight @ centred**2) + 1e-4
+            covariance = weight @ (centred * (log_points - mean_points))
+            slope = float(np.clip(covariance / variance, 0.3, 3.0))
+            offset = mean_points - slope * mean_at_points
     log_prior = np.log(np.where(prior > 0, prior, 1.0))
     fitted = np.exp(np.clip(slope * log_prior + offset, -12.0, 12.0))
     return np.where(prior > 0, fitted, 0.0).astype(np.float32)
 
 
 def filled(depth: Depth) -> Tensor:
-    """Log depth (1, 1, H, W) with unknown pixels filled from coarser and coarser means."""
+    """Returns log depth (1, 1, H, W) with unknown pixels filled from coarser and coarser means.
+
+    Args:
+        depth: (H, W) in metres, 0 = unknown.
+    """
+    # Levels of half the size each: mean of known log depth, 0 where unknown, and known fraction.
     known = torch.from_numpy((depth > 0).astype(np.float32))[None, None]
     value = torch.from_numpy(np.log(np.where(depth > 0, depth, 1.0)).astype(np.float32))[None, None]
     levels = [(value * known, known)]
     while min(levels[-1][0].shape[-2:]) > 1:
-        total, fraction = (F.avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1])
+        total, fraction = (F.avg_pool2d(level, 2, ceil_mode=True) for level in levels[-1])
         levels.append((total, fraction))
+    # From the coarsest level on, each fills what the finer one lacks.
     result = levels[-1][0] / levels[-1][1].clamp(min=1e-6)
     for total, fraction in reversed(levels[:-1]):
         coarse = _enlarged(result, total.shape[-2:])
@@ -85,9 +108,10 @@ def filled(depth: Depth) -> Tensor:
 
 
 def damaged(rng: Generator, depth: Depth, grey: Depth) -> Depth:
-    """Ground truth with random errors of depth networks; metres up to scale.
+    """Returns ground truth (H, W) with random errors of depth networks, up to scale.
 
-    One severity per prior scales all errors: some priors are nearly exact, others poor throughout.
+    `grey` (H, W) 0..1 is the image, whose texture may shine through. One severity per prior scales
+    all errors: some priors are nearly exact, others poor throughout.
     """
     severity = float(rng.uniform(0.05, 1.0) ** 1.5)
     log_depth = filled(depth)
@@ -103,7 +127,7 @@ def damaged(rng: Generator, depth: Depth, grey: Depth) -> Depth:
 
 
 def nonsense(rng: Generator, shape: tuple[int, ...], other: Depth) -> Depth:
-    """A dense depth unrelated to the sample."""
+    """Returns a dense depth (shape) unrelated to the sample: constant, noise or that of `other`."""
     kind = rng.integers(4)
     if kind == 0:
         return np.ones(shape, np.float32)
@@ -207,8 +231,10 @@ def _field(rng: Generator, like: Tensor, cells: int, channels: int = 1) -> Tenso
 
 
 def _smooth(x: Tensor, factor: int) -> Tensor:
+    """Returns a map (1, 1, H, W) averaged over cells of so many pixels and enlarged again."""
     return _enlarged(F.avg_pool2d(x, factor, ceil_mode=True), x.shape[-2:])
 
 
 def _enlarged(x: Tensor, size: tuple[int, ...] | torch.Size) -> Tensor:
+    """Returns a map (1, c, …) at the size (H, W), interpolated bilinearly."""
     return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)

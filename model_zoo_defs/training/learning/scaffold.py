@@ -32,6 +32,7 @@ def scaffolded(network: nn.Module, layers: Sequence[str]) -> nn.Module:
 
 
 def _through_scaffold(layer: nn.Module, _: tuple[Tensor, ...], output: Tensor) -> Tensor:
+    """Returns a layer's output normalised by its scaffold; torch calls this hook."""
     normed: Tensor = layer.get_submodule(SCAFFOLD)(output)
     return normed
 

@@ -33,7 +33,7 @@ from model_zoo_defs.training.learning.validation import Case, cases, scores
 SIGMA_WEIGHT = 0.1
 # Stages of the encoder that are trained if any are: those at 1/16 and 1/32.
 ENCODER_STAGES = ("s16", "s32")
-# Weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size
+# Weights of the depths at 1/16, 1/8, 1/4, 1/2 and full size.
 LEVEL_WEIGHTS = (0.15, 0.2, 0.3, 0.4, 1.0)
 
 
@@ -146,15 +146,16 @@ def depth_loss(depth: Tensor, ground_truth: Tensor) -> Tensor:
     safe = torch.where(known, ground_truth, depth.detach())
     count = known.sum((1, 2, 3)).clamp(min=1)
     log_error = (torch.log(depth) - torch.log(safe)).abs().sum((1, 2, 3)) / count
-    rows = zip(ground_truth.flatten(1), known.flatten(1), strict=True)
-    medians = torch.stack(
-        [row[seen].median() if bool(seen.any()) else row.new_ones(()) for row, seen in rows]
-    )
-    error = ((depth - safe).abs().sum((1, 2, 3)) / count) / medians
+    medians = []
+    for depths, are_known in zip(ground_truth.flatten(1), known.flatten(1), strict=True):
+        has_any = bool(are_known.any())
+        medians.append(depths[are_known].median() if has_any else depths.new_ones(()))
+    error = ((depth - safe).abs().sum((1, 2, 3)) / count) / torch.stack(medians)
     return torch.log(log_error + 0.5 * error + 1e-2).mean()
 
 
 def _loader(settings: Settings, first_step: int) -> Iterable[Sample]:
+    """Returns the batches of samples from a step on to the end of the run."""
     start = first_step * settings.batch
     numbers = Counting(start, (settings.steps - first_step) * settings.batch)
     data = Samples(settings.data, settings.size, settings.seed)
@@ -188,6 +189,7 @@ def train(settings: Settings) -> Path:
 
 
 def _report(run: Run, held_out: list[Case], loss: float) -> None:
+    """Saves the run, and appends its loss and its scores on the held-out cases to its files."""
     run.save()
     out = run.out
     now = {"step": float(run.step), "seconds": round(run.elapsed_s)}
@@ -199,6 +201,7 @@ def _report(run: Run, held_out: list[Case], loss: float) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
+    """Returns (height, width) of a text such as 192x256."""
     height, width = text.split("x")
     return int(height), int(width)
 

@@ -98,7 +98,9 @@ def example(sparse: Tensor, ground_truth: Tensor, rgb: Tensor, where: float) -> 
     if len(rows) > MOST_POINTS:
         first = int(where * (len(rows) - MOST_POINTS))
         strip = slice(int(rows[first]), int(rows[first + MOST_POINTS - 1]) + 1)
-        sparse, value, ground_truth = sparse[strip], value[strip], ground_truth[strip]
+        sparse = sparse[strip]
+        value = value[strip]
+        ground_truth = ground_truth[strip]
         rgb = rgb[:, strip]
     at = sparse > 0
     cloud = Cloud.of_image(at, value, rgb)
@@ -165,6 +167,7 @@ def fit(layer: InlierWeights, examples: Sequence[Example], steps: int, seed: int
 
 
 def _first(batch: list[Example]) -> Example:
+    """Returns the only example of a loader's batch of one."""
     return batch[0]
 
 

@@ -27,21 +27,24 @@ PATTERNS: dict[str, Callable[[np.random.Generator, Depth], Depth]] = {
 
 
 class Case(NamedTuple):
-    """One frame with points: rgb (1, 3, H, W), sparse (1, 1, H, W), depth and linear (H, W).
-
-    linear: interpolation of the points before outliers were added; prior as `sparse`.
-    """
+    """One frame with points."""
 
     pattern: str
+    """Name of the pattern of the points, and of what was changed."""
     rgb: Tensor
+    """(1, 3, H, W), normalised."""
     sparse: Tensor
+    """(1, 1, H, W) metres, 0 = unknown."""
     depth: Depth
+    """Ground truth (H, W) in metres, 0 = unknown."""
     linear: Depth
+    """Linear interpolation (H, W) of the points before outliers were added."""
     prior: Tensor | None = None
+    """(1, 1, H, W) metres, 0 = unknown; None without."""
 
 
 def linear_interpolation(sparse: Depth) -> Depth:
-    """Linear interpolation of a map's known pixels, (H, W) metres."""
+    """Returns the linear interpolation of a map's known pixels, (H, W) metres."""
     rows, columns = np.nonzero(sparse)
     points = SparsePoints(
         xy=torch.from_numpy(np.stack([columns, rows], axis=1).astype(np.float32)),
@@ -52,7 +55,7 @@ def linear_interpolation(sparse: Depth) -> Depth:
 
 
 def cases(folder: Path, count: int) -> list[Case]:
-    """`count` evenly spaced frames of the folder, each with every pattern."""
+    """Returns cases of `count` evenly spaced frames of the folder, with every pattern each."""
     frames = Frames(folder)
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
     chosen_cases: list[Case] = []
@@ -73,11 +76,19 @@ def cases(folder: Path, count: int) -> list[Case]:
 def _variants(
     rng: np.random.Generator, case: Case, rgb: NDArray[np.uint8], other: Depth
 ) -> list[Case]:
-    """The case with a damaged prior, with an unrelated prior, and with 20 % outliers."""
+    """Returns the case with a damaged prior, with an unrelated prior, and with 20 % outliers.
+
+    Args:
+        rng: Random numbers.
+        case: The case.
+        rgb: Its image (H, W, 3).
+        other: Depth of another frame.
+    """
     sparse = case.sparse[0, 0].numpy()
     grey = (rgb.mean(-1) / 255.0).astype(np.float32)
 
     def with_prior(kind: str, prior: Depth) -> Case:
+        """Returns the case with a prior, aligned to its points."""
         dense = priors.aligned(prior, sparse, affine=False)
         return case._replace(
             pattern=f"{case.pattern}_{kind}", prior=torch.from_numpy(dense)[None, None]
@@ -93,7 +104,7 @@ def _variants(
 
 @torch.no_grad()
 def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[str, float]:
-    """MAE and RMSE of the network in per cent of those of linear interpolation, per pattern."""
+    """Returns MAE and RMSE in per cent of those of linear interpolation, PATTERN_mae and _rmse."""
     network.eval()
     ratios: dict[str, list[tuple[float, float]]] = {}
     for case in some:
@@ -108,10 +119,10 @@ def scores(network: nn.Module, some: list[Case], device: torch.device) -> dict[s
                 float(np.sqrt((ours**2).mean() / (theirs**2).mean())),
             )
         )
-    # the geometric mean over frames: every frame counts alike, however far its walls are
-    result = {}
+    # The geometric mean over frames: every frame counts alike, however far its walls are.
+    per_cent = {}
     for pattern, pairs in ratios.items():
         mae, rmse = np.exp(np.log(np.array(pairs) + 1e-9).mean(0)) * 100.0
-        result[f"{pattern}_mae"] = float(mae)
-        result[f"{pattern}_rmse"] = float(rmse)
-    return result
+        per_cent[f"{pattern}_mae"] = float(mae)
+        per_cent[f"{pattern}_rmse"] = float(rmse)
+    return per_cent

@@ -14,9 +14,13 @@ from model_zoo_defs.training.rendering.shapes import FloatArray
 def photographed(
     colour: FloatArray, rng: np.random.Generator, *, clean: bool = False
 ) -> npt.NDArray[np.uint8]:
-    """Returns the stored image (H, W, 3) of linear light (H, W, 3).
+    """Returns the stored image (H, W, 3) that a random camera takes.
 
-    clean: without vignetting, blur, noise and compression; exposure and white balance stay.
+    Args:
+        colour: Linear light (H, W, 3) of any brightness.
+        rng: Random numbers.
+        clean: Whether vignetting, blur, noise and compression are left out; exposure and white
+            balance stay.
     """
     height, width = colour.shape[:2]
     # The mean of log light decides the exposure, so a bright window may burn out.
@@ -48,10 +52,12 @@ def photographed(
 
 
 def _bytes(image: FloatArray) -> npt.NDArray[np.uint8]:
+    """Returns an image 0..1 as 0..255, clipped and rounded."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _blurred(image: FloatArray, sigma: float) -> FloatArray:
+    """Returns an image (H, W, 3) blurred by a Gaussian of below a pixel, of 3 taps an axis."""
     side = np.float32(np.exp(-0.5 / sigma**2))
     for axis in (0, 1):
         ends = np.concatenate([image.take([0], axis), image, image.take([-1], axis)], axis=axis)
@@ -62,6 +68,7 @@ def _blurred(image: FloatArray, sigma: float) -> FloatArray:
 
 
 def _compressed(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
+    """Returns an image (H, W, 3) as JPEG of this quality gives it back."""
     memory = io.BytesIO()
     Image.fromarray(image).save(memory, "JPEG", quality=quality)
     return np.asarray(Image.open(memory).convert("RGB"))

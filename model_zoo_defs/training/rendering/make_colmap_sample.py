@@ -79,8 +79,13 @@ def make_photos(folder: Path) -> float:
 
 
 def _moved(first: View, number: int) -> LensView:
+    """Returns the view of a photo: beside the first view, turned to keep looking at one point.
+
+    The photos lie in a row whose middle is the first view; every second one is 0.1 m lower.
+    """
     along = (number - (PHOTOS - 1) / 2) * _STEP_M
-    right, down = first.axes[:, 0], first.axes[:, 1]
+    right = first.axes[:, 0]
+    down = first.axes[:, 1]
     position = first.position + along * right + 0.1 * (number % 2) * down
     turn = rotation(along / _PIVOT_M, 0.0, 0.0).astype(np.float32)
     moved = replace(first, position=position.astype(np.float32), axes=turn @ first.axes)

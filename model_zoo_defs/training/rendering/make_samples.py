@@ -128,6 +128,10 @@ def make_street(folder: Path) -> None:
 def _write_images(
     world: World, view: View, rng: np.random.Generator, folder: Path, scale: int
 ) -> FloatArray:
+    """Writes rgb.png and gt.png of a view; returns its depth (H, W) in metres.
+
+    The scale is integers a metre in gt.png.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     colour, depth = seen(world, view, rng, ambient_rays=_AMBIENT_RAYS)
     image = Image.fromarray(photographed(colour, rng, clean=True))
@@ -218,6 +222,7 @@ def write_depth(path: Path, depth: npt.NDArray[np.floating], scale: int) -> None
 
 
 def _write(path: Path, fill: Callable[[BytesIO], object]) -> None:
+    """Writes a file, whole or not at all, with what the function writes to a stream."""
     memory = BytesIO()
     fill(memory)
     temporary = path.with_name(path.name + ".tmp")

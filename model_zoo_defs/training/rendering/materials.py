@@ -93,6 +93,10 @@ class Palette:
         return len(self.materials) - 1
 
     def _store(self, image: npt.NDArray[np.uint8]) -> int:
+        """Keeps a texture (SIDE, SIDE, 3) with its smaller levels; returns its number.
+
+        A texel is four bytes: red, green, blue and 0.
+        """
         level: npt.NDArray[np.floating] = image.astype(np.float32)
         packed = []
         for _ in range(_LEVELS):
@@ -141,8 +145,11 @@ class MaterialTable:
     ) -> FloatArray:
         """Returns linear reflectance (n, 3) at texture coordinates (n, 2) in metres.
 
-        footprint_m: width of the surface patch seen by the ray; it selects the mipmap level, which
-        avoids aliasing on far surfaces.
+        Args:
+            material: Numbers of the materials (n,).
+            uv: Texture coordinates (n, 2) in metres.
+            footprint_m: Width (n,) of the surface patch that a ray sees; it selects the mipmap
+                level, which avoids aliasing on far surfaces.
         """
         per_m = self.tiles_per_m[material]
         coordinates = uv * per_m[:, None] + self.offset[material]
@@ -161,6 +168,14 @@ class MaterialTable:
     def _bilinear(
         self, coordinates: FloatArray, level: npt.NDArray[np.int32], base: npt.NDArray[np.int32]
     ) -> FloatArray:
+        """Returns display colours (n, 3) 0..255, interpolated between four texels each.
+
+        Args:
+            coordinates: (n, 2) in tiles.
+            level: Mipmap level (n,), 0 is the finest.
+            base: Number (n,) of the first texel of that level of the texture.
+        """
+        # The texel below and to the left, and how far the point is from it.
         side = (np.int32(SIDE) >> level).astype(np.int32)
         spot = coordinates * side[:, None].astype(np.float32) - np.float32(0.5)
         corner = np.floor(spot)
@@ -171,7 +186,9 @@ class MaterialTable:
         v0 = low[:, 1] & mask
         u1 = (low[:, 0] + 1) & mask
         v1 = (low[:, 1] + 1) & mask
-        fu, fv = part[:, :1], part[:, 1:]
+        fu = part[:, :1]
+        fv = part[:, 1:]
+        # Tiles repeat: sides are powers of two, so a mask gives the remainder.
         total = np.zeros((len(coordinates), 3), np.float32)
         for u, v, weight in (
             (u0, v0, (1 - fu) * (1 - fv)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -60,7 +61,8 @@ def render_shard(job: Job, index: int) -> int:
     if target.exists():
         return count
     frames: list[Frame] = []
-    for scene in range(first // VIEWS_PER_SCENE, -(-(first + count) // VIEWS_PER_SCENE)):
+    first_scene = first // VIEWS_PER_SCENE
+    for scene in range(first_scene, math.ceil((first + count) / VIEWS_PER_SCENE)):
         frames += job.scene(scene)
     frames = frames[:count]
     temporary = target.with_suffix(f".{os.getpid()}.tmp")
@@ -79,7 +81,7 @@ def render_shard(job: Job, index: int) -> int:
 def render_all(job: Job, *, workers: int) -> None:
     """Writes every missing shard; the bytes do not depend on the number of workers."""
     job.out.mkdir(parents=True, exist_ok=True)
-    indices = range(-(-job.frames // job.shard_frames))
+    indices = range(math.ceil(job.frames / job.shard_frames))
     work = partial(render_shard, job)
     with tqdm(total=job.frames, unit="frame", smoothing=0.05) as progress:
         if workers == 1:
@@ -92,6 +94,7 @@ def render_all(job: Job, *, workers: int) -> None:
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Returns the options of the command line; None reads those of the process."""
     parser = argparse.ArgumentParser(description="Render random scenes with exact depth.")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
     parser.add_argument("--frames", type=int, default=4000)

@@ -13,9 +13,15 @@ from model_zoo_defs.training.scenes.world import Hits, View, World
 def seen(
     world: World, view: View, rng: np.random.Generator, *, ambient_rays: int = 3
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns linear colour (H, W, 3) and exact depth along the axis (H, W), 0 unknown.
+    """Returns what a camera sees: linear colour (H, W, 3), exact depth along the axis (H, W).
 
-    ambient_rays: per pixel, for ambient occlusion; more give less noise.
+    Depth is 0 where it is unknown: where no surface is met, or beyond the world's reach.
+
+    Args:
+        world: The scene.
+        view: The camera.
+        rng: Random numbers.
+        ambient_rays: Rays a pixel for ambient occlusion; more give less noise.
     """
     shape = (view.height, view.width)
     origins, directions = view.grid()
@@ -125,6 +131,15 @@ def _toward(
 
 
 def _lit(world: World, hits: Hits, back: FloatArray, visible: FloatArray) -> FloatArray:
+    """Returns the light (n, 3) that falls on matt surfaces, by Lambert's law.
+
+    Args:
+        world: The scene.
+        hits: Points on the surfaces.
+        back: Unit directions to the camera (n, 3).
+        visible: What reaches each point of the surroundings and of each light, of `_visibility`.
+    """
+    # Of the surroundings, between the colour below and that above.
     up = (0.5 + 0.5 * hits.normals[:, 2:]).astype(np.float32)
     above = np.asarray(world.sky.ambient_up, np.float32)
     below = np.asarray(world.sky.ambient_down, np.float32)
@@ -138,12 +153,18 @@ def _lit(world: World, hits: Hits, back: FloatArray, visible: FloatArray) -> Flo
 
 
 def _highlights(world: World, hits: Hits, back: FloatArray, visible: FloatArray) -> FloatArray:
+    """Returns the light (n, 3) of highlights on glossy surfaces, by Blinn and Phong's model.
+
+    The arguments are those of `_lit`.
+    """
     gloss = world.table.gloss[hits.material]
     result = np.zeros((len(gloss), 3), np.float32)
     shiny = np.flatnonzero((gloss > 0) & hits.met)
     if not len(shiny):
         return result
-    normals, points, gloss = hits.normals[shiny], hits.points[shiny], gloss[shiny]
+    normals = hits.normals[shiny]
+    points = hits.points[shiny]
+    gloss = gloss[shiny]
     for index, lamp in enumerate(world.lights):
         toward, strength = _toward(lamp.position, lamp.sun, points)
         middle = toward + back[shiny]
@@ -162,7 +183,8 @@ def _reflect(
     pick = np.flatnonzero((mirror > 0) & hits.met)
     if not len(pick):
         return
-    normals, gaze = hits.normals[pick], back[pick]
+    normals = hits.normals[pick]
+    gaze = back[pick]
     away = 2 * np.einsum("ij,ij->i", normals, gaze)[:, None] * normals - gaze
     start = hits.points[pick] + hits.flat[pick] * (2e-3 + 3e-4 * hits.t[pick])[:, None]
     again = world.cast(start, np.ascontiguousarray(away, dtype=np.float32))
@@ -173,6 +195,7 @@ def _reflect(
 
 
 def _sky(world: World, gaze: FloatArray) -> FloatArray:
+    """Returns the colour (n, 3) of the sky in unit directions (n, 3), with its clouds."""
     height = np.clip(gaze[:, 2:], 0, 1) ** 0.6
     zenith = np.asarray(world.sky.zenith, np.float32)
     horizon = np.asarray(world.sky.horizon, np.float32)
@@ -189,6 +212,7 @@ def _sky(world: World, gaze: FloatArray) -> FloatArray:
 _EDGE_SAMPLES: npt.NDArray[np.float32] = np.array(
     [[-0.13, -0.38], [0.38, -0.13], [0.13, 0.38], [-0.38, 0.13]], np.float32
 )
+"""Where a pixel on an edge is sampled: columns and rows from its centre, a rotated grid."""
 
 
 def _smooth_edges(
@@ -204,6 +228,7 @@ def _smooth_edges(
     material = np.where(hits.met, hits.material, -1).reshape(shape)
     t = hits.t.reshape(shape)
     normals = hits.flat.reshape(*shape, 3)
+    # Pixels that differ from a neighbour in material, distance or direction.
     edge = np.zeros(shape, bool)
     for axis in (0, 1):
         here = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
@@ -217,7 +242,9 @@ def _smooth_edges(
     v, u = np.nonzero(edge)
     if not len(v):
         return
-    du, dv = _EDGE_SAMPLES[:, :1], _EDGE_SAMPLES[:, 1:]
+    # Four samples of each of these pixels.
+    du = _EDGE_SAMPLES[:, :1]
+    dv = _EDGE_SAMPLES[:, 1:]
     origins, directions = view.rays(u + du, v + dv)
     samples = world.cast(origins, directions)
     visible = _visibility(world, samples, rng, ambient_rays=ambient_rays)

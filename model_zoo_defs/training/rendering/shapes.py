@@ -87,6 +87,7 @@ class Group:
 
 
 def _moved(mesh: Mesh, at: Point, yaw: float, pitch: float, roll: float, scale: float) -> Mesh:
+    """Returns a copy of the mesh that is scaled, turned as by `rotation`, and moved to `at`."""
     offset = np.asarray(at, np.float32)
     if yaw == 0.0 and pitch == 0.0 and roll == 0.0:
         vertices = mesh.vertices * np.float32(scale) + offset
@@ -226,6 +227,7 @@ def superquadric(
 
 
 def _power(base: npt.NDArray[np.floating], exponent: float) -> npt.NDArray[np.floating]:
+    """Returns |base| to the power, with the sign of the base."""
     return np.asarray(np.sign(base) * np.abs(base) ** exponent)
 
 
@@ -272,6 +274,7 @@ def prism(outline: npt.ArrayLike, depth: float) -> Mesh:
     centre = np.broadcast_to(ring.mean(axis=0), ring.shape)
 
     def at(points: npt.NDArray[np.floating], y: float) -> npt.NDArray[np.floating]:
+        """Returns points (k, 2) of x and z as (k, 3) at this y."""
         return np.stack([points[:, 0], np.full(len(points), y), points[:, 1]], axis=1)
 
     half = depth / 2

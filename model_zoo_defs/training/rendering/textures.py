@@ -97,23 +97,27 @@ def _cells(
 
 
 def _plain(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): one colour with a faint grain."""
     amount = rng.choice([0.0, 0.06, 0.15])
     grain = noise(rng, smooth=rng.random())[..., None] - 0.5
     return np.asarray(base * (1 + amount * grain))
 
 
 def _plaster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): two close colours in clouds."""
     weight = 0.7 * noise(rng, smooth=0.9) + 0.3 * noise(rng, smooth=0.3)
     return mixed(near(rng, base), near(rng, base), weight)
 
 
 def _mottled(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): two colours in patches."""
     weight = noise(rng, smooth=rng.uniform(0.3, 0.95))
     weight = 0.5 + (weight - 0.5) * rng.uniform(1.0, 5.0)
     return mixed(base, near(rng, base, 0.25) if rng.random() < 0.6 else colour(rng), weight)
 
 
 def _wood(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): grain of wood along the columns."""
     rows = noise(rng, smooth=rng.uniform(0.6, 0.9))
     wander = (noise(rng, smooth=0.99) - 0.5) * 40
     index = (np.arange(SIDE)[:, None] + wander).astype(int) % SIDE
@@ -124,6 +128,7 @@ def _wood(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _planks(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): rows of planks with joints."""
     rows = int(rng.choice([4, 6, 8]))
     value, joint = _cells(rng, int(rng.integers(1, 3)), rows, stagger=0.43, gap=0.012)
     wood = _wood(rng, base) * (1 + rng.uniform(0.1, 0.5) * (value[..., None] - 0.5))
@@ -136,6 +141,7 @@ def mixed_over(image: FloatArray, ink: npt.ArrayLike, weight: FloatArray) -> Flo
 
 
 def _brick(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): staggered bricks with mortar."""
     columns = int(rng.choice([3, 4, 6]))
     value, joint = _cells(rng, columns, columns * 3, stagger=0.5, gap=0.09)
     wall = mixed(base, near(rng, base, 0.3), value) * (0.8 + 0.4 * noise(rng)[..., None])
@@ -143,6 +149,7 @@ def _brick(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _tiles(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): square tiles with joints."""
     count = int(rng.choice([2, 4, 8, 12]))
     value, joint = _cells(rng, count, count, stagger=0.0, gap=rng.uniform(0.03, 0.08))
     contrast = rng.choice([0.03, 0.1, 0.4])
@@ -151,6 +158,7 @@ def _tiles(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _paving(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): paving stones with joints."""
     columns = int(rng.integers(3, 7))
     value, joint = _cells(rng, columns, columns, stagger=rng.choice([0.0, 0.5]), gap=0.05)
     stone = base * (0.85 + 0.25 * value + 0.3 * (noise(rng, smooth=0.4) - 0.5))[..., None]
@@ -158,12 +166,14 @@ def _paving(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _checks(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): a chessboard of two colours."""
     count = 2 * int(rng.integers(1, 6))
     odd = (np.floor(_U * count) + np.floor(_V * count)) % 2
     return mixed(base, colour(rng, vivid=0.5), odd) * (0.9 + 0.2 * noise(rng)[..., None])
 
 
 def _stripes(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): stripes along the columns."""
     count = int(rng.integers(3, 40))
     levels = rng.random(count, dtype=np.float32)
     band = levels[np.floor(_V * count).astype(int)]
@@ -174,6 +184,7 @@ def _stripes(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _carpet(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): lines with a fine weave."""
     weave = noise(rng, smooth=0.05)
     lines = noise(rng, smooth=0.3)[:, :1]
     weight = rng.uniform(0.2, 0.9) * lines + rng.uniform(0.2, 0.7) * weave
@@ -181,6 +192,7 @@ def _carpet(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _fabric(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): woven cloth, some of it printed."""
     count = int(rng.choice([32, 48, 64]))
     weave = np.sin(_U * count * 2 * np.pi) * np.sin(_V * count * 2 * np.pi)
     shade = 1 + 0.12 * weave + 0.3 * (noise(rng, smooth=0.2) - 0.5)
@@ -191,6 +203,7 @@ def _fabric(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _spots(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): round spots in staggered rows."""
     count = int(rng.integers(3, 16))
     du = (_U * count) % 1 - 0.5
     dv = (_V * count + 0.5 * (np.floor(_U * count) % 2)) % 1 - 0.5
@@ -199,11 +212,13 @@ def _spots(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _marble(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): veins between two close colours."""
     vein: FloatArray = np.abs(np.sin((_U + _V) * 2 * np.pi + 9 * noise(rng, smooth=0.95)))
     return mixed(near(rng, base, 0.3), base, vein ** rng.uniform(0.2, 0.8))
 
 
 def _speckle(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): grains in two more colours."""
     image = base * (0.85 + 0.3 * noise(rng, smooth=0.2)[..., None])
     for _ in range(2):
         grains = (noise(rng, smooth=rng.uniform(0, 0.35)) > rng.uniform(0.65, 0.8)).astype(
@@ -214,11 +229,13 @@ def _speckle(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _foliage(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): leaves, dark to bright."""
     weight = 0.5 + 1.5 * (noise(rng, smooth=0.35) - 0.5)
     return mixed(base * 0.4, np.clip(base * 1.4, 0, 1), weight)
 
 
 def _brushed(rng: np.random.Generator, base: FloatArray) -> FloatArray:
+    """Returns an image (SIDE, SIDE, 3): fine lines of brushed metal."""
     lines = noise(rng, smooth=0.0)[:, :1] * np.ones((1, SIDE), np.float32)
     return base * (0.9 + 0.2 * lines[..., None])
 
@@ -269,6 +286,7 @@ def _poster(rng: np.random.Generator, base: FloatArray) -> FloatArray:
 
 
 def _contrasted(rng: np.random.Generator) -> FloatArray:
+    """Returns weights (SIDE, SIDE) 0..1 of smooth patches with clear borders."""
     return np.asarray(np.clip(0.5 + 3 * (noise(rng, smooth=0.95) - 0.5), 0, 1), np.float32)
 
 
@@ -277,6 +295,7 @@ Ink = tuple[int, int, int]
 
 
 def _ink(value: FloatArray) -> Ink:
+    """Returns a colour 0..1 as Pillow draws it."""
     red, green, blue = (int(255 * channel) for channel in np.clip(value, 0, 1))
     return red, green, blue
 

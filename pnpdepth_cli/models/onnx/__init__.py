@@ -38,17 +38,25 @@ from pnpdepth_cli.spent import spent_on
 if TYPE_CHECKING:
     from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, ValueInfoProto
 
-_OPSETS = range(7, 25)  # onnxruntime runs none that is older
-_MAX_BYTES = 1 << 31  # of a protocol buffer; larger weights lie in files beside it
-_SHARED = 2  # tensors that may have the same bytes of a file beside the model
+_OPSETS = range(7, 25)
+"""Versions of the standard that are covered; onnxruntime runs none that is older."""
+_MAX_BYTES = 1 << 31
+"""Bytes of a protocol buffer; larger weights lie in files beside it."""
+_SHARED = 2
+"""Tensors that may have the same bytes of a file beside the model."""
+_LEAST_PATCH = 8
+"""Pixels of the smallest patch of a vision transformer."""
 
 _STANDARD = ("", "ai.onnx")
+"""Names of the standard's own domain of operators."""
 _TO_SHAPES = ("Shape", "Size")
+"""Operators that give the shape of a tensor, or its number of elements."""
 _CONSTANT_ELEMENTS = 1 << 24
+"""Elements that any one computed constant may have."""
 _CONSTANT_GROWTH = 4
+"""Elements of one computed constant for each that is stored in the file, if that is more."""
 _CONSTANTS = 4
-"""One computed constant may have so many elements, or so many times those stored in the file; all
-of them together so many times as many as one."""
+"""Elements of all computed constants together over those that one may have."""
 
 _WORK = 1 << 32
 """Elements that may be read, and products summed, for all computed constants: seconds."""
@@ -72,13 +80,15 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
         ModelError: The file cannot be read, or the network cannot be run.
     """
     model, is_whole = _read(file)
+    # A constant may be listed among the inputs, as a default that a caller can replace.
     constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = {i.name: _shape(i) for i in model.graph.input if i.name not in constants}
-    is_part = _prune(model, _choose_output(model, output, file))
+    inputs = {value.name: _shape(value) for value in model.graph.input}
+    shapes = [shape for name, shape in inputs.items() if name not in constants]
+    is_pruned = _prune(model, _choose_output(model, output, file))
     # onnxruntime must not run what is pruned. From the file, it reads weights that lie beside it.
-    source = model.SerializeToString() if is_part else str(file)
+    source = model.SerializeToString() if is_pruned else str(file)
     return graph_definition(
-        list(inputs.values()), file, stated,
+        shapes, file, stated,
         size=Multiple(_patch_size(model) or ASSUMED_MULTIPLE),
         build=lambda: onnx_graph(model, file),
         summary=f"ONNX, opset {_opset(model)}, from {model.producer_name or 'no name'}",
@@ -88,9 +98,10 @@ def onnx_definition(file: Path, output: str | None = None, **stated: object) -> 
 
 
 def _read(file: Path) -> tuple[ModelProto, bool]:
-    """The onnx.ModelProto with its weights, of an opset that is covered.
+    """Returns the onnx.ModelProto with its weights, and whether all of it lies in the file.
 
-    True if all of it lies in the file.
+    Raises:
+        ModelError: A package is missing, or the file cannot be read or is not covered.
     """
     # The file, and the packages that read it.
     check_network_file(file, "ONNX file", _MAX_BYTES)
@@ -103,8 +114,8 @@ def _read(file: Path) -> tuple[ModelProto, bool]:
         raise ModelError(
             f"reading {file} needs {error.name}: pip install 'pnpdepth[onnx]'"
         ) from None
-    more = (DecodeError, onnx.checker.ValidationError)
-    with wrap_content_errors(f"ONNX file {file} cannot be read", *more):
+    errors_of_onnx = (DecodeError, onnx.checker.ValidationError)
+    with wrap_content_errors(f"ONNX file {file} cannot be read", *errors_of_onnx):
         model = onnx.load(str(file), load_external_data=False)
         is_whole = not _load_external(model, file.parent)
         _check_covered(model)
@@ -112,7 +123,7 @@ def _read(file: Path) -> tuple[ModelProto, bool]:
 
 
 def _check_covered(model: ModelProto) -> None:
-    """InputError unless it is one graph whose names are text, of an opset that is covered."""
+    """Raises InputError unless a model is one graph with names in UTF-8, of a covered opset."""
     if not model.graph.node:
         raise InputError("it holds no graph")
     if model.functions:
@@ -128,9 +139,15 @@ def _check_covered(model: ModelProto) -> None:
 
 
 def _load_external(model: ModelProto, folder: Path) -> bool:
-    """Reads the tensors that lie in files beside the model into it. True if there are any.
+    """Reads tensors that lie in files beside the model into it; returns whether there are any.
 
-    InputError if they claim more than these files have, or more than memory holds.
+    Args:
+        model: The model, which is changed.
+        folder: Folder of its file.
+
+    Raises:
+        InputError: They claim more than these files have, or more than memory holds.
+        ModelError: A file is missing.
     """
     from onnx import external_data_helper as external
 
@@ -139,6 +156,7 @@ def _load_external(model: ModelProto, folder: Path) -> bool:
         for tensor in external._get_all_tensors(model)
         if external.uses_external_data(tensor)
     ]
+    # All of them together claim no more than the files have.
     sizes = dict[str, int]()
     for location in dict.fromkeys(claim.location for claim in claims):
         check_network_file(folder / location, "its file")
@@ -152,55 +170,78 @@ def _load_external(model: ModelProto, folder: Path) -> bool:
 
 
 def _shape(value: ValueInfoProto) -> list[int | str]:
-    dims = value.type.tensor_type.shape.dim
-    return [d.dim_value if d.dim_value > 0 else d.dim_param or "?" for d in dims]
+    """Returns the shape of an input or output; a side of any length has a name, or "?"."""
+    sides = value.type.tensor_type.shape.dim
+    return [side.dim_value if side.dim_value > 0 else side.dim_param or "?" for side in sides]
 
 
 def _choose_output(model: ModelProto, wanted: str | None, file: Path) -> str:
-    outputs: dict[str, str] = {o.name: "×".join(map(str, _shape(o))) for o in model.graph.output}
-    if wanted is None and len(outputs) == 1:
-        return next(iter(outputs))
-    if wanted is not None and wanted in outputs:
+    """Returns the name of the output that is the depth.
+
+    Args:
+        model: The model.
+        wanted: Name that the user gave; None takes the only output.
+        file: File of the model, for messages.
+
+    Raises:
+        ModelError: There is no such output, or there are several and none was named.
+    """
+    shapes: dict[str, str] = {
+        output.name: "×".join(map(str, _shape(output))) for output in model.graph.output
+    }
+    if wanted is None and len(shapes) == 1:
+        return next(iter(shapes))
+    if wanted is not None and wanted in shapes:
         return wanted
-    listed = ", ".join(f"{name} {shape}" for name, shape in outputs.items())
-    found = f"no output {wanted!r}" if wanted else f"{len(outputs)} outputs"
+    listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+    fact = f"no output {wanted!r}" if wanted else f"{len(shapes)} outputs"
+    example = next(iter(shapes), "OUTPUT")
     raise ModelError(
-        f"ONNX file {file} has {found}; name the depth as {file}:{next(iter(outputs), 'OUTPUT')};"
-        f" it has {listed}"
+        f"ONNX file {file} has {fact}; name the depth as {file}:{example}; it has {listed}"
     )
 
 
 def _prune(model: ModelProto, output: str) -> bool:
-    """Leaves in the model one output and the nodes that it needs. True if others were there."""
+    """Leaves one output and the nodes that it needs in a model; returns whether it had others.
+
+    Args:
+        model: The model, which is changed.
+        output: Name of the output that stays.
+    """
     graph = model.graph
+    # From the last node back: each one whose result is needed, and then its inputs.
     needed = {output}
-    nodes = []
+    kept_nodes = []
     for node in reversed(graph.node):
         if not needed.isdisjoint(node.output):
-            nodes.append(node)
+            kept_nodes.append(node)
             needed.update(filter(None, node.input))
-    is_part = len(nodes) < len(graph.node) or len(graph.output) > 1
-    outputs = [value for value in graph.output if value.name == output]
-    kept = type(graph)(node=reversed(nodes), output=outputs)
+    is_pruned = len(kept_nodes) < len(graph.node) or len(graph.output) > 1
+    kept_outputs = [value for value in graph.output if value.name == output]
+    kept_graph = type(graph)(node=reversed(kept_nodes), output=kept_outputs)
     graph.ClearField("node")
     graph.ClearField("output")
-    graph.MergeFrom(kept)
-    return is_part
+    graph.MergeFrom(kept_graph)
+    return is_pruned
 
 
 def _as_map(output: Tensor) -> Tensor:
-    last = output.ndim == 4 and output.shape[-1] == 1 and output.shape[1] != 1
-    return output.permute(0, 3, 1, 2) if last else output
+    """Returns an output (1, h, w, 1) as (1, 1, h, w), any other as it is."""
+    is_channels_last = output.ndim == 4 and output.shape[-1] == 1 and output.shape[1] != 1
+    return output.permute(0, 3, 1, 2) if is_channels_last else output
 
 
 def _patch_size(model: ModelProto) -> int | None:
-    """The patch size of a vision transformer: a convolution that steps by its own kernel."""
+    """Returns the pixels of a patch of a vision transformer; None for any other network.
+
+    Patches are the kernels of a convolution that steps by its own kernel.
+    """
     for node in model.graph.node:
         if node.op_type == "Conv":
-            by_name = {a.name: list(a.ints) for a in node.attribute}
+            by_name = {attribute.name: list(attribute.ints) for attribute in node.attribute}
             kernel = by_name.get("kernel_shape", [])
             stride = by_name.get("strides", [])
-            if kernel == stride and kernel and min(kernel) >= 8:
+            if kernel and kernel == stride and min(kernel) >= _LEAST_PATCH:
                 return int(kernel[0])
     return None
 
@@ -213,10 +254,20 @@ def _verify(
     *,
     is_whole: bool,
 ) -> str:
-    """Says that the network agrees with onnxruntime. ModelError if it does not.
+    """Returns the note that the network agrees with onnxruntime.
 
     They are compared on the first image of a size, and not again as long as the file stays as it
     is. Weights in other files may change unseen, so with them each first image is compared.
+
+    Args:
+        source: The ONNX file, or the content of one, that onnxruntime runs.
+        file: The ONNX file that the network was read from.
+        module: The network.
+        arguments: Arguments of its forward for a frame.
+        is_whole: Whether all weights lie in the file.
+
+    Raises:
+        ModelError: They do not agree.
     """
 
     def compare() -> list[str]:
@@ -224,34 +275,43 @@ def _verify(
             _compare(source, file, module, arguments)
         return [_AGREES]
 
+    def is_agreement(answer: list[str]) -> bool:
+        return answer == [_AGREES]
+
     sizes = [(tuple(tensor.shape), tensor.device.type) for tensor in arguments]
-    recall_or_decide(
-        module, file if is_whole else None, f"agrees for {sizes}", compare, [_AGREES].__eq__
-    )
+    known_file = file if is_whole else None
+    recall_or_decide(module, known_file, f"agrees for {sizes}", compare, is_agreement)
     return _AGREES
 
 
 def _compare(
     source: str | bytes, file: Path, module: nn.Module, arguments: Sequence[Tensor]
 ) -> None:
-    """Raises ModelError if the network does not agree with onnxruntime on an image.
+    """Raises ModelError if the network's output differs from onnxruntime's by over `MISMATCH`.
 
-    The source is the file that onnxruntime reads, or the content of one.
+    Args:
+        source: The ONNX file, or the content of one, that onnxruntime runs.
+        file: The ONNX file, for messages.
+        module: The network.
+        arguments: Arguments of its forward for a frame.
     """
     import onnxruntime
 
     assert isinstance(module, FileGraph)
     with torch.no_grad():
         actual = module(*arguments).cpu()  # first, since it allocates no more than it should
-    feed = {n: a.float().cpu().numpy() for n, a in zip(module.inputs, arguments, strict=True)}
+    feed = {
+        name: argument.float().cpu().numpy()
+        for name, argument in zip(module.inputs, arguments, strict=True)
+    }
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4
+    options.log_severity_level = 4  # it says fatal errors only
     options.intra_op_num_threads = torch.get_num_threads()
     with wrap_user_errors(f"onnxruntime, which checks ONNX file {file},"):
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
         expected = torch.from_numpy(session.run(None, feed)[0]).float()
     deviation = _deviation(actual, expected)
-    if not deviation <= MISMATCH:
+    if not deviation <= MISMATCH:  # NaN is none
         raise ModelError(
             f"ONNX file {file}: its reading by torch differs from onnxruntime's by {deviation:.2g}"
             " of the output's range"
@@ -259,15 +319,21 @@ def _compare(
 
 
 def _deviation(actual: Tensor, expected: Tensor) -> float:
-    """The largest difference relative to the largest expected value."""
+    """Returns the largest difference of two outputs over the largest expected value.
+
+    Infinite if they differ in shape, or in where they are finite.
+    """
     if actual.shape != expected.shape:
         return math.inf
-    known = expected.isfinite()
-    both = known & actual.isfinite()  # a network may be inf or NaN in the sky
-    if int((known != actual.isfinite()).sum()) > MISMATCH * expected.numel() or not both.any():
+    # A network may be inf or NaN in the sky.
+    is_actual_finite = actual.isfinite()
+    is_expected_finite = expected.isfinite()
+    unlike_count = int((is_actual_finite != is_expected_finite).sum())
+    are_finite = is_actual_finite & is_expected_finite
+    if unlike_count > MISMATCH * expected.numel() or not are_finite.any():
         return math.inf
-    actual = actual[both].float()
-    expected = expected[both]
+    actual = actual[are_finite].float()
+    expected = expected[are_finite]
     largest = float(expected.abs().amax())
     difference = float((actual - expected).abs().amax())
     return difference / largest if largest else difference
@@ -286,6 +352,7 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
     _check_operators(model.graph.node, path)
     graph = FileGraph()
     opset = _opset(model)
+    # Constants, and how large those may become that are computed of them.
     constants = {tensor.name: _tensor(tensor, path) for tensor in model.graph.initializer}
     stored = sum(constant.numel() for constant in constants.values())
     largest = max(_CONSTANT_ELEMENTS, _CONSTANT_GROWTH * stored)
@@ -293,32 +360,34 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
     for value in model.graph.input:
         if value.name not in constants:
             graph.add_input(value.name)
-    shapes = set[str]()
+    # Names of values that are shapes, or computed of shapes only.
+    shape_values = set[str]()
     for proto in model.graph.node:
-        # The operator and its inputs, of which one may be left out.
-        name = _name(proto)
-        attributes = {a.name: _attribute(a, path) for a in proto.attribute}
-        used = sum(bool(output) for output in proto.output)
-        node = Node(op=proto.op_type, opset=opset, outputs=used, attributes=attributes)
+        # The operator, and those of its inputs that are no constants. An input that is left out has
+        # an empty name.
+        name = _layer_name(proto)
+        node = _node(proto, opset, path)
         title = f"ONNX file {path}: node {name!r}: {node.op}"
         operation = Operation(title, functools.partial(_compute, node))
-        handed_in = [n for n in proto.input if n and n not in constants]
-        if not graph.values.keys() >= {*handed_in}:
+        computed = [value for value in proto.input if value and value not in constants]
+        if not graph.values.keys() >= {*computed}:
             raise ModelError(f"{title} reads a value that nothing before it gives")
         # What only constants go into is computed now.
-        if not handed_in:
+        if not computed:
             with torch.no_grad(), limit, wrap_user_errors(title):
                 result = operation(*map(constants.get, proto.input))
             results = result if isinstance(result, tuple) else (result,)
+            # Of an operator with several outputs, all but Split's give the first one only.
             constants.update(zip(proto.output, results, strict=False))
             continue
         # Anything else is a node of the module.
-        on_shapes = node.op in _TO_SHAPES or shapes.issuperset(handed_in)
+        on_shapes = node.op in _TO_SHAPES or shape_values.issuperset(computed)
         if on_shapes:
-            shapes.update(filter(None, proto.output))
+            shape_values.update(filter(None, proto.output))
         inputs = _arguments_of(proto, graph, constants, on_shapes=on_shapes)
         outputs = proto.output if node.op == "Split" else proto.output[0]
         graph.add_operation(name, operation, inputs, {}, outputs, is_layer=not on_shapes)
+    # The one output.
     output = model.graph.output[0].name
     if output in constants:
         raise ModelError(f"ONNX file {path}: its output depends on no input")
@@ -326,15 +395,31 @@ def onnx_graph(model: ModelProto, path: Path) -> FileGraph:
     return graph
 
 
-def _arguments_of(
-    proto: NodeProto, graph: FileGraph, constants: Mapping[str, Tensor], *, on_shapes: bool
-) -> list[Argument]:
-    """The inputs of a node of the module: constants become weights, but for those of the CPU.
+def _node(proto: NodeProto, opset: int, path: Path) -> Node:
+    """Returns what the function of an operator needs to know of a node of the file.
 
     Args:
         proto: The node.
-        graph: The module, with the nodes before it.
-        constants: Tensors that are known, by name.
+        opset: Version of the standard.
+        path: File of the model, for messages.
+    """
+    attributes = {attribute.name: _attribute(attribute, path) for attribute in proto.attribute}
+    used_outputs = sum(bool(output) for output in proto.output)
+    return Node(op=proto.op_type, opset=opset, outputs=used_outputs, attributes=attributes)
+
+
+def _arguments_of(
+    proto: NodeProto, graph: FileGraph, constants: Mapping[str, Tensor], *, on_shapes: bool
+) -> list[Argument]:
+    """Returns the inputs of a node of the module, None for one that is left out.
+
+    Constants become weights of the module, which move to its device, but for those that are read as
+    Python numbers: these stay tensors of the CPU.
+
+    Args:
+        proto: The node.
+        graph: The module, with the nodes before it; weights are added.
+        constants: Tensors that depend on no input, by name.
         on_shapes: Whether the node computes with shapes, which stay on the CPU.
     """
     arguments = list[Argument]()
@@ -349,39 +434,59 @@ def _arguments_of(
 
 
 def _compute(node: Node, *inputs: Tensor | None) -> Tensor | tuple[Tensor, ...]:
-    """The node's outputs. Arithmetic on shapes stays on the CPU."""
+    """Returns the output of a node, of Split the tuple of all.
+
+    Arithmetic on shapes stays on the CPU.
+
+    Args:
+        node: The operator with its attributes.
+        *inputs: Inputs in the operator's order, on any devices; None for one that is left out.
+
+    Raises:
+        ModelError: This use of the operator is not covered.
+    """
     if node.outputs > 1 and node.op != "Split":
         raise ModelError("more than its first output")
-    for name, only in ONLY.items():
-        if node.get(name, only) != only:
+    for name, default in ONLY.items():
+        if node.get(name, default) != default:
             raise ModelError(f"{name} {node.get(name)!r}")
+    # The inputs on the device of the first that is not on the CPU, but for Python numbers.
     devices = [value.device for value in inputs if value is not None and not value.is_cpu]
     device = devices[0] if devices else "cpu"
-    host = HOST_INPUTS[node.op]
+    on_cpu = HOST_INPUTS[node.op]
     moved: list[Any] = [
-        None if value is None else value.to("cpu" if index in host else device)
+        None if value is None else value.to("cpu" if index in on_cpu else device)
         for index, value in enumerate(inputs)
     ]
     return OPERATORS[node.op](node, moved)
 
 
 def _opset(model: ModelProto) -> int:
-    return max((o.version for o in model.opset_import if o.domain in _STANDARD), default=1)
+    """Returns the version of the standard that a model uses."""
+    versions = [entry.version for entry in model.opset_import if entry.domain in _STANDARD]
+    return max(versions, default=1)
 
 
 def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
-    names = [n.op_type if n.domain in _STANDARD else f"{n.domain}.{n.op_type}" for n in nodes]
-    unknown = Counter(name for name in names if name not in OPERATORS)
-    if unknown:
-        listed = ", ".join(f"{op} ({count} ×)" for op, count in unknown.items())
+    """Raises ModelError, naming all of them, if nodes have operators that are not covered."""
+    names = [
+        node.op_type if node.domain in _STANDARD else f"{node.domain}.{node.op_type}"
+        for node in nodes
+    ]
+    uncovered = Counter(name for name in names if name not in OPERATORS)
+    if uncovered:
+        listed = ", ".join(f"{name} ({count} ×)" for name, count in uncovered.items())
         raise ModelError(
             f"ONNX file {path} uses operators that are not covered: {listed}; export the network"
             " with others, or bring it as a Python file"
         )
 
 
-def _name(proto: NodeProto) -> str:
-    """Name of the node for --layer; one without a name has operator and output."""
+def _layer_name(proto: NodeProto) -> str:
+    """Returns the name of a node for --layer; of one without a name, its operator and output.
+
+    Characters with a meaning in the names of layers become underscores.
+    """
     name = proto.name or f"{proto.op_type}_{''.join(proto.output[:1])}"
     if name.replace(".", "").isdigit():
         name = f"{proto.op_type}_{name}"
@@ -389,6 +494,10 @@ def _name(proto: NodeProto) -> str:
 
 
 def _attribute(proto: AttributeProto, path: Path) -> object:
+    """Returns the value of an attribute: a tensor, a text, a number or a list of numbers.
+
+    The path is for messages.
+    """
     from onnx import AttributeProto, helper
 
     if proto.type == AttributeProto.TENSOR:
@@ -400,6 +509,11 @@ def _attribute(proto: AttributeProto, path: Path) -> object:
 
 
 def _tensor(proto: TensorProto, path: Path) -> Tensor:
+    """Returns a tensor of the file.
+
+    Raises:
+        ModelError: It cannot be read, or is in half precision; the path is for the message.
+    """
     from onnx import numpy_helper
 
     with wrap_content_errors(f"ONNX file {path}: tensor {proto.name!r} cannot be read"):

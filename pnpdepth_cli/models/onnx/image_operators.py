@@ -23,119 +23,183 @@ from pnpdepth_cli.models.onnx.operators import (
 )
 
 _RESIZE = ("mode", "coordinate_transformation_mode", "nearest_mode", "cubic_coeff_a")
+"""Attributes of Resize on which the weights of one axis depend."""
+_RESIZE_OPSET = 12
+"""Version of the standard in which onnxruntime is asked for these weights."""
+_IR_VERSION = 8
+"""Version of the file format; onnx's default is its newest, which an old onnxruntime refuses."""
 _MAX_POOL = {1: F.max_pool1d, 2: F.max_pool2d, 3: F.max_pool3d}
+"""Functions by the number of spatial axes."""
 
 Pads = list[tuple[int, int]]
+"""Pixels that are added at the (beginning, end) of each spatial axis."""
 
 
-def _sides(pads: Pads) -> list[int]:
-    """The pads in the order of F.pad: the last axis first."""
-    return [n for pair in reversed(pads) for n in pair]
+def _in_torch_order(pads: Pads) -> list[int]:
+    """Returns the pads as F.pad takes them: both of the last axis first."""
+    return [pixels for pair in reversed(pads) for pixels in pair]
 
 
 class _KernelWindow(NamedTuple):
-    """How a kernel moves over an image, of each spatial axis."""
+    """How a kernel moves over an image, one entry for each spatial axis."""
 
     stride: list[int]
     dilation: list[int]
     pads: Pads
-    """(begin, end) of each axis."""
 
 
 def _window(node: Node, x: Tensor, kernel: Sequence[int]) -> _KernelWindow:
-    """The window of a node."""
+    """Returns how the kernel of a node moves over its input.
+
+    Args:
+        node: A convolution or pooling.
+        x: Input (b, c, spatial axes).
+        kernel: Pixels of the kernel along each spatial axis.
+    """
     rank = x.ndim - 2
-    auto = node.get("auto_pad", "NOTSET")
+    auto_pad = node.get("auto_pad", "NOTSET")
     stride = node.get("strides", [1] * rank)
     dilation = node.get("dilations", [1] * rank)
-    if auto in ("NOTSET", "VALID"):
-        flat = [0] * (2 * rank)
-        if auto == "NOTSET":
-            flat = node.get("pads", flat)
-        return _KernelWindow(stride, dilation, list(zip(flat[:rank], flat[rank:], strict=True)))
-    sizes = zip(x.shape[2:], kernel, stride, dilation, strict=True)
-    totals = [(math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n for n, k, s, d in sizes]
-    return _KernelWindow(stride, dilation, _halves(node, totals))
+    if auto_pad in ("NOTSET", "VALID"):
+        # The beginnings of all axes, then their ends.
+        numbers = [0] * (2 * rank)
+        if auto_pad == "NOTSET":
+            numbers = node.get("pads", numbers)
+        pads = list(zip(numbers[:rank], numbers[rank:], strict=True))
+        return _KernelWindow(stride, dilation, pads)
+    # SAME: so many pixels that there are ⌈length / stride⌉ positions of the kernel.
+    missing = []
+    for length, taps, step, spread in zip(x.shape[2:], kernel, stride, dilation, strict=True):
+        last_position = (math.ceil(length / step) - 1) * step
+        reach = (taps - 1) * spread + 1
+        missing.append(last_position + reach - length)
+    return _KernelWindow(stride, dilation, _halves(node, missing))
 
 
 def _halves(node: Node, totals: Sequence[int]) -> Pads:
-    """(begin, end) of so many pixels per axis; an odd one lies at the end for SAME_UPPER only."""
-    pairs = [(max(0, n) // 2, max(0, n) - max(0, n) // 2) for n in totals]
-    return pairs if node.get("auto_pad") == "SAME_UPPER" else [(end, begin) for begin, end in pairs]
+    """Returns pads of so many pixels in all for each axis, none where that is negative.
+
+    Of an odd number, the larger half lies at the end for SAME_UPPER, else at the beginning.
+    """
+    pads = []
+    for total in totals:
+        smaller = max(0, total) // 2
+        larger = max(0, total) - smaller
+        if node.get("auto_pad") == "SAME_UPPER":
+            pads.append((smaller, larger))
+        else:
+            pads.append((larger, smaller))
+    return pads
 
 
 @operator("Conv")
 def conv(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the convolution of an image with a weight (out, c / groups, kernel), and its bias."""
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
     if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
         raise ModelError("double precision")
     stride, dilation, pads = _window(node, x, weight.shape[2:])
+    # torch pads both ends of an axis alike; unlike ends are padded before.
+    zeros = [0] * len(pads)
     padding = [begin for begin, _ in pads]
-    none = [0] * len(pads)
     if any(begin != end for begin, end in pads):
-        x = F.pad(x, _sides(pads))
-        padding = none
-    group = node.get("group", 1)
-    return torch.convolution(x, weight, bias, stride, padding, dilation, False, none, group)
+        x = F.pad(x, _in_torch_order(pads))
+        padding = zeros
+    groups = node.get("group", 1)
+    return torch.convolution(
+        x, weight, bias, stride, padding, dilation,
+        transposed=False, output_padding=zeros, groups=groups,
+    )  # fmt: skip
 
 
 @operator("ConvTranspose")
 def conv_transpose(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the transposed convolution of an image with a weight (c, out / groups, kernel).
+
+    Its pads are pixels that are cut off the result.
+    """
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
     stride, dilation, pads = _window(node, x, weight.shape[2:])
-    none = [0] * len(pads)
-    group = node.get("group", 1)
-    extra = node.get("output_padding", none)
-    y = torch.convolution(x, weight, bias, stride, none, dilation, True, extra, group)
-    # The result without its pads, which may be stated by its shape.
-    sizes = y.shape[2:]
-    wanted = node.get("output_shape")
-    if wanted is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
-        wanted = [n * s for n, s in zip(x.shape[2:], stride, strict=True)]
-    if wanted is not None:
-        spatial = wanted[-len(sizes) :]
-        pads = _halves(node, [n - w for n, w in zip(sizes, spatial, strict=True)])
-    kept = [slice(begin, n - end) for n, (begin, end) in zip(sizes, pads, strict=True)]
-    return y[(slice(None), slice(None), *kept)]
+    zeros = [0] * len(pads)
+    whole = torch.convolution(
+        x, weight, bias, stride, zeros, dilation,
+        transposed=True,
+        output_padding=node.get("output_padding", zeros),
+        groups=node.get("group", 1),
+    )  # fmt: skip
+    # The result without its pads, which may follow from the shape that it should have.
+    sides = whole.shape[2:]
+    wanted_shape = node.get("output_shape")
+    if wanted_shape is None and node.get("auto_pad", "NOTSET").startswith("SAME"):
+        wanted_shape = [side * step for side, step in zip(x.shape[2:], stride, strict=True)]
+    if wanted_shape is not None:
+        wanted_sides = wanted_shape[-len(sides) :]
+        surplus = [side - wanted for side, wanted in zip(sides, wanted_sides, strict=True)]
+        pads = _halves(node, surplus)
+    kept = [slice(begin, side - end) for side, (begin, end) in zip(sides, pads, strict=True)]
+    return whole[(slice(None), slice(None), *kept)]
 
 
 def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
-    """Arguments of torch's pooling, and the pads that it cannot have, in the order of F.pad."""
+    """Returns the arguments of torch's pooling, and pads that must be added before.
+
+    The latter are in the order of F.pad, and empty where torch's own padding does: as much at both
+    ends of an axis, and no more than half a kernel.
+
+    Args:
+        node: The pooling.
+        x: Input (b, c, spatial axes).
+
+    Raises:
+        ModelError: There are such pads, and the size of the output is rounded up.
+    """
     kernel = node.get("kernel_shape")
-    ceil = bool(node.get("ceil_mode", 0))
+    rounds_up = bool(node.get("ceil_mode", 0))
     stride, _, pads = _window(node, x, kernel)
-    called = {"kernel_size": kernel, "stride": stride, "ceil_mode": ceil}
-    if all(begin == end <= k // 2 for (begin, end), k in zip(pads, kernel, strict=True)):
-        return called | {"padding": [begin for begin, _ in pads]}, []
-    if ceil:
+    arguments = {"kernel_size": kernel, "stride": stride, "ceil_mode": rounds_up}
+    can_torch_pad = all(
+        begin == end <= pixels // 2 for (begin, end), pixels in zip(pads, kernel, strict=True)
+    )
+    if can_torch_pad:
+        return arguments | {"padding": [begin for begin, _ in pads]}, []
+    if rounds_up:
         raise ModelError("ceil_mode and such pads")
-    return called, _sides(pads)
+    return arguments, _in_torch_order(pads)
 
 
 @operator("MaxPool")
 def max_pool(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the largest value under each position of the kernel; what is padded never is."""
     x = inputs[0]
-    called, sides = _pooling(node, x)
-    x = F.pad(x, sides, value=-math.inf) if sides else x
+    arguments, pads = _pooling(node, x)
+    if pads:
+        x = F.pad(x, pads, value=-math.inf)
     pool: Callable[..., Tensor] = _MAX_POOL[x.ndim - 2]
-    return pool(x, dilation=node.get("dilations", 1), **called)
+    return pool(x, dilation=node.get("dilations", 1), **arguments)
 
 
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the mean under each position of the kernel, of padded zeros too if it says so.
+
+    Raises:
+        ModelError: The input has other than two spatial axes, or the kernel is dilated.
+    """
     x = inputs[0]
-    with_pads = bool(node.get("count_include_pad", 0))
-    if x.ndim != 4 or any(d != 1 for d in node.get("dilations", [])):
+    counts_pads = bool(node.get("count_include_pad", 0))
+    if x.ndim != 4 or any(spread != 1 for spread in node.get("dilations", [])):
         raise ModelError("other than two spatial axes, or dilations")
-    called, sides = _pooling(node, x)
-    mean = F.avg_pool2d(F.pad(x, sides), count_include_pad=with_pads, **called)
-    if with_pads or not sides:
+    arguments, pads = _pooling(node, x)
+    mean = F.avg_pool2d(F.pad(x, pads), count_include_pad=counts_pads, **arguments)
+    if counts_pads or not pads:
         return mean
-    return mean / F.avg_pool2d(F.pad(torch.ones_like(x[:1, :1]), sides), **called)
+    # Divided by the fraction of the kernel that lies in the image.
+    is_image = F.pad(torch.ones_like(x[:1, :1]), pads)
+    return mean / F.avg_pool2d(is_image, **arguments)
 
 
 register(
@@ -151,12 +215,14 @@ register(
 
 @operator("BatchNormalization")
 def batch_norm(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the input normalised by the mean and variance of training, scaled and shifted."""
     x, weight, bias, mean, variance = inputs[:5]
     return F.batch_norm(x, mean, variance, weight, bias, eps=node.get("epsilon", 1e-5))
 
 
 @operator("LayerNormalization")
 def layer_norm(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the input normalised over all axes from one on, scaled and shifted."""
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
@@ -167,95 +233,150 @@ def layer_norm(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("GroupNormalization")
 def group_norm(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the input normalised over groups of channels, scaled and shifted."""
     x, weight, bias = inputs
     return F.group_norm(x, node.get("num_groups"), weight, bias, node.get("epsilon", 1e-5))
 
 
 @operator("Upsample", "Resize", host=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
+    """Returns the input resized along each axis, to stated sizes or by stated factors.
+
+    Raises:
+        ModelError: Neither is stated, or only some axes or a region are resized.
+    """
     x = inputs[0]
-    scales = optional(inputs, 2)
-    sizes = optional(inputs, 3)
     if "axes" in node.attributes:
         raise ModelError("axes")
-    wanted = [] if sizes is None else whole_numbers(sizes)
-    if wanted:
-        factors = [size / n for size, n in zip(wanted, x.shape, strict=True)]
+    # The sizes, or the factors, whose place depends on the version.
+    factors_input = optional(inputs, 2)
+    sizes_input = optional(inputs, 3)
+    sizes = [] if sizes_input is None else whole_numbers(sizes_input)
+    if sizes:
+        factors = [size / side for size, side in zip(sizes, x.shape, strict=True)]
     elif node.op == "Upsample" or node.opset < 11:
         factors = node.get("scales") if len(inputs) < 2 else inputs[1].tolist()
-        mode = {"bilinear": "linear"}.get(node.get("mode"), node.get("mode", "nearest"))
-        more = {"coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-        node = replace(node, attributes={"mode": mode, **more})
-    elif scales is None:
+        node = _as_later_resize(node)
+    elif factors_input is None:
         raise ModelError("neither scales nor sizes")
     else:
-        factors = scales.tolist()
-    wanted = wanted or [math.floor(n * f) for n, f in zip(x.shape, factors, strict=True)]
-    # By torch's own resize where it computes the same.
-    fast = _by_torch(x, node, factors, wanted)
-    if fast is not None:
-        return fast
-    for axis, (size, factor) in enumerate(zip(wanted, factors, strict=True)):
+        factors = factors_input.tolist()
+    if not sizes:
+        sizes = [math.floor(side * factor) for side, factor in zip(x.shape, factors, strict=True)]
+    # By torch's own resize where it computes the same; else along each axis by its weights.
+    resized = _by_torch(x, node, factors, sizes)
+    if resized is not None:
+        return resized
+    for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
         if factor != 1:
             x = _along(x, axis, _weights(node, x.shape[axis], size, factor))
     return x
 
 
+def _as_later_resize(node: Node) -> Node:
+    """Returns an Upsample, or a Resize before opset 11, with the attributes of opset 11."""
+    mode = node.get("mode", "nearest")
+    if mode == "bilinear":
+        mode = "linear"
+    attributes = {
+        "mode": mode,
+        "coordinate_transformation_mode": "asymmetric",
+        "nearest_mode": "floor",
+    }
+    return replace(node, attributes=attributes)
+
+
 def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> Tensor | None:
-    """The result of torch's own resize if it computes the same; else None."""
-    exact = all(n * f == s for n, f, s in zip(x.shape, factors, sizes, strict=True))
-    if x.ndim != 4 or list(x.shape[:2]) != sizes[:2] or not exact or not x.is_floating_point():
+    """Returns the result of torch's own resize if it computes the same; else None.
+
+    Args:
+        x: Input, of any number of axes.
+        node: Resize of opset 11 or later.
+        factors: Factor of each axis.
+        sizes: Size of each axis of the result.
+    """
+    # torch resizes the last two axes of images, by the quotient of the sizes.
+    are_exact = all(
+        side * factor == size for side, factor, size in zip(x.shape, factors, sizes, strict=True)
+    )
+    is_image = x.ndim == 4 and list(x.shape[:2]) == sizes[:2] and x.is_floating_point()
+    if not is_image or not are_exact:
         return None
     size = (sizes[2], sizes[3])
     mode = node.get("mode", "nearest")
     coordinates = node.get("coordinate_transformation_mode", "half_pixel")
-    whole = all(f >= 1 and f == int(f) for f in factors)
-    if mode == "nearest" and whole and node.get("nearest_mode") == "floor":
+    # Pixels are repeated a whole number of times.
+    are_whole = all(factor >= 1 and factor == int(factor) for factor in factors)
+    if mode == "nearest" and are_whole and node.get("nearest_mode") == "floor":
         return F.interpolate(x, size) if coordinates == "asymmetric" else None
-    corners = coordinates == "align_corners"
-    half = coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
-    if mode == "linear" and (half or corners):
-        return F.interpolate(x, size, mode="bilinear", align_corners=corners)
+    # Bilinear interpolation; of one pixel, the two kinds of half pixels differ.
+    by_corners = coordinates == "align_corners"
+    by_half_pixels = coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
+    if mode == "linear" and (by_half_pixels or by_corners):
+        return F.interpolate(x, size, mode="bilinear", align_corners=by_corners)
     return None
 
 
 def _along(x: Tensor, axis: int, weights: Tensor) -> Tensor:
-    """Σ_k weights[n, k] · x[k] along the axis, of the elements whose weight is not 0."""
-    shape = [1] * x.ndim
-    shape[axis] = -1
-    most = int(weights.ne(0).sum(1).max())
-    index = weights.abs().topk(most, dim=1).indices
-    columns = zip(index.to(x.device).T, weights.gather(1, index).to(x).T, strict=True)
-    return torch.stack([x.index_select(axis, i) * w.reshape(shape) for i, w in columns]).sum(
-        0, dtype=x.dtype
-    )
+    """Returns the weighted sums of a tensor's entries along an axis.
+
+    Args:
+        x: The tensor, whose axis has `size` entries.
+        axis: Number of the axis.
+        weights: (out, size): entry n of the result is the sum over k of weights[n, k] · x[k].
+    """
+    weights_shape = [1] * x.ndim
+    weights_shape[axis] = -1
+    # Only weights that are not 0 count. Each row has few, (out, count) with their numbers.
+    count = int(weights.ne(0).sum(1).max())
+    indices = weights.abs().topk(count, dim=1).indices
+    largest = weights.gather(1, indices).to(x)
+    terms = [
+        x.index_select(axis, index) * weight.reshape(weights_shape)
+        for index, weight in zip(indices.to(x.device).T, largest.T, strict=True)
+    ]
+    return torch.stack(terms).sum(0, dtype=x.dtype)
 
 
 def _weights(node: Node, size: int, out: int, factor: float) -> Tensor:
-    """The weights (out, size) of an axis: what onnxruntime makes of the identity matrix."""
+    """Returns the weights (out, size) by which an axis is resized.
+
+    They are what onnxruntime makes of the identity matrix.
+
+    Args:
+        node: Resize of opset 11 or later.
+        size: Length of the axis.
+        out: Length that it gets.
+        factor: Factor that the node states; `out` may be rounded.
+
+    Raises:
+        ModelError: The node resizes a region, or onnxruntime cannot.
+    """
     import onnxruntime
     from onnx import TensorProto, helper, numpy_helper
 
     if node.get("coordinate_transformation_mode") == "tf_crop_and_resize":
         raise ModelError("a region of interest")
     torch.empty(out, size, device="meta")  # which a `SizeLimit` refuses if it is too large
-    # One node, that resizes each row of the identity matrix, to a size or by a factor.
+    # One node that resizes the rows of the identity matrix, to a size or by a factor. Its inputs
+    # are the matrix, the region, which is empty, the factors, and the sizes.
     attributes = {name: node.get(name) for name in _RESIZE if name in node.attributes}
-    stated = ["none", "by"]
-    by = np.array([out, size])
-    if factor != out / size:
-        stated = ["by"]
+    if factor == out / size:
+        input_names = ["x", "none", "none", "by"]
+        by = np.array([out, size])
+    else:
+        input_names = ["x", "none", "by"]
         by = np.array([factor, 1], np.float32)
     none = np.zeros(0, np.float32)
     graph = helper.make_graph(
-        [helper.make_node("Resize", ["x", "none", *stated], ["y"], **attributes)],
+        [helper.make_node("Resize", input_names, ["y"], **attributes)],
         "resize",
         [helper.make_tensor_value_info("x", TensorProto.FLOAT, [size, size])],
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, [out, size])],
         [numpy_helper.from_array(by, "by"), numpy_helper.from_array(none, "none")],
     )
-    # Its result is the weights.
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 12)], ir_version=8)
+    opset = helper.make_opsetid("", _RESIZE_OPSET)
+    model = helper.make_model(graph, opset_imports=[opset], ir_version=_IR_VERSION)
     with wrap_user_errors(f"{node.op} of onnxruntime"):
         session = onnxruntime.InferenceSession(
             model.SerializeToString(), providers=["CPUExecutionProvider"]
