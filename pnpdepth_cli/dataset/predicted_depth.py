@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.completion.image_registration import better_orientation, evidence
+from pnpdepth_cli.completion.image_registration import better_orientation
+from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.dataset.arrays import same_aspect_ratio
 from pnpdepth_cli.dataset.plausible import named
 from pnpdepth_cli.dataset.range_ends import far_end, near_end, repeated_ends

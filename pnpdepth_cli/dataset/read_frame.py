@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.completion.image_registration import better_orientation, evidence
+from pnpdepth_cli.completion.image_registration import better_orientation
+from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.completion.two_depths import compare_depths
 from pnpdepth_cli.dataset import arrays, sparse_depth, stored_depth
 from pnpdepth_cli.dataset.agreement import check_order, unit_warning
