@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.commands.many_frames.running import spread
-from pnpdepth_cli.completion.image_registration import estimate_registration, evidence
+from pnpdepth_cli.completion.image_registration import estimate_registration
+from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, tensor_of
 from pnpdepth_cli.frames.method import Method, pipeline_of
 from pnpdepth_cli.frames.open_network import OpenNetwork

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
+from pnpdepth_cli.completion.image_registration import estimate_registration
+from pnpdepth_cli.completion.registration_evidence import Evidence
 from pnpdepth_cli.dataset.saved_result import save
 from pnpdepth_cli.errors import DivergedError, InputError, NoPointsError, UsageError
 from pnpdepth_cli.frames.adapt import learn, reason_not_to_learn, weights_in_place

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnpdepth_cli.completion.image_registration import better_orientation, evidence
+from pnpdepth_cli.completion.image_registration import better_orientation
+from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.dataset.arrays import same_aspect_ratio
 from pnpdepth_cli.dataset.plausible import named
 from pnpdepth_cli.dataset.unknown_pixels import SAVE_RAW, STEPS_OF_8_BITS, Map, without_unknown

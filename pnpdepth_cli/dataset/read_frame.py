@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from pnpdepth_cli.camera import Camera
-from pnpdepth_cli.completion.image_registration import better_orientation, evidence
+from pnpdepth_cli.completion.image_registration import better_orientation
+from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.dataset import arrays, stored_depth
 from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_files import FrameFiles, ReadOptions

@@ -16,12 +16,8 @@ from torch import Tensor
 
 from pnpdepth_cli.camera import Camera
 from pnpdepth_cli.completion.alignment import Alignment
-from pnpdepth_cli.completion.image_registration import (
-    Evidence,
-    ImageRegistration,
-    estimate_registration,
-    evidence,
-)
+from pnpdepth_cli.completion.image_registration import ImageRegistration, estimate_registration
+from pnpdepth_cli.completion.registration_evidence import Evidence, evidence
 from pnpdepth_cli.errors import DivergedError, UsageError
 from pnpdepth_cli.models.definition import DENSE_SPACING
 from pnpdepth_cli.points import METRES, SparsePoints

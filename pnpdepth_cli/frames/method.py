@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import torch
 
-from pnpdepth_cli.completion.image_registration import Evidence, estimate_registration
+from pnpdepth_cli.completion.image_registration import estimate_registration
+from pnpdepth_cli.completion.registration_evidence import Evidence
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Frame, Refined, Register, UsedNetwork
 from pnpdepth_cli.frames.measured import with_measured, with_note_on_measured
