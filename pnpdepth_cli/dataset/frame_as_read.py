@@ -17,7 +17,7 @@ from pnpdepth_cli.points import SparsePoints
 class ReadFrame(Frame):
     """A frame of files. No method reads what is declared here."""
 
-    own: SparsePoints
+    own_points: SparsePoints
     """All points of the frame's own files, also those held out, without those of neighbours."""
     held_out: SparsePoints
     """Points that nothing uses, to score at; none of them unless it was asked for."""

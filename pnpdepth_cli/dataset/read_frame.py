@@ -98,7 +98,7 @@ def read_frame(
     return ReadFrame(
         rgb=None if rgb is None else tensor_of(np.ascontiguousarray(rgb)),
         points=joined.points,
-        own=points,
+        own_points=points,
         of_matches=sparse.record.kind == "colmap",
         held_out=held_out,
         register=None if one_view else registration_to_make(options.registration, Settings()),

@@ -80,12 +80,12 @@ def record_of_result(
     """
     network = refined.networks[0]  # the user's; further ones are the program's
     # The points that were used, of which some are of neighbouring frames.
-    used_of_frame = len(frame.own) - len(frame.held_out)
+    used_of_frame = len(frame.own_points) - len(frame.held_out)
     points = PointsRecord(
         used=len(refined.used),
         held_out=len(frame.held_out),
-        nearest=float(frame.own.depth.min()),
-        farthest=float(frame.own.depth.max()),
+        nearest=float(frame.own_points.depth.min()),
+        farthest=float(frame.own_points.depth.max()),
         moved=len(refined.used) - used_of_frame if frame.neighbours else None,
     )
     # The settings of the user's network, with nothing left open.

@@ -43,7 +43,7 @@ def save(refined: Refined, path: Path, *, overwrite: bool) -> None:
     frame = ReadFrame(
         rgb=None,
         points=points,
-        own=points,
+        own_points=points,
         held_out=points.select(slice(0)),
         camera=refined.camera,
     )

@@ -313,7 +313,7 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
         return None
     # They must be the points of the record: as many, from the same nearest to the same farthest.
     points = frame_now.points
-    ends = (float(frame_now.own.depth.min()), float(frame_now.own.depth.max()))
+    ends = (float(frame_now.own_points.depth.min()), float(frame_now.own_points.depth.max()))
     recorded = result.points
     wanted = recorded.used - (recorded.moved or 0)  # without those of neighbouring frames
     wanted_ends = (recorded.nearest, recorded.farthest)

@@ -141,7 +141,9 @@ def write_outputs(
     inputs = replace(inputs, register=frame.registration).registered()
     image = inputs.image
     # Depth, its standard deviation, and where it is valid.
-    write_depth(outputs["depth"], frame.depth, scale=integer_scale(inputs.own, inputs.depth_scale))
+    write_depth(
+        outputs["depth"], frame.depth, scale=integer_scale(inputs.own_points, inputs.depth_scale)
+    )
     if "sigma" in outputs and frame.sigma is not None and frame.valid is not None:
         write_sigma(outputs["sigma"], frame.sigma)
         write_mask(outputs["valid"], frame.valid)
@@ -149,8 +151,8 @@ def write_outputs(
     figures = {}
     unit = inputs.unit
     if "preview" in outputs:
-        xy = inputs.own.xy.numpy()
-        depth = inputs.own.depth.numpy()
+        xy = inputs.own_points.xy.numpy()
+        depth = inputs.own_points.depth.numpy()
         figures["preview"] = preview(
             image, xy, depth, frame.before, frame.depth, outputs["preview"], unit, made_by
         )

@@ -53,7 +53,7 @@ def write_refined(
         OutputError: A file cannot be written.
     """
     # Depth as the file can hold it, and scores of that.
-    scale = integer_scale(inputs.own, inputs.depth_scale)
+    scale = integer_scale(inputs.own_points, inputs.depth_scale)
     frame = without_unknown(request, inputs, frame)
     frame = within_range(frame, outputs["depth"], scale)
     record = _score(request, method, inputs, frame)
