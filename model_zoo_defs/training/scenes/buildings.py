@@ -76,10 +76,11 @@ def building(kit: Kit, width: float) -> Group:
 
 
 def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
+    """Returns the holes (left, low, right, high) of windows and one door in a front, in metres."""
     holes: list[Hole] = []
     count = max(1, int(width / kit.size(1.8, 3.2)))
     w = kit.size(0.8, 1.5)
-    h = kit.size(1.1, 1.8)
+    height = kit.size(1.1, 1.8)
     sill = kit.size(0.7, 1.0)
     door = int(kit.rng.integers(count))
     for floor in range(floors):
@@ -90,13 +91,14 @@ def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
             elif w < width / count - 0.1:
                 low = floor * storey + sill
                 holes.append(
-                    (middle - w / 2, low, middle + w / 2, min(low + h, (floor + 1) * storey))
+                    (middle - w / 2, low, middle + w / 2, min(low + height, (floor + 1) * storey))
                 )
     return holes
 
 
-def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
-    wide = w + 0.8
+def _balcony(kit: Kit, group: Group, x: float, z: float, width: float) -> None:
+    """Adds a balcony of a door `w` wide, in the middle of its floor's edge at (x, z)."""
+    wide = width + 0.8
     group.add(box(wide, 1.0, 0.12), kit.palette.new("plain", (0.6, 0.6, 0.58)), (x, -0.5, z))
     steel = kit.metal()
     group.add(rod((x - wide / 2, -0.97, z + 1), (x + wide / 2, -0.97, z + 1), 0.025), steel)
@@ -105,6 +107,7 @@ def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
 
 
 def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
+    """Adds a roof, pitched or flat, and a downpipe; `skin` is the walls' material."""
     tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
     if kit.chance(0.65):
         # Two slopes from eaves to ridge, gables, chimney and gutter.
