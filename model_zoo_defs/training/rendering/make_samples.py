@@ -143,9 +143,14 @@ def _write_images(
 
 
 def laser_axes() -> npt.NDArray[np.float64]:
-    """Returns R of p_camera = R p_laser + t; the mount is slightly rotated, as real mounts are."""
+    """Returns R (3, 3) of p_camera = R p_laser + t.
+
+    The scanner has x forward, y left, z up, the camera x right, y down, z forward. The mount is
+    slightly rotated, as real mounts are.
+    """
     straight = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     off = rotation(yaw=0.008, pitch=-0.004, roll=0.006).astype(np.float64)
+    # The nearest rotation, as float32 was not exact.
     left, _, right = np.linalg.svd(straight @ off)
     return np.asarray(left @ right)
 
