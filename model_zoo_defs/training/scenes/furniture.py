@@ -48,7 +48,7 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
     group = Group()
     # Size and materials.
     wood = kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
-    w = width or kit.size(0.7, 2.0)
+    table_width = width or kit.size(0.7, 2.0)
     depth = kit.size(0.5, 0.95)
     height = kit.size(0.4, 0.78)
     thick = kit.size(0.015, 0.05)
@@ -60,11 +60,11 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
         group.add(cylinder(0.04, height - thick), legs, (0, y, 0))
         group.add(cylinder(depth * 0.3, 0.03, top=depth * 0.1), legs, (0, y, 0))
     else:
-        group.add(box(w, depth, thick), wood, (0, y, height - thick))
+        group.add(box(table_width, depth, thick), wood, (0, y, height - thick))
         thickness = kit.size(0.03, 0.09)
         for sx in (-1, 1):
             for sy in (-1, 1):
-                at = (sx * (w / 2 - thickness), y + sy * (depth / 2 - thickness), 0)
+                at = (sx * (table_width / 2 - thickness), y + sy * (depth / 2 - thickness), 0)
                 leg = (
                     box(thickness, thickness, height - thick)
                     if kit.chance(0.7)
@@ -72,12 +72,16 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
                 )
                 group.add(leg, legs, at)
         if kit.chance(0.5):
-            group.add(box(w * 0.9, depth * 0.85, 0.08), wood, (0, y, height - thick - 0.08))
+            group.add(
+                box(table_width * 0.9, depth * 0.85, 0.08), wood, (0, y, height - thick - 0.08)
+            )
     # Things on it.
     scatter(
         kit,
         group,
-        area=Rectangle((-w * 0.42, -depth * 0.9), (w * 0.42, -depth * 0.1), height),
+        area=Rectangle(
+            (-table_width * 0.42, -depth * 0.9), (table_width * 0.42, -depth * 0.1), height
+        ),
         count=int(kit.rng.integers(0, 9)),
         tallest=0.45,
         things=_TABLE_THINGS,

@@ -22,9 +22,63 @@ def room(kit: Kit) -> Plan:
     depth = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
     height = kit.size(2.2, 3.1)
     rise = kit.size(-0.9, 1.5) if kit.chance(0.2) else 0.0
-    # Floor and ceiling; some floors reflect.
+    # Floor, ceiling and walls.
     group = Group()
+    paint = _add_floor_and_ceiling(kit, group, (width, depth, height), rise)
+    sides = (
+        ((0.0, depth), 0.0, width, height, rise),
+        ((width, depth), -np.pi / 2, depth, height + rise, 0.0),
+        ((width, 0.0), np.pi, width, height + rise, -rise),
+        ((0.0, 0.0), np.pi / 2, depth, height, 0.0),
+    )
+    for start, yaw, length, tall, lift in sides:
+        side = _side(kit, length, tall, lift, paint, across=min(width, depth), corridor=corridor)
+        group.insert(side, (*start, 0), yaw=yaw)
+    # What stands in the middle: furniture, a pillar, things on the floor.
+    if not corridor:
+        _middle(kit, group, width, depth)
+    if kit.chance(0.3):
+        thing = (
+            box(0.35, 0.35, height + max(rise, 0))
+            if kit.chance(0.5)
+            else cylinder(0.18, height + max(rise, 0))
+        )
+        group.add(thing, paint, (kit.size(0.3, 0.7) * width, kit.size(0.3, 0.7) * depth, 0))
+    clutter.scatter(
+        kit,
+        group,
+        area=clutter.Rectangle((0.4, 0.4), (width - 0.4, depth - 0.4), 0.0),
+        count=int(rng.integers(0, 10)),
+    )
+    # What the windows show.
+    _outside(kit, group, width, depth)
+    # Places that the cameras look at, and lights.
     targets = []
+    for _ in range(16):
+        targets.append((kit.size(0.1, 0.9) * width, kit.size(0.1, 0.9) * depth, kit.size(0.1, 1.4)))
+    lights = _lights(kit, width, depth, height, group)
+    return Plan(
+        group=group,
+        lights=lights,
+        sky=_indoor_sky(kit),
+        low=(0.3, 0.3, 0.5),
+        high=(width - 0.3, depth - 0.3, min(1.9, height - 0.3)),
+        targets=tuple(targets),
+    )
+
+
+def _add_floor_and_ceiling(
+    kit: Kit, group: Group, size: tuple[float, float, float], rise: float
+) -> int:
+    """Adds the floor, which may reflect, and the ceiling; returns the material of the walls.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group of the room.
+        size: Width, depth and height of the room in metres.
+        rise: How much higher the ceiling is at the right wall than at the left.
+    """
+    width, depth, height = size
     paint = kit.surface(
         "plaster",
         "plaster",
@@ -73,58 +127,42 @@ def room(kit: Kit) -> Plan:
         ),
         ceiling,
     )
-    # Walls with windows, doors, and what stands along them.
-    sides = (
-        ((0.0, depth), 0.0, width, height, rise),
-        ((width, depth), -np.pi / 2, depth, height + rise, 0.0),
-        ((width, 0.0), np.pi, width, height + rise, -rise),
-        ((0.0, 0.0), np.pi / 2, depth, height, 0.0),
-    )
-    for start, yaw, length, tall, lift in sides:
-        own = paint if kit.chance(0.8) else kit.surface("plaster", "plain", "brick", tile_m=1.5)
-        side = Group()
-        holes = openings(kit, length, min(tall, tall + lift))
-        side.add(wall(length, tall, holes, rise=lift), own)
-        for hole in holes:
-            opening(kit, side, hole, own)
-        if kit.chance(0.7):
-            skirting = (
-                kit.palette.new("plain", (0.88, 0.87, 0.85)) if kit.chance(0.6) else kit.wood()
-            )
-            side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
-        decorate(kit, side, length, min(tall, tall + lift), holes)
-        _line_up(kit, side, length, min(width, depth), holes, corridor)
-        group.insert(side, (*start, 0), yaw=yaw)
-    # What stands in the middle: furniture, a pillar, things on the floor.
-    if not corridor:
-        _middle(kit, group, width, depth)
-    if kit.chance(0.3):
-        thing = (
-            box(0.35, 0.35, height + max(rise, 0))
-            if kit.chance(0.5)
-            else cylinder(0.18, height + max(rise, 0))
-        )
-        group.add(thing, paint, (kit.size(0.3, 0.7) * width, kit.size(0.3, 0.7) * depth, 0))
-    clutter.scatter(
-        kit,
-        group,
-        area=clutter.Rectangle((0.4, 0.4), (width - 0.4, depth - 0.4), 0.0),
-        count=int(rng.integers(0, 10)),
-    )
-    # What the windows show.
-    _outside(kit, group, width, depth)
-    # Places that the cameras look at, and lights.
-    for _ in range(16):
-        targets.append((kit.size(0.1, 0.9) * width, kit.size(0.1, 0.9) * depth, kit.size(0.1, 1.4)))
-    lights = _lights(kit, width, depth, height, group)
-    return Plan(
-        group=group,
-        lights=lights,
-        sky=_indoor_sky(kit),
-        low=(0.3, 0.3, 0.5),
-        high=(width - 0.3, depth - 0.3, min(1.9, height - 0.3)),
-        targets=tuple(targets),
-    )
+    return paint
+
+
+def _side(
+    kit: Kit,
+    length: float,
+    height: float,
+    rise: float,
+    paint: int,
+    *,
+    across: float,
+    corridor: bool,
+) -> Group:
+    """Returns a wall with windows, doors, and what hangs on it and stands along it.
+
+    Args:
+        kit: Random numbers and materials.
+        length: Length of the wall, metres.
+        height: Height at its left end.
+        rise: How much higher it is at its right end.
+        paint: Material of most walls of the room.
+        across: The shorter side of the room.
+        corridor: Whether the room is a corridor, with less furniture.
+    """
+    own = paint if kit.chance(0.8) else kit.surface("plaster", "plain", "brick", tile_m=1.5)
+    side = Group()
+    holes = openings(kit, length, min(height, height + rise))
+    side.add(wall(length, height, holes, rise=rise), own)
+    for hole in holes:
+        opening(kit, side, hole, own)
+    if kit.chance(0.7):
+        skirting = kit.palette.new("plain", (0.88, 0.87, 0.85)) if kit.chance(0.6) else kit.wood()
+        side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
+    decorate(kit, side, length, min(height, height + rise), holes)
+    _line_up(kit, side, length, across, holes, corridor)
+    return side
 
 
 def _line_up(

@@ -90,7 +90,7 @@ def car(kit: Kit) -> Group:
         "plain", None if vivid else base, gloss=0.7, mirror=kit.size(0.04, 0.12), vivid=1.0
     )
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.size(0.1, 0.25))
-    # Measures: f and b are the front and the back end.
+    # Measures: half its width, and heights of its lines above the road.
     long = kit.size(3.7, 4.8)
     half = kit.size(0.82, 0.93)
     low = kit.size(0.18, 0.24)
@@ -121,7 +121,7 @@ def car(kit: Kit) -> Group:
         (front - 1.1, half * 0.83, belt - 0.1, hood + 0.03),
     ]
     group.add(_loft(cabin, 0.4), glass)
-    top = [(y, width * 0.93, z - 0.05, z + 0.012) for y, width, _, z in cabin[1:4]]
+    top = [(y, half_width * 0.93, z - 0.05, z + 0.012) for y, half_width, _, z in cabin[1:4]]
     group.add(_loft(top, 0.5), paint)
     # On both sides: pillars, mirror, lights and trim.
     for side in (-1, 1):
@@ -182,7 +182,7 @@ def car(kit: Kit) -> Group:
 def lorry(kit: Kit) -> Group:
     """Returns a van, bus or lorry."""
     group = Group()
-    # Materials and measures: f and b are the front and the back end.
+    # Materials, length and the heights of its parts.
     paint = kit.palette.new("plain", gloss=0.5, mirror=0.05, vivid=0.5)
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=0.2)
     long = kit.size(4.8, 11)
