@@ -203,7 +203,8 @@ def first_state(sparse: Tensor, known: Three, kernels: Three, biases: Three) -> 
         target = sparse if layer == 0 else known[layer] * copies[layer - 1]
         codes.append(analysed(target, kernel))
         copies.append(shrunk(codes[layer], biases[layer], torch.zeros_like(codes[layer])))
-    return State(_three(codes), _three(copies), _three([torch.zeros_like(z) for z in codes]))
+    multipliers = [torch.zeros_like(of_layer) for of_layer in codes]
+    return State(_three(codes), _three(copies), _three(multipliers))
 
 
 def from_tensorflow(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

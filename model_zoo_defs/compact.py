@@ -248,7 +248,7 @@ class Compact(nn.Module):
             density = torch.log1p(residual.density * stride * stride)
             hints = [before, residual.mean, residual.std, density]
             maps = [resize(features, size), image[level], *hints, *extra]
-            inputs = [torch.cat([one_map.to(features.dtype) for one_map in maps], 1)]
+            inputs = [torch.cat([values.to(features.dtype) for values in maps], 1)]
             # What the prior says, if there is one.
             of_prior = None
             if guide is not None and fit.of_prior is not None:

@@ -16,6 +16,8 @@ from model_zoo_defs._compact.prior import Prior
 FIT_HEADS = 4
 # Numbers in a key or query of a cell, which say how far a point counts there.
 FIT_KEY = 16
+# Log distance in cells to the nearest point, where there is none.
+FAR = 5.0
 # So many cells are fitted at a time: bounds the memory.
 FIT_CHUNK = 1024
 
@@ -122,9 +124,12 @@ class PointFit(nn.Module):
 
     @staticmethod
     def _without_points(near: Tensor, prior: Prior | None) -> Fit:
-        """Returns the prior as it is; 0, the median, without a prior."""
+        """Returns the fits of images without points: the prior itself, else 0, which means 1 m.
+
+        The tensor near, (B, c, h, w), has their size.
+        """
         zeros = torch.zeros_like(near[:, :FIT_HEADS], dtype=torch.float32)
-        distance = zeros[:, :1] + 5.0
+        distance = zeros[:, :1] + FAR
         if prior is None:
             return Fit(zeros, distance)
         value, valid = prior.at(16)

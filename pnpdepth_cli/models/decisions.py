@@ -170,7 +170,15 @@ def _digest_of(module: nn.Module, file: Path) -> str | None:
 
 
 def _structure_of(module: nn.Module, file: Path) -> list[bytes]:
-    """Returns the bytes that tell the structure of a network; empty if its code may be anywhere."""
+    """Returns the bytes that tell the structure of a network; empty if its code may be anywhere.
+
+    Args:
+        module: The network.
+        file: File of its graph, or safetensors file of its weights beside its config.json.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
     if isinstance(module, FileGraph):
         # The nodes tell which output of the file it is.
         return [file.read_bytes(), "\n".join(module._modules).encode()]

@@ -268,7 +268,7 @@ class ModelDefinition:
 
     @property
     def default_alignment(self) -> str:
-        """How the output is aligned with the points if no option says it: of `ALIGNMENTS`."""
+        """How the output is aligned if no option says it, one of `choices.ALIGNMENTS`."""
         if self.defaults.align:
             return self.defaults.align
         is_metric = self.output_scale == "metric" and self.output_kind != "unknown"

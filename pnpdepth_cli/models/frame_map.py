@@ -88,6 +88,7 @@ class FrameMap:
     def points_to_network(self, points: SparsePoints) -> SparsePoints:
         """Returns the points inside the crop, at pixel coordinates of the network."""
         resized = points.cropped(*self.crop).resized(*self.resized)
+        # Padding at the right and the bottom moves no coordinates.
         return SparsePoints(xy=resized.xy, depth=resized.depth, size=self.network)
 
     def intrinsics_to_network(self, camera: Camera) -> Tensor:

@@ -127,6 +127,7 @@ def _with_parts(definition: ModelDefinition, parts: tuple[str, ...]) -> ModelDef
     choose_own_output = definition.output
 
     def output(returned: Any) -> Tensor:
+        """Returns the part, of what the network's forward returned."""
         chosen = returned if choose_own_output is None else choose_own_output(returned)
         for name in parts:
             chosen = part_of(chosen, name)

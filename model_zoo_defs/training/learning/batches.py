@@ -155,7 +155,7 @@ def recoloured(rng: Generator, rgb: Tensor) -> Tensor:
 
 
 def some_points(rng: Generator, depth: Depth) -> Depth:
-    """Sparse depth for networks that also take an image: random pixels or LiDAR scan lines.
+    """Returns sparse depth for networks that also take an image: random pixels or LiDAR scan lines.
 
     Half of the random pixel sets have the density of 500 of 228 x 304 pixels; the density of 500 of
     228 x 912 pixels lies in the range of the others.
@@ -163,12 +163,16 @@ def some_points(rng: Generator, depth: Depth) -> Depth:
     kind = rng.random()
     if kind < 0.2:
         return scan_lines(rng, depth)
+    # Fraction of the pixels: that of the paper's networks for NYU, or any in a range.
     fraction = 0.0072 if kind < 0.6 else np.exp(rng.uniform(np.log(0.0015), np.log(0.03)))
     return keep(depth, uniform(rng, depth, max(1, round(fraction * depth.size))))
 
 
 def many_points(rng: Generator, depth: Depth) -> Depth:
-    """Sparse depth for networks without an image: random pixels, often 5 %, or LiDAR scan lines."""
+    """Returns sparse depth for networks without an image: random pixels or LiDAR scan lines.
+
+    Two thirds of the random pixel sets have 5 % of the pixels.
+    """
     kind = rng.random()
     if kind < 0.4:
         return scan_lines(rng, depth)

@@ -32,7 +32,7 @@ def draw(
     other: Depth,
     fraction: float = PRIOR_FRACTION,
 ) -> Depth | None:
-    """Returns a prior of a random kind, aligned to the points; None with 1 − `fraction`.
+    """Returns a prior of a random kind, aligned to the points; None for some samples.
 
     Args:
         rng: Random numbers.
@@ -40,7 +40,7 @@ def draw(
         grey: The image (H, W) 0..1.
         sparse: Points (H, W) in metres, 0 = unknown.
         other: Depth of an unrelated frame, of any size.
-        fraction: Probability of a prior.
+        fraction: Probability that there is one.
     """
     if rng.random() >= fraction:
         return None

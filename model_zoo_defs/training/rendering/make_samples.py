@@ -66,6 +66,8 @@ _SECTOR_DEG = 120.0
 """Azimuth that is scanned, the image's field of view in its middle."""
 _RANGE_NOISE_M = 0.015
 """Standard deviation of a range."""
+_NEAREST_M = 0.5
+"""Depth below which a point is not projected."""
 _REACH_M = 100.0
 """Range beyond which nothing returns."""
 
@@ -141,9 +143,14 @@ def _write_images(
 
 
 def laser_axes() -> npt.NDArray[np.float64]:
-    """Returns R of p_camera = R p_laser + t; the mount is slightly rotated, as real mounts are."""
+    """Returns R (3, 3) of p_camera = R p_laser + t.
+
+    The scanner has x forward, y left, z up, the camera x right, y down, z forward. The mount is
+    slightly rotated, as real mounts are.
+    """
     straight = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     off = rotation(yaw=0.008, pitch=-0.004, roll=0.006).astype(np.float64)
+    # The nearest rotation, as float32 was not exact.
     left, _, right = np.linalg.svd(straight @ off)
     return np.asarray(left @ right)
 
@@ -198,12 +205,20 @@ def calibration_text(turn: npt.NDArray[np.float64]) -> str:
 
 
 def projected(scan: FloatArray, turn: npt.NDArray[np.float64], view: View) -> FloatArray:
-    """Returns the scan as a sparse depth map; of two points in a pixel the nearer is kept."""
+    """Returns a scan as a sparse depth map (H, W); of two points in a pixel the nearer is kept.
+
+    Args:
+        scan: Points (n, 4) of `laser_scan`.
+        turn: Rotation from the scanner's frame to the reference camera's.
+        view: The image's camera, beside the reference camera.
+    """
+    # In the reference camera's frame, and in front of it.
     points = scan[:, :3].astype(np.float64) @ turn.T + _LASER_IN_CAMERA
-    points = points[points[:, 2] > 0.5]
+    points = points[points[:, 2] > _NEAREST_M]
     u = np.rint((points[:, 0] + _BASELINES_M[2]) / points[:, 2] * view.fx + view.cx).astype(int)
     v = np.rint(points[:, 1] / points[:, 2] * view.fy + view.cy).astype(int)
     inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    # The nearest is written last.
     order = np.argsort(-points[inside, 2], kind="stable")
     sparse = np.zeros((view.height, view.width), np.float32)
     sparse[v[inside][order], u[inside][order]] = points[inside, 2][order]

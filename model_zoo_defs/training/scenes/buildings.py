@@ -45,20 +45,22 @@ def building(kit: Kit, width: float) -> Group:
     balcony = kit.chance(0.3)
     for u0, v0, u1, v1 in holes:
         x = (u0 + u1) / 2 - width / 2
-        w = u1 - u0
-        h = v1 - v0
+        hole_width = u1 - u0
+        hole_height = v1 - v0
         curtain = glass if kit.chance(0.6) else kit.surface("plain", "stripes", vivid=0.1)
-        group.add(box(w, 0.02, h), curtain, (x, recess, v0))
-        reveal, sill = (0.01, recess, h), (w + 0.15, recess + 0.1, 0.05)
+        group.add(box(hole_width, 0.02, hole_height), curtain, (x, recess, v0))
+        reveal, sill = (0.01, recess, hole_height), (hole_width + 0.15, recess + 0.1, 0.05)
         for at, size in (
-            ((x - w / 2, recess / 2, v0), reveal), ((x + w / 2, recess / 2, v0), reveal),
-            ((x, recess / 2, v1), (w, recess, 0.01)), ((x, recess / 2 - 0.05, v0 - 0.05), sill),
-            ((x, recess - 0.03, v0), (0.06, 0.05, h)),
-            ((x, recess - 0.03, v0 + h * 0.6), (w, 0.05, 0.06)),
-        ):  # fmt: skip
+            ((x - hole_width / 2, recess / 2, v0), reveal),
+            ((x + hole_width / 2, recess / 2, v0), reveal),
+            ((x, recess / 2, v1), (hole_width, recess, 0.01)),
+            ((x, recess / 2 - 0.05, v0 - 0.05), sill),
+            ((x, recess - 0.03, v0), (0.06, 0.05, hole_height)),
+            ((x, recess - 0.03, v0 + hole_height * 0.6), (hole_width, 0.05, 0.06)),
+        ):
             group.add(box(*size), trim, at)
         if balcony and v0 > 2 and kit.chance(0.6):
-            _balcony(kit, group, x, v0 - 0.4, w)
+            _balcony(kit, group, x, v0 - 0.4, hole_width)
     # Roof, awning and shop sign.
     _top(kit, group, width, height, deep, skin)
     if kit.chance(0.3):
@@ -76,10 +78,11 @@ def building(kit: Kit, width: float) -> Group:
 
 
 def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
+    """Returns the holes (left, low, right, high) of windows and one door in a front, in metres."""
     holes: list[Hole] = []
     count = max(1, int(width / kit.size(1.8, 3.2)))
-    w = kit.size(0.8, 1.5)
-    h = kit.size(1.1, 1.8)
+    window_width = kit.size(0.8, 1.5)
+    height = kit.size(1.1, 1.8)
     sill = kit.size(0.7, 1.0)
     door = int(kit.rng.integers(count))
     for floor in range(floors):
@@ -87,16 +90,22 @@ def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
             middle = (column + 0.5) * width / count
             if floor == 0 and column == door:
                 holes.append((middle - 0.5, 0.02, middle + 0.5, 2.15))
-            elif w < width / count - 0.1:
+            elif window_width < width / count - 0.1:
                 low = floor * storey + sill
                 holes.append(
-                    (middle - w / 2, low, middle + w / 2, min(low + h, (floor + 1) * storey))
+                    (
+                        middle - window_width / 2,
+                        low,
+                        middle + window_width / 2,
+                        min(low + height, (floor + 1) * storey),
+                    )
                 )
     return holes
 
 
-def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
-    wide = w + 0.8
+def _balcony(kit: Kit, group: Group, x: float, z: float, width: float) -> None:
+    """Adds a balcony of a door `w` wide, in the middle of its floor's edge at (x, z)."""
+    wide = width + 0.8
     group.add(box(wide, 1.0, 0.12), kit.palette.new("plain", (0.6, 0.6, 0.58)), (x, -0.5, z))
     steel = kit.metal()
     group.add(rod((x - wide / 2, -0.97, z + 1), (x + wide / 2, -0.97, z + 1), 0.025), steel)
@@ -105,26 +114,32 @@ def _balcony(kit: Kit, group: Group, x: float, z: float, w: float) -> None:
 
 
 def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
+    """Adds a roof, pitched or flat, and a downpipe; `skin` is the walls' material."""
     tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
     if kit.chance(0.65):
         # Two slopes from eaves to ridge, gables, chimney and gutter.
         rise = kit.size(1.5, 4.5)
         eave = kit.size(0.2, 0.6)
-        w = width / 2 + 0.1
+        half_width = width / 2 + 0.1
         ridge = height + rise
         low = height - eave * rise / (deep / 2)
-        front = [(-w, -eave, low), (w, -eave, low), (w, deep / 2, ridge), (-w, deep / 2, ridge)]
+        front = [
+            (-half_width, -eave, low),
+            (half_width, -eave, low),
+            (half_width, deep / 2, ridge),
+            (-half_width, deep / 2, ridge),
+        ]
         back = [
-            (-w, deep + eave, low),
-            (w, deep + eave, low),
-            (w, deep / 2, ridge),
-            (-w, deep / 2, ridge),
+            (-half_width, deep + eave, low),
+            (half_width, deep + eave, low),
+            (half_width, deep / 2, ridge),
+            (-half_width, deep / 2, ridge),
         ]
         group.add(quads([front, back]), tiles)
         gable = [(0, height), (deep, height), (deep / 2, ridge - 0.05)]
-        group.add(prism(gable, 2 * w - 0.25), skin, (0, 0, 0), yaw=np.pi / 2)
+        group.add(prism(gable, 2 * half_width - 0.25), skin, (0, 0, 0), yaw=np.pi / 2)
         group.add(box(0.6, 0.5, 1.6), skin, (kit.size(-0.3, 0.3) * width, deep * 0.4, ridge - 0.9))
-        group.add(rod((-w, -eave, low), (w, -eave, low), 0.06), kit.metal())
+        group.add(rod((-half_width, -eave, low), (half_width, -eave, low), 0.06), kit.metal())
     else:
         # A flat roof.
         group.add(

@@ -52,13 +52,13 @@ def gadget(kit: Kit) -> Group:
 def ring(kit: Kit) -> Group:
     """Returns a ring, flat or leaning."""
     group = Group()
-    r = kit.size(0.03, 0.1)
-    thick = r * kit.size(0.1, 0.5)
+    radius = kit.size(0.03, 0.1)
+    thick = radius * kit.size(0.1, 0.5)
     pitch = kit.size(0, 1.4)
     group.add(
-        torus(r, thick),
+        torus(radius, thick),
         kit.any_surface(),
-        (0, 0, thick + r * np.sin(pitch)),
+        (0, 0, thick + radius * np.sin(pitch)),
         pitch=pitch,
         yaw=kit.size(0, 6.3),
     )
@@ -71,17 +71,24 @@ def tool(kit: Kit) -> Group:
     long = kit.size(0.1, 0.35)
     thick = kit.size(0.003, 0.014)
     yaw = kit.size(0, 6.3)
-    c = np.cos(yaw) * long / 2
-    s = np.sin(yaw) * long / 2
-    group.add(rod((-c, -s, thick), (c, s, thick), thick), kit.any_surface())
+    along_x = np.cos(yaw) * long / 2
+    along_y = np.sin(yaw) * long / 2
+    group.add(rod((-along_x, -along_y, thick), (along_x, along_y, thick), thick), kit.any_surface())
     if kit.chance(0.6):
         group.add(
-            rod((c * 0.2, s * 0.2, thick * 2), (c * 1.3, s * 1.3, thick * 2), thick * 1.9),
+            rod(
+                (along_x * 0.2, along_y * 0.2, thick * 2),
+                (along_x * 1.3, along_y * 1.3, thick * 2),
+                thick * 1.9,
+            ),
             kit.any_surface(),
         )
     if kit.chance(0.3):
         group.add(
-            superquadric((0.06, 0.04, 0.016), vertical=0.7), kit.metal(), (-c, -s, 0.01), yaw=yaw
+            superquadric((0.06, 0.04, 0.016), vertical=0.7),
+            kit.metal(),
+            (-along_x, -along_y, 0.01),
+            yaw=yaw,
         )
     return group
 
@@ -126,9 +133,9 @@ def letters(kit: Kit) -> Group:
     """Returns standing block letters built of bars."""
     group = Group()
     material = kit.any_surface()
-    h = kit.size(0.06, 0.2)
-    d = kit.size(0.015, 0.05)
-    t = h * kit.size(0.14, 0.24)
+    height = kit.size(0.06, 0.2)
+    depth = kit.size(0.015, 0.05)
+    thickness = height * kit.size(0.14, 0.24)
     strokes = {
         "L": "lb",
         "T": "tm",
@@ -139,13 +146,18 @@ def letters(kit: Kit) -> Group:
         "F": "ltc",
         "A": "lrtc",
     }
-    spots = {"l": (t, h, -0.3, 0), "r": (t, h, 0.3, 0), "m": (t, h, 0, 0),
-             "t": (h * 0.6 + t, t, 0, h - t), "b": (h * 0.6 + t, t, 0, 0),
-             "c": (h * 0.6, t, 0, h / 2 - t / 2)}  # fmt: skip
+    spots = {
+        "l": (thickness, height, -0.3, 0),
+        "r": (thickness, height, 0.3, 0),
+        "m": (thickness, height, 0, 0),
+        "t": (height * 0.6 + thickness, thickness, 0, height - thickness),
+        "b": (height * 0.6 + thickness, thickness, 0, 0),
+        "c": (height * 0.6, thickness, 0, height / 2 - thickness / 2),
+    }
     for index, name in enumerate(kit.rng.choice(list(strokes), int(kit.rng.integers(1, 5)))):
         for stroke in strokes[str(name)]:
-            w, tall, x, z = spots[stroke]
-            group.add(box(w, d, tall), material, (index * h + x * h, 0, z))
+            width, tall, x, z = spots[stroke]
+            group.add(box(width, depth, tall), material, (index * height + x * height, 0, z))
     return group
 
 
@@ -167,9 +179,9 @@ def frame(kit: Kit) -> Group:
 def wedge(kit: Kit) -> Group:
     """Returns a many-cornered block, such as a house-shaped toy or a piece of cheese."""
     count = int(kit.rng.integers(3, 9))
-    r = kit.size(0.03, 0.12)
+    radius = kit.size(0.03, 0.12)
     angle = np.sort(kit.rng.uniform(0, 2 * np.pi, count)) + np.linspace(0, 1, count)
-    far = r * kit.rng.uniform(0.6, 1.0, count)
+    far = radius * kit.rng.uniform(0.6, 1.0, count)
     outline = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=1)
     outline[:, 1] -= outline[:, 1].min()
     group = Group()

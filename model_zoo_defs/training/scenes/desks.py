@@ -46,8 +46,8 @@ def _wild(kit: Kit) -> Group:
     elif choice < 0.65:
         # A turned body of random radii.
         z = np.linspace(0, size * 1.5, 20)
-        r = size * 0.4 * np.clip(0.6 + np.cumsum(kit.rng.normal(0, 0.14, 20)), 0.1, 1.4)
-        group.add(lathe(np.stack([r, z], axis=1), sides=24), kit.any_surface())
+        radius = size * 0.4 * np.clip(0.6 + np.cumsum(kit.rng.normal(0, 0.14, 20)), 0.1, 1.4)
+        group.add(lathe(np.stack([radius, z], axis=1), sides=24), kit.any_surface())
     else:
         # A bent wire or tube.
         s = np.linspace(0, 1, 40)[:, None]
@@ -62,8 +62,8 @@ def desk_scene(kit: Kit) -> Plan:
     """Returns a table top seen from near by, full of things."""
     group = Group()
     # The table.
-    w = kit.size(0.8, 2.2)
-    d = kit.size(0.6, 1.4)
+    width = kit.size(0.8, 2.2)
+    depth = kit.size(0.6, 1.4)
     top = kit.surface(
         "wood",
         "planks",
@@ -78,8 +78,8 @@ def desk_scene(kit: Kit) -> Plan:
         tile_m=kit.size(0.2, 1.0),
     )
     z = 0.75
-    group.add(box(w, d, 0.04), top, (0, 0, z - 0.04))
-    for x in (-w * 0.45, w * 0.45):
+    group.add(box(width, depth, 0.04), top, (0, 0, z - 0.04))
+    for x in (-width * 0.45, width * 0.45):
         group.add(box(0.05, 0.05, z - 0.04), kit.wood(), (x, 0, 0))
     # Floor, walls near and far, ceiling.
     floor = kit.surface("planks", "carpet", "tiles", "plain", tile_m=1)
@@ -94,7 +94,7 @@ def desk_scene(kit: Kit) -> Plan:
         "mottled",
         tile_m=kit.size(0.5, 2),
     )
-    far = d / 2 + (kit.size(0.0, 0.3) if kit.chance(0.5) else kit.size(0.3, 3))
+    far = depth / 2 + (kit.size(0.0, 0.3) if kit.chance(0.5) else kit.size(0.3, 3))
     for yaw in np.arange(4) * np.pi / 2 + kit.size(-0.2, 0.2):
         side = Group()
         side.add(quads([[(-5, 0, 0), (5, 0, 0), (5, 0, 2.8), (-5, 0, 2.8)]]), paper)
@@ -109,7 +109,7 @@ def desk_scene(kit: Kit) -> Plan:
         kit.surface("plain", vivid=0),
     )
     # Heaps of things, which the cameras look at.
-    half = (w / 2 - 0.05, d / 2 - 0.05)
+    half = (width / 2 - 0.05, depth / 2 - 0.05)
     heaps = int(kit.rng.integers(2, 7))
     targets = []
     for _ in range(heaps):
@@ -149,6 +149,6 @@ def desk_scene(kit: Kit) -> Plan:
         occlusion_m=kit.size(0.15, 0.6),
     )  # fmt: skip
     return Plan(
-        group=group, lights=tuple(lights), sky=sky, low=(-w * 0.7, -d * 0.5 - 0.9, z + 0.1),
-        high=(w * 0.7, d * 0.2, z + 0.9), targets=tuple(targets),
+        group=group, lights=tuple(lights), sky=sky, low=(-width * 0.7, -depth * 0.5 - 0.9, z + 0.1),
+        high=(width * 0.7, depth * 0.2, z + 0.9), targets=tuple(targets),
     )  # fmt: skip

@@ -15,7 +15,7 @@ def person(kit: Kit) -> Group:
     cloth = kit.any_surface()
     legs = kit.surface("plain", "fabric", vivid=0.2)
     skin = kit.palette.new("plain", np.array([0.85, 0.65, 0.52]) * kit.size(0.45, 1.1), gloss=0.1)
-    h = kit.size(1.5, 1.9)
+    height = kit.size(1.5, 1.9)
     stride = kit.size(0, 0.3)
     # Legs, feet, arms and hands; the arms swing against the legs.
     for side in (-1, 1):
@@ -23,7 +23,11 @@ def person(kit: Kit) -> Group:
         foot = side * stride
         group.add(
             tube(
-                [(x, 0, h * 0.5), (x * 1.1, -0.03 + foot * 0.4, h * 0.27), (x * 1.1, foot, 0.05)],
+                [
+                    (x, 0, height * 0.5),
+                    (x * 1.1, -0.03 + foot * 0.4, height * 0.27),
+                    (x * 1.1, foot, 0.05),
+                ],
                 0.07,
             ),
             legs,
@@ -35,27 +39,27 @@ def person(kit: Kit) -> Group:
         group.add(
             tube(
                 [
-                    (side * 0.2, 0, h * 0.8),
-                    (side * 0.26, swing * 0.4, h * 0.64),
-                    (side * 0.24, swing - 0.08, h * 0.5),
+                    (side * 0.2, 0, height * 0.8),
+                    (side * 0.26, swing * 0.4, height * 0.64),
+                    (side * 0.24, swing - 0.08, height * 0.5),
                 ],
                 0.045,
             ),
             cloth,
         )
-        group.add(superquadric((0.08, 0.08, 0.12)), skin, (side * 0.24, swing - 0.1, h * 0.47))
+        group.add(superquadric((0.08, 0.08, 0.12)), skin, (side * 0.24, swing - 0.1, height * 0.47))
     # Trunk, neck, head and hair.
     group.add(
-        superquadric((0.4, 0.25, h * 0.38), vertical=0.6, around=0.8),
+        superquadric((0.4, 0.25, height * 0.38), vertical=0.6, around=0.8),
         cloth,
-        (0, 0, h * 0.66),
+        (0, 0, height * 0.66),
     )
-    group.add(cylinder(0.05, 0.1), skin, (0, 0, h * 0.83))
-    group.add(superquadric((0.17, 0.2, 0.25)), skin, (0, -0.01, h * 0.93))
+    group.add(cylinder(0.05, 0.1), skin, (0, 0, height * 0.83))
+    group.add(superquadric((0.17, 0.2, 0.25)), skin, (0, -0.01, height * 0.93))
     group.add(
         superquadric((0.19, 0.2, 0.18)),
         kit.palette.new("foliage", (0.2, 0.13, 0.08)),
-        (0, 0.02, h * 0.955),
+        (0, 0.02, height * 0.955),
     )
     return group
 
@@ -68,9 +72,17 @@ def bicycle(kit: Kit) -> Group:
     for x in (-0.52, 0.52):
         group.add(torus(0.33, 0.018), tyre, (x, -0.2, 0.35), pitch=np.pi / 2)
         for angle in np.arange(6) * np.pi / 6:
-            c = 0.32 * np.cos(angle)
-            s = 0.32 * np.sin(angle)
-            group.add(rod((x - c, -0.2, 0.35 - s), (x + c, -0.2, 0.35 + s), 0.003, sides=4), tyre)
+            along_x = 0.32 * np.cos(angle)
+            along_z = 0.32 * np.sin(angle)
+            group.add(
+                rod(
+                    (x - along_x, -0.2, 0.35 - along_z),
+                    (x + along_x, -0.2, 0.35 + along_z),
+                    0.003,
+                    sides=4,
+                ),
+                tyre,
+            )
     joints = {
         "a": (-0.52, 0.35),
         "b": (-0.05, 0.3),

@@ -48,32 +48,40 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
     group = Group()
     # Size and materials.
     wood = kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
-    w = width or kit.size(0.7, 2.0)
-    d = kit.size(0.5, 0.95)
-    h = kit.size(0.4, 0.78)
+    table_width = width or kit.size(0.7, 2.0)
+    depth = kit.size(0.5, 0.95)
+    height = kit.size(0.4, 0.78)
     thick = kit.size(0.015, 0.05)
     legs = kit.metal() if kit.chance(0.3) else wood
-    y = -d / 2
+    y = -depth / 2
     # A round table on one leg, or one on four.
     if kit.chance(0.15):
-        group.add(cylinder(d * 0.6, thick, sides=30), wood, (0, y, h - thick))
-        group.add(cylinder(0.04, h - thick), legs, (0, y, 0))
-        group.add(cylinder(d * 0.3, 0.03, top=d * 0.1), legs, (0, y, 0))
+        group.add(cylinder(depth * 0.6, thick, sides=30), wood, (0, y, height - thick))
+        group.add(cylinder(0.04, height - thick), legs, (0, y, 0))
+        group.add(cylinder(depth * 0.3, 0.03, top=depth * 0.1), legs, (0, y, 0))
     else:
-        group.add(box(w, d, thick), wood, (0, y, h - thick))
-        t = kit.size(0.03, 0.09)
+        group.add(box(table_width, depth, thick), wood, (0, y, height - thick))
+        thickness = kit.size(0.03, 0.09)
         for sx in (-1, 1):
             for sy in (-1, 1):
-                at = (sx * (w / 2 - t), y + sy * (d / 2 - t), 0)
-                leg = box(t, t, h - thick) if kit.chance(0.7) else cylinder(t / 2, h - thick)
+                at = (sx * (table_width / 2 - thickness), y + sy * (depth / 2 - thickness), 0)
+                leg = (
+                    box(thickness, thickness, height - thick)
+                    if kit.chance(0.7)
+                    else cylinder(thickness / 2, height - thick)
+                )
                 group.add(leg, legs, at)
         if kit.chance(0.5):
-            group.add(box(w * 0.9, d * 0.85, 0.08), wood, (0, y, h - thick - 0.08))
+            group.add(
+                box(table_width * 0.9, depth * 0.85, 0.08), wood, (0, y, height - thick - 0.08)
+            )
     # Things on it.
     scatter(
         kit,
         group,
-        area=Rectangle((-w * 0.42, -d * 0.9), (w * 0.42, -d * 0.1), h),
+        area=Rectangle(
+            (-table_width * 0.42, -depth * 0.9), (table_width * 0.42, -depth * 0.1), height
+        ),
         count=int(kit.rng.integers(0, 9)),
         tallest=0.45,
         things=_TABLE_THINGS,
@@ -90,16 +98,16 @@ def desk(kit: Kit) -> Group:
         top = 0.74
         group = Group()
         wood = kit.wood()
-        w = float(upper[0] - lower[0])
-        group.add(box(w, 0.7, 0.03), wood, (0, -0.35, top - 0.03))
+        width = float(upper[0] - lower[0])
+        group.add(box(width, 0.7, 0.03), wood, (0, -0.35, top - 0.03))
         for side in (-1, 1):
-            group.add(box(0.03, 0.65, top - 0.03), wood, (side * (w / 2 - 0.02), -0.35, 0))
+            group.add(box(0.03, 0.65, top - 0.03), wood, (side * (width / 2 - 0.02), -0.35, 0))
         group.insert(monitor(kit), (kit.size(-0.2, 0.2), -0.2, top), yaw=kit.size(-0.3, 0.3))
         group.add(box(0.42, 0.14, 0.02), kit.dark(), (0, -0.5, top))
         scatter(
             kit,
             group,
-            area=Rectangle((-w * 0.45, -0.62), (w * 0.45, -0.15), top),
+            area=Rectangle((-width * 0.45, -0.62), (width * 0.45, -0.15), top),
             count=int(kit.rng.integers(1, 7)),
             tallest=0.4,
         )
@@ -110,22 +118,30 @@ def bookshelf(kit: Kit) -> Group:
     """Returns open shelves full of books and things."""
     group = Group()
     wood = kit.wood() if kit.chance(0.6) else kit.surface("plain")
-    w = kit.size(0.6, 1.6)
-    d = kit.size(0.24, 0.4)
-    h = kit.size(0.8, 2.2)
-    t = 0.025
+    width = kit.size(0.6, 1.6)
+    depth = kit.size(0.24, 0.4)
+    height = kit.size(0.8, 2.2)
+    thickness = 0.025
     for side in (-1, 1):
-        group.add(box(t, d, h), wood, (side * (w - t) / 2, -d / 2, 0))
+        group.add(
+            box(thickness, depth, height), wood, (side * (width - thickness) / 2, -depth / 2, 0)
+        )
     if kit.chance(0.75):
-        group.add(box(w, 0.01, h), wood, (0, -0.005, 0))
-    shelves = np.linspace(0.06, h - t, max(2, int(h / kit.size(0.28, 0.42))))
+        group.add(box(width, 0.01, height), wood, (0, -0.005, 0))
+    shelves = np.linspace(0.06, height - thickness, max(2, int(height / kit.size(0.28, 0.42))))
     gap = float(shelves[1] - shelves[0])
     covers = [kit.palette.new("poster", tile_m=0.3) for _ in range(3)]
     covers += [kit.palette.new("plain", tile_m=0.3, vivid=0.6) for _ in range(6)]
     for z in shelves:
-        group.add(box(w, d, t), wood, (0, -d / 2, float(z)))
+        group.add(box(width, depth, thickness), wood, (0, -depth / 2, float(z)))
         if z < shelves[-1]:
-            _fill_shelf(kit, group, (w - 2 * t, d, gap - t), float(z) + t, covers)
+            _fill_shelf(
+                kit,
+                group,
+                (width - 2 * thickness, depth, gap - thickness),
+                float(z) + thickness,
+                covers,
+            )
     return group
 
 
@@ -133,31 +149,33 @@ def _fill_shelf(
     kit: Kit, group: Group, size: tuple[float, float, float], z: float, covers: list[int]
 ) -> None:
     """Adds books and things to a shelf of this width, depth and height, whose board is at z."""
-    w, d, gap = size
-    x = -w / 2
-    while x < w / 2 - 0.06:
+    width, depth, gap = size
+    x = -width / 2
+    while x < width / 2 - 0.06:
         if kit.chance(0.8):
             # A book, some of them leaning.
             wide = kit.size(0.012, 0.06)
             tall = gap * kit.size(0.5, 0.97)
-            deep = d * kit.size(0.5, 0.9)
+            deep = depth * kit.size(0.5, 0.9)
             lean = kit.size(-0.25, 0.0) if kit.chance(0.06) else 0.0
             group.add(
                 box(wide * 0.97, deep, tall),
                 int(kit.rng.choice(covers)),
-                (x + wide / 2, -d * kit.size(0.93, 1.0) + deep / 2, z),
+                (x + wide / 2, -depth * kit.size(0.93, 1.0) + deep / 2, z),
                 roll=lean,
             )
             x += wide
         else:
             # A thing, or a gap.
             wide = kit.size(0.08, 0.3)
-            end = min(x + wide, w / 2)
+            end = min(x + wide, width / 2)
             if kit.chance(0.7):
                 scatter(
                     kit,
                     group,
-                    area=Rectangle(((x + end) / 2, -d * 0.7), ((x + end) / 2 + 0.01, -d * 0.4), z),
+                    area=Rectangle(
+                        ((x + end) / 2, -depth * 0.7), ((x + end) / 2 + 0.01, -depth * 0.4), z
+                    ),
                     count=1,
                     tallest=gap * 0.9,
                     things=_SHELF_THINGS,
@@ -173,19 +191,19 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
         if kit.chance(0.5)
         else kit.palette.new("plain", tile_m=1.0, gloss=0.4, mirror=kit.size(0, 0.05), vivid=0.4)
     )
-    w = kit.size(0.5, 1.8)
-    d = kit.size(0.35, 0.65)
-    h = kit.size(0.5, 2.2)
+    width = kit.size(0.5, 1.8)
+    depth = kit.size(0.35, 0.65)
+    height = kit.size(0.5, 2.2)
     if hang:
-        d = 0.35
-        h = kit.size(0.5, 0.8)
-    group.add(box(w, d, h), front, (0, -d / 2, hang))
-    _doors(kit, group, (w, d, h), hang, front)
-    if h < 1.3 and not hang:
+        depth = 0.35
+        height = kit.size(0.5, 0.8)
+    group.add(box(width, depth, height), front, (0, -depth / 2, hang))
+    _doors(kit, group, (width, depth, height), hang, front)
+    if height < 1.3 and not hang:
         scatter(
             kit,
             group,
-            area=Rectangle((-w * 0.42, -d * 0.85), (w * 0.42, -d * 0.2), h),
+            area=Rectangle((-width * 0.42, -depth * 0.85), (width * 0.42, -depth * 0.2), height),
             count=int(kit.rng.integers(0, 7)),
             tallest=0.7,
         )
@@ -194,33 +212,35 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
 
 def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, front: int) -> None:
     """Adds doors with handles to the front of a body of this width, depth and height at z."""
-    w, d, h = size
+    width, depth, height = size
     steel = kit.metal()
     # Rows and columns of doors or drawers, with handles of one style.
-    columns = max(1, round(w / kit.size(0.4, 0.6)))
-    rows = int(kit.rng.integers(1, 5)) if h > 0.6 else 1
+    columns = max(1, round(width / kit.size(0.4, 0.6)))
+    rows = int(kit.rng.integers(1, 5)) if height > 0.6 else 1
     style = int(kit.rng.integers(3))
     gap = 0.006
     for column in range(columns):
         for row in range(rows):
-            wide = w / columns
-            tall = (h - 0.06) / rows
-            x = -w / 2 + (column + 0.5) * wide
+            wide = width / columns
+            tall = (height - 0.06) / rows
+            x = -width / 2 + (column + 0.5) * wide
             low = z + 0.05 + row * tall
             # The door.
-            group.add(box(wide - 2 * gap, 0.018, tall - 2 * gap), front, (x, -d - 0.01, low + gap))
+            group.add(
+                box(wide - 2 * gap, 0.018, tall - 2 * gap), front, (x, -depth - 0.01, low + gap)
+            )
             # Its handle: a bar across, a bar along, or a knob.
             if style == 0:
                 group.add(
                     box(min(0.25, wide * 0.5), 0.012, 0.012),
                     steel,
-                    (x, -d - 0.045, low + tall * 0.85),
+                    (x, -depth - 0.045, low + tall * 0.85),
                 )
             elif style == 1:
                 group.add(
                     rod(
-                        (x + wide * 0.38, -d - 0.05, low + tall * 0.3),
-                        (x + wide * 0.38, -d - 0.05, low + tall * 0.7),
+                        (x + wide * 0.38, -depth - 0.05, low + tall * 0.3),
+                        (x + wide * 0.38, -depth - 0.05, low + tall * 0.7),
                         0.007,
                     ),
                     steel,
@@ -229,7 +249,7 @@ def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, f
                 group.add(
                     superquadric((0.03, 0.03, 0.03)),
                     steel,
-                    (x + wide * 0.4, -d - 0.035, low + tall / 2),
+                    (x + wide * 0.4, -depth - 0.035, low + tall / 2),
                 )
 
 
@@ -237,33 +257,36 @@ def kitchen(kit: Kit) -> Group:
     """Returns a kitchen counter with tap, tiled back wall, hung cupboards and clutter."""
     group = Group()
     # The body with its doors, the top and the back wall.
-    w = kit.size(1.6, 3.6)
-    d = kit.size(0.58, 0.68)
-    h = kit.size(0.84, 0.94)
+    width = kit.size(1.6, 3.6)
+    depth = kit.size(0.58, 0.68)
+    height = kit.size(0.84, 0.94)
     front = kit.palette.new("plain", tile_m=1.0, gloss=0.5, mirror=kit.size(0.0, 0.06), vivid=0.6)
     top = kit.surface("marble", "speckle", "plain", "wood", tile_m=0.8)
-    group.add(box(w, d - 0.05, h - 0.1), front, (0, -d / 2, 0.1))
-    group.add(box(w, d - 0.12, 0.1), kit.dark(), (0, -d / 2 + 0.03, 0))
-    _doors(kit, group, (w, d - 0.03, h - 0.1), 0.08, front)
-    group.add(box(w + 0.02, d + 0.03, 0.04), top, (0, -d / 2, h - 0.04))
+    group.add(box(width, depth - 0.05, height - 0.1), front, (0, -depth / 2, 0.1))
+    group.add(box(width, depth - 0.12, 0.1), kit.dark(), (0, -depth / 2 + 0.03, 0))
+    _doors(kit, group, (width, depth - 0.03, height - 0.1), 0.08, front)
+    group.add(box(width + 0.02, depth + 0.03, 0.04), top, (0, -depth / 2, height - 0.04))
     group.add(
-        box(w, 0.012, 0.55), kit.surface("tiles", "brick", "plain", tile_m=0.5), (0, -0.006, h)
+        box(width, 0.012, 0.55),
+        kit.surface("tiles", "brick", "plain", tile_m=0.5),
+        (0, -0.006, height),
     )
     # Sink and tap.
-    x = kit.size(-0.3, 0.3) * w
+    x = kit.size(-0.3, 0.3) * width
     steel = kit.metal()
-    group.add(box(0.5, 0.4, 0.006), steel, (x, -d / 2, h))
-    group.add(box(0.42, 0.32, 0.002), kit.dark(), (x, -d / 2, h + 0.006))
-    a = np.linspace(0, np.pi, 12)
+    group.add(box(0.5, 0.4, 0.006), steel, (x, -depth / 2, height))
+    group.add(box(0.42, 0.32, 0.002), kit.dark(), (x, -depth / 2, height + 0.006))
+    angle = np.linspace(0, np.pi, 12)
     arc = np.stack(
-        [np.zeros(12), -0.18 - 0.09 * (1 - np.cos(a)), h + 0.22 + 0.08 * np.sin(a)], axis=1
+        [np.zeros(12), -0.18 - 0.09 * (1 - np.cos(angle)), height + 0.22 + 0.08 * np.sin(angle)],
+        axis=1,
     )
-    group.add(tube(np.concatenate([[[0, -0.18, h]], arc]) + np.array([x, 0, 0]), 0.012), steel)
+    group.add(tube(np.concatenate([[[0, -0.18, height]], arc]) + np.array([x, 0, 0]), 0.012), steel)
     # Things on the counter.
     scatter(
         kit,
         group,
-        area=Rectangle((-w * 0.47, -d * 0.9), (w * 0.47, -0.1), h),
+        area=Rectangle((-width * 0.47, -depth * 0.9), (width * 0.47, -0.1), height),
         count=int(kit.rng.integers(4, 18)),
         tallest=0.45,
         things=_KITCHEN_THINGS,
@@ -271,7 +294,7 @@ def kitchen(kit: Kit) -> Group:
     # Hung cupboards.
     if kit.chance(0.6):
         for side in (-0.25, 0.25):
-            group.insert(cupboard(kit, hang=h + kit.size(0.5, 0.65)), (side * w, 0, 0))
+            group.insert(cupboard(kit, hang=height + kit.size(0.5, 0.65)), (side * width, 0, 0))
     return group
 
 
@@ -279,13 +302,20 @@ def floor_lamp(kit: Kit) -> Group:
     """Returns a tall thin lamp."""
     group = Group()
     metal = kit.metal()
-    h = kit.size(1.3, 1.8)
+    height = kit.size(1.3, 1.8)
     group.add(cylinder(0.14, 0.02), metal, (0, -0.2, 0))
-    group.add(cylinder(0.011, h), metal, (0, -0.2, 0))
-    r = kit.size(0.12, 0.22)
+    group.add(cylinder(0.011, height), metal, (0, -0.2, 0))
+    radius = kit.size(0.12, 0.22)
     shade = kit.palette.new("fabric", (0.85, 0.8, 0.7), glow=kit.size(0, 1.5))
     group.add(
-        lathe([(r, h - 0.25), (r * 0.6, h), (r * 0.58, h), (r * 0.98, h - 0.25)]),
+        lathe(
+            [
+                (radius, height - 0.25),
+                (radius * 0.6, height),
+                (radius * 0.58, height),
+                (radius * 0.98, height - 0.25),
+            ]
+        ),
         shade,
         (0, -0.2, 0),
     )
@@ -312,12 +342,12 @@ def railing(kit: Kit) -> Group:
     """Returns a rail with thin bars."""
     group = Group()
     steel = kit.metal() if kit.chance(0.6) else kit.wood()
-    w = kit.size(0.8, 2.4)
-    h = kit.size(0.7, 1.1)
-    group.add(rod((-w / 2, -0.05, h), (w / 2, -0.05, h), 0.022), steel)
-    group.add(rod((-w / 2, -0.05, 0.1), (w / 2, -0.05, 0.1), 0.012), steel)
-    for x in np.arange(-w / 2, w / 2 + 0.01, kit.size(0.08, 0.16)):
-        group.add(cylinder(0.007, h), steel, (float(x), -0.05, 0))
+    width = kit.size(0.8, 2.4)
+    height = kit.size(0.7, 1.1)
+    group.add(rod((-width / 2, -0.05, height), (width / 2, -0.05, height), 0.022), steel)
+    group.add(rod((-width / 2, -0.05, 0.1), (width / 2, -0.05, 0.1), 0.012), steel)
+    for x in np.arange(-width / 2, width / 2 + 0.01, kit.size(0.08, 0.16)):
+        group.add(cylinder(0.007, height), steel, (float(x), -0.05, 0))
     return group
 
 

@@ -132,42 +132,48 @@ def pole(kit: Kit) -> Group:
     group = Group()
     grey = kit.palette.new("plain", (kit.size(0.2, 0.6),) * 3, gloss=0.3)
     choice = kit.rng.random()
-    r = kit.size(0.03, 0.09)
+    radius = kit.size(0.03, 0.09)
     if choice < 0.4:
         # A lamp post.
-        h = kit.size(4.5, 9)
+        height = kit.size(4.5, 9)
         reach = kit.size(0.5, 2.2)
         group.add(
             tube(
-                [(0, 0, 0), (0, 0, h * 0.6), (0, 0, h * 0.93), (reach * 0.3, 0, h), (reach, 0, h)],
-                r,
+                [
+                    (0, 0, 0),
+                    (0, 0, height * 0.6),
+                    (0, 0, height * 0.93),
+                    (reach * 0.3, 0, height),
+                    (reach, 0, height),
+                ],
+                radius,
             ),
             grey,
         )
-        group.add(superquadric((0.7, 0.25, 0.15), vertical=0.5), grey, (reach, 0, h))
+        group.add(superquadric((0.7, 0.25, 0.15), vertical=0.5), grey, (reach, 0, height))
     elif choice < 0.8:
         # A road sign, round or square.
-        h = kit.size(2.0, 3.0)
-        group.add(cylinder(0.032, h + 0.4), grey)
+        height = kit.size(2.0, 3.0)
+        group.add(cylinder(0.032, height + 0.4), grey)
         sign = kit.palette.new("poster", tile_m=0.7, whole=True, gloss=0.2)
-        w = kit.size(0.45, 0.9)
+        width = kit.size(0.45, 0.9)
         if kit.chance(0.5):
             group.add(
-                cylinder(w / 2, 0.02, sides=26),
+                cylinder(width / 2, 0.02, sides=26),
                 kit.surface("plain", "checks", "poster", vivid=0.9),
-                (0, -0.04, h),
+                (0, -0.04, height),
                 pitch=np.pi / 2,
             )
         else:
-            group.add(box(w, 0.02, kit.size(0.4, 0.9), fit=0.7), sign, (0, -0.04, h - 0.4))
+            group.add(box(width, 0.02, kit.size(0.4, 0.9), fit=0.7), sign, (0, -0.04, height - 0.4))
     else:
         # A traffic light.
-        h = kit.size(2.6, 6)
-        group.add(cylinder(r, h), grey)
+        height = kit.size(2.6, 6)
+        group.add(cylinder(radius, height), grey)
         case = kit.dark()
-        group.add(box(0.28, 0.25, 0.85), case, (0.0, -0.12, min(h, 3.4) - 0.9))
+        group.add(box(0.28, 0.25, 0.85), case, (0.0, -0.12, min(height, 3.4) - 0.9))
         for index, lamp in enumerate(((0.6, 0.05, 0.03), (0.6, 0.4, 0.03), (0.05, 0.5, 0.1))):
-            at = (0, -0.25, min(h, 3.4) - 0.2 - 0.28 * index)
+            at = (0, -0.25, min(height, 3.4) - 0.2 - 0.28 * index)
             group.add(
                 superquadric((0.19, 0.05, 0.19)),
                 kit.palette.new("plain", lamp, glow=kit.size(0, 2)),

@@ -18,13 +18,67 @@ def room(kit: Kit) -> Plan:
     rng = kit.rng
     # Size: some rooms are corridors, some ceilings slope.
     corridor = kit.chance(0.12)
-    w = kit.size(1.4, 2.2) if corridor else kit.size(2.2, 6.5)
-    d = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
-    h = kit.size(2.2, 3.1)
+    width = kit.size(1.4, 2.2) if corridor else kit.size(2.2, 6.5)
+    depth = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
+    height = kit.size(2.2, 3.1)
     rise = kit.size(-0.9, 1.5) if kit.chance(0.2) else 0.0
-    # Floor and ceiling; some floors reflect.
+    # Floor, ceiling and walls.
     group = Group()
+    paint = _add_floor_and_ceiling(kit, group, (width, depth, height), rise)
+    sides = (
+        ((0.0, depth), 0.0, width, height, rise),
+        ((width, depth), -np.pi / 2, depth, height + rise, 0.0),
+        ((width, 0.0), np.pi, width, height + rise, -rise),
+        ((0.0, 0.0), np.pi / 2, depth, height, 0.0),
+    )
+    for start, yaw, length, tall, lift in sides:
+        side = _side(kit, length, tall, lift, paint, across=min(width, depth), corridor=corridor)
+        group.insert(side, (*start, 0), yaw=yaw)
+    # What stands in the middle: furniture, a pillar, things on the floor.
+    if not corridor:
+        _middle(kit, group, width, depth)
+    if kit.chance(0.3):
+        thing = (
+            box(0.35, 0.35, height + max(rise, 0))
+            if kit.chance(0.5)
+            else cylinder(0.18, height + max(rise, 0))
+        )
+        group.add(thing, paint, (kit.size(0.3, 0.7) * width, kit.size(0.3, 0.7) * depth, 0))
+    clutter.scatter(
+        kit,
+        group,
+        area=clutter.Rectangle((0.4, 0.4), (width - 0.4, depth - 0.4), 0.0),
+        count=int(rng.integers(0, 10)),
+    )
+    # What the windows show.
+    _outside(kit, group, width, depth)
+    # Places that the cameras look at, and lights.
     targets = []
+    for _ in range(16):
+        targets.append((kit.size(0.1, 0.9) * width, kit.size(0.1, 0.9) * depth, kit.size(0.1, 1.4)))
+    lights = _lights(kit, width, depth, height, group)
+    return Plan(
+        group=group,
+        lights=lights,
+        sky=_indoor_sky(kit),
+        low=(0.3, 0.3, 0.5),
+        high=(width - 0.3, depth - 0.3, min(1.9, height - 0.3)),
+        targets=tuple(targets),
+    )
+
+
+def _add_floor_and_ceiling(
+    kit: Kit, group: Group, size: tuple[float, float, float], rise: float
+) -> int:
+    """Adds the floor, which may reflect, and the ceiling; returns the material of the walls.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group of the room.
+        size: Width, depth and height of the room in metres.
+        rise: How much higher the ceiling is at the right wall than at the left.
+    """
+    width, depth, height = size
     paint = kit.surface(
         "plaster",
         "plaster",
@@ -50,58 +104,65 @@ def room(kit: Kit) -> Plan:
         tile_m=kit.size(0.6, 2),
         vivid=0.2,
     )
-    m = kit.size(0, 0.12) if kit.chance(0.4) else 0.0
-    if m:
+    mirror = kit.size(0, 0.12) if kit.chance(0.4) else 0.0
+    if mirror:
         floor = kit.palette.new(
-            "planks" if kit.chance(0.5) else "tiles", tile_m=kit.size(0.6, 2), mirror=m, vivid=0.1
+            "planks" if kit.chance(0.5) else "tiles",
+            tile_m=kit.size(0.6, 2),
+            mirror=mirror,
+            vivid=0.1,
         )
     ceiling = kit.surface("plain", "plaster", "tiles", vivid=0.05, tile_m=2)
-    group.add(quads([[(0, 0, 0), (w, 0, 0), (w, d, 0), (0, d, 0)]]), floor)
-    group.add(quads([[(0, 0, h), (w, 0, h + rise), (w, d, h + rise), (0, d, h)]]), ceiling)
-    # Walls with windows, doors, and what stands along them.
-    sides = (((0.0, d), 0.0, w, h, rise), ((w, d), -np.pi / 2, d, h + rise, 0.0),
-             ((w, 0.0), np.pi, w, h + rise, -rise), ((0.0, 0.0), np.pi / 2, d, h, 0.0))  # fmt: skip
-    for start, yaw, length, tall, lift in sides:
-        own = paint if kit.chance(0.8) else kit.surface("plaster", "plain", "brick", tile_m=1.5)
-        side = Group()
-        holes = openings(kit, length, min(tall, tall + lift))
-        side.add(wall(length, tall, holes, rise=lift), own)
-        for hole in holes:
-            opening(kit, side, hole, own)
-        if kit.chance(0.7):
-            skirting = (
-                kit.palette.new("plain", (0.88, 0.87, 0.85)) if kit.chance(0.6) else kit.wood()
-            )
-            side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
-        decorate(kit, side, length, min(tall, tall + lift), holes)
-        _line_up(kit, side, length, min(w, d), holes, corridor)
-        group.insert(side, (*start, 0), yaw=yaw)
-    # What stands in the middle: furniture, a pillar, things on the floor.
-    if not corridor:
-        _middle(kit, group, w, d)
-    if kit.chance(0.3):
-        thing = (
-            box(0.35, 0.35, h + max(rise, 0))
-            if kit.chance(0.5)
-            else cylinder(0.18, h + max(rise, 0))
-        )
-        group.add(thing, paint, (kit.size(0.3, 0.7) * w, kit.size(0.3, 0.7) * d, 0))
-    clutter.scatter(
-        kit,
-        group,
-        area=clutter.Rectangle((0.4, 0.4), (w - 0.4, d - 0.4), 0.0),
-        count=int(rng.integers(0, 10)),
+    group.add(quads([[(0, 0, 0), (width, 0, 0), (width, depth, 0), (0, depth, 0)]]), floor)
+    group.add(
+        quads(
+            [
+                [
+                    (0, 0, height),
+                    (width, 0, height + rise),
+                    (width, depth, height + rise),
+                    (0, depth, height),
+                ]
+            ]
+        ),
+        ceiling,
     )
-    # What the windows show.
-    _outside(kit, group, w, d)
-    # Places that the cameras look at, and lights.
-    for _ in range(16):
-        targets.append((kit.size(0.1, 0.9) * w, kit.size(0.1, 0.9) * d, kit.size(0.1, 1.4)))
-    lights = _lights(kit, w, d, h, group)
-    return Plan(
-        group=group, lights=lights, sky=_indoor_sky(kit),
-        low=(0.3, 0.3, 0.5), high=(w - 0.3, d - 0.3, min(1.9, h - 0.3)), targets=tuple(targets),
-    )  # fmt: skip
+    return paint
+
+
+def _side(
+    kit: Kit,
+    length: float,
+    height: float,
+    rise: float,
+    paint: int,
+    *,
+    across: float,
+    corridor: bool,
+) -> Group:
+    """Returns a wall with windows, doors, and what hangs on it and stands along it.
+
+    Args:
+        kit: Random numbers and materials.
+        length: Length of the wall, metres.
+        height: Height at its left end.
+        rise: How much higher it is at its right end.
+        paint: Material of most walls of the room.
+        across: The shorter side of the room.
+        corridor: Whether the room is a corridor, with less furniture.
+    """
+    own = paint if kit.chance(0.8) else kit.surface("plaster", "plain", "brick", tile_m=1.5)
+    side = Group()
+    holes = openings(kit, length, min(height, height + rise))
+    side.add(wall(length, height, holes, rise=rise), own)
+    for hole in holes:
+        opening(kit, side, hole, own)
+    if kit.chance(0.7):
+        skirting = kit.palette.new("plain", (0.88, 0.87, 0.85)) if kit.chance(0.6) else kit.wood()
+        side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
+    decorate(kit, side, length, min(height, height + rise), holes)
+    _line_up(kit, side, length, across, holes, corridor)
+    return side
 
 
 def _line_up(
@@ -131,10 +192,10 @@ def _line_up(
         u += wide + (kit.size(0.0, 0.1) if kit.chance(0.5) else kit.size(0.2, 0.9))
 
 
-def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
+def _middle(kit: Kit, group: Group, width: float, depth: float) -> None:
     """Adds a table with chairs, a rug, single chairs, people and hanging lamps."""
-    x = kit.size(0.35, 0.65) * w
-    y = kit.size(0.35, 0.65) * d
+    x = kit.size(0.35, 0.65) * width
+    y = kit.size(0.35, 0.65) * depth
     yaw = kit.size(0, 6.3)
     # A rug.
     if kit.chance(0.5):
@@ -146,7 +207,7 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
             yaw=yaw,
         )
     # A table with chairs on both sides.
-    if min(w, d) > 2.8 and kit.chance(0.75):
+    if min(width, depth) > 2.8 and kit.chance(0.75):
         ensemble = Group()
         item = furniture.table(kit) if kit.chance(0.7) else furniture.desk(kit)
         lower, upper = item.bounds()
@@ -177,13 +238,13 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
         )
         item = makers[int(kit.rng.integers(len(makers)))](kit)
         group.insert(
-            item, (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0), yaw=kit.size(0, 6.3)
+            item, (kit.size(0.2, 0.8) * width, kit.size(0.2, 0.8) * depth, 0), yaw=kit.size(0, 6.3)
         )
     # A person.
     if kit.chance(0.3):
         group.insert(
             figures.person(kit),
-            (kit.size(0.2, 0.8) * w, kit.size(0.2, 0.8) * d, 0),
+            (kit.size(0.2, 0.8) * width, kit.size(0.2, 0.8) * depth, 0),
             yaw=kit.size(0, 6.3),
         )
     # A hanging lamp.
@@ -198,29 +259,34 @@ def _middle(kit: Kit, group: Group, w: float, d: float) -> None:
         )
 
 
-def _outside(kit: Kit, group: Group, w: float, d: float) -> None:
+def _outside(kit: Kit, group: Group, width: float, depth: float) -> None:
     """Adds what is seen through windows: ground and, at random, a wall, a hedge or boxes."""
     ground = kit.surface("paving", "foliage", "speckle", tile_m=3, vivid=0.2)
-    group.add(box(80, 80, 0.1), ground, (w / 2, d / 2, -kit.size(0.3, 4)))
+    group.add(box(80, 80, 0.1), ground, (width / 2, depth / 2, -kit.size(0.3, 4)))
     for _ in range(int(kit.rng.integers(0, 6))):
         angle = kit.size(0, 6.3)
-        far = kit.size(4, 25) + max(w, d)
+        far = kit.size(4, 25) + max(width, depth)
         block = box(kit.size(1, 12), kit.size(1, 8), kit.size(1, 9))
         material = kit.surface("brick", "plaster", "foliage", tile_m=2, vivid=0.2)
         group.add(
             block,
             material,
-            (w / 2 + far * np.cos(angle), d / 2 + far * np.sin(angle), -2),
+            (width / 2 + far * np.cos(angle), depth / 2 + far * np.sin(angle), -2),
             yaw=kit.size(0, 6.3),
         )
 
 
-def _lights(kit: Kit, w: float, d: float, h: float, group: Group) -> tuple[Light, ...]:
+def _lights(kit: Kit, width: float, depth: float, height: float, group: Group) -> tuple[Light, ...]:
+    """Returns lamps in a room of this width, depth and height, and often a sun."""
     lights = []
     for _ in range(int(kit.rng.integers(1, 4))):
         warm = kit.size(0.65, 1.0)
         power = kit.size(0.5, 3.0)
-        position = (kit.size(0.15, 0.85) * w, kit.size(0.15, 0.85) * d, kit.size(1.7, h - 0.1))
+        position = (
+            kit.size(0.15, 0.85) * width,
+            kit.size(0.15, 0.85) * depth,
+            kit.size(1.7, height - 0.1),
+        )
         colour = (power, power * (0.3 + 0.7 * warm), power * warm**2)
         lights.append(Light(position=position, colour=colour, radius=kit.size(0.05, 0.5)))
     if kit.chance(0.5):
@@ -236,6 +302,7 @@ def _lights(kit: Kit, w: float, d: float, h: float, group: Group) -> tuple[Light
 
 
 def _indoor_sky(kit: Kit) -> Sky:
+    """Returns the sky outside the windows, and the ambient light of a room."""
     bright = kit.size(1, 5)
     level = kit.size(0.15, 0.6)
     up = tuple(float(v) for v in level * kit.rng.uniform(0.85, 1.1, 3))

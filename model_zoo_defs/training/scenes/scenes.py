@@ -30,21 +30,20 @@ _MAKERS = {"room": room, "street": street, "desk": desk_scene}
 
 
 class Rig(NamedTuple):
-    """Intrinsics and random pose of a camera.
-
-    fov_deg: horizontal. shift: of the principal point from the image centre, (right, down), as
-    fractions of width and height. height: above the floor or road, lowest and highest, metres.
-    roll_deg: standard deviation of roll and, in a street, of yaw. pitch_deg: mean, upward, and
-    standard deviation; None: towards a target of the scene. clearance: least distance to visible
-    surfaces, metres.
-    """
+    """Intrinsics and random pose of a camera."""
 
     fov_deg: float
+    """Horizontal field of view."""
     shift: tuple[float, float]
+    """The principal point from the image centre, (right, down), in widths and heights."""
     height: tuple[float, float]
+    """Lowest and highest position above the floor or road, metres."""
     roll_deg: float
+    """Standard deviation of roll and, in a street, of yaw."""
     pitch_deg: tuple[float, float] | None = None
+    """Mean, upward, and standard deviation; None looks towards a target of the scene."""
     clearance: float | None = None
+    """Least distance to visible surfaces, metres; None sets none."""
 
 
 CAMERAS: dict[str, Rig | None] = {
@@ -121,6 +120,7 @@ def pick_view(
 def _street_view(
     plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None
 ) -> View:
+    """Returns a view mostly along the street; a rig sets its height, angles and intrinsics."""
     position = rng.uniform(plan.low, plan.high)
     yaw = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-1.2, 1.2)
     # A crop of a wide image may be off-centre to its principal point.

@@ -35,32 +35,40 @@ def chair(kit: Kit) -> Group:
     # Size and materials.
     wood = kit.wood() if kit.chance(0.65) else kit.metal()
     seat = kit.surface("fabric", "plain", tile_m=0.3) if kit.chance(0.6) else wood
-    w = kit.size(0.38, 0.5)
-    d = kit.size(0.38, 0.5)
-    h = kit.size(0.42, 0.48)
+    width = kit.size(0.38, 0.5)
+    depth = kit.size(0.38, 0.5)
+    height = kit.size(0.42, 0.48)
     back = kit.size(0.75, 1.1)
-    t = kit.size(0.02, 0.045)
-    y = -d / 2
+    thickness = kit.size(0.02, 0.045)
+    y = -depth / 2
     # Seat and legs.
     if kit.chance(0.5):
-        group.add(box(w, d, 0.04), seat, (0, y, h - 0.04))
+        group.add(box(width, depth, 0.04), seat, (0, y, height - 0.04))
     else:
-        cushion(kit, group, (w, d, 0.08), (0, y, h - 0.03), seat)
+        cushion(kit, group, (width, depth, 0.08), (0, y, height - 0.03), seat)
     for sx in (-1, 1):
-        x = sx * (w / 2 - t / 2)
-        group.add(box(t, t, h), wood, (x, -d + t / 2, 0))
-        group.add(box(t, t, back), wood, (x, -t / 2, 0))
+        x = sx * (width / 2 - thickness / 2)
+        group.add(box(thickness, thickness, height), wood, (x, -depth + thickness / 2, 0))
+        group.add(box(thickness, thickness, back), wood, (x, -thickness / 2, 0))
     # Back: boards, bars or a panel.
     style = int(kit.rng.integers(3))
     if style == 0:
-        for z in np.linspace(h + 0.1, back - 0.06, int(kit.rng.integers(2, 5))):
-            group.add(box(w - t, t * 0.6, 0.045), wood, (0, -t / 2, float(z)))
+        for z in np.linspace(height + 0.1, back - 0.06, int(kit.rng.integers(2, 5))):
+            group.add(
+                box(width - thickness, thickness * 0.6, 0.045), wood, (0, -thickness / 2, float(z))
+            )
     elif style == 1:
-        for x in np.linspace(-w / 2 + t, w / 2 - t, int(kit.rng.integers(4, 8))):
-            group.add(cylinder(0.008, back - h), wood, (float(x), -t / 2, h))
-        group.add(box(w, t, 0.06), wood, (0, -t / 2, back - 0.06))
+        for x in np.linspace(
+            -width / 2 + thickness, width / 2 - thickness, int(kit.rng.integers(4, 8))
+        ):
+            group.add(cylinder(0.008, back - height), wood, (float(x), -thickness / 2, height))
+        group.add(box(width, thickness, 0.06), wood, (0, -thickness / 2, back - 0.06))
     else:
-        group.add(box(w, 0.03, (back - h) * 0.8), seat, (0, -t / 2, h + (back - h) * 0.2))
+        group.add(
+            box(width, 0.03, (back - height) * 0.8),
+            seat,
+            (0, -thickness / 2, height + (back - height) * 0.2),
+        )
     return group
 
 
@@ -94,19 +102,25 @@ def sofa(kit: Kit) -> Group:
     # Size.
     seats = int(kit.rng.integers(1, 4))
     each = kit.size(0.55, 0.75)
-    d = kit.size(0.75, 0.95)
-    h = kit.size(0.38, 0.46)
-    w = seats * each
+    depth = kit.size(0.75, 0.95)
+    height = kit.size(0.38, 0.46)
+    width = seats * each
     arm = kit.size(0.12, 0.25)
     # Body, back and arms.
-    group.add(box(w + 2 * arm, d, h * 0.6), cloth, (0, -d / 2, 0.06))
-    cushion(kit, group, (w + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
+    group.add(box(width + 2 * arm, depth, height * 0.6), cloth, (0, -depth / 2, 0.06))
+    cushion(kit, group, (width + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
     for side in (-1, 1):
-        cushion(kit, group, (arm, d, h * 1.4), (side * (w + arm) / 2, -d / 2, h * 0.75), cloth)
+        cushion(
+            kit,
+            group,
+            (arm, depth, height * 1.4),
+            (side * (width + arm) / 2, -depth / 2, height * 0.75),
+            cloth,
+        )
     # A cushion for each seat, and pillows.
     for index in range(seats):
         x = (index - (seats - 1) / 2) * each
-        cushion(kit, group, (each, d * 0.75, 0.18), (x, -d * 0.58, h), cloth)
+        cushion(kit, group, (each, depth * 0.75, 0.18), (x, -depth * 0.58, height), cloth)
         if kit.chance(0.6):
             pillow = kit.any_surface()
             s = kit.size(0.35, 0.5)
@@ -114,7 +128,7 @@ def sofa(kit: Kit) -> Group:
                 kit,
                 group,
                 (s, 0.16, s),
-                (x + kit.size(-0.1, 0.1), -0.36, h + s * 0.55),
+                (x + kit.size(-0.1, 0.1), -0.36, height + s * 0.55),
                 pillow,
                 pitch=-0.35,
                 yaw=kit.size(-0.3, 0.3),
@@ -126,21 +140,29 @@ def bed(kit: Kit) -> Group:
     """Returns a bed with blanket and pillows."""
     group = Group()
     wood = kit.wood()
-    w = kit.size(0.9, 1.9)
-    d = kit.size(1.9, 2.1)
-    group.add(box(w, d, 0.3), wood, (0, -d / 2, 0))
-    group.add(box(w, 0.06, kit.size(0.6, 1.1)), wood, (0, -0.03, 0))
+    width = kit.size(0.9, 1.9)
+    depth = kit.size(1.9, 2.1)
+    group.add(box(width, depth, 0.3), wood, (0, -depth / 2, 0))
+    group.add(box(width, 0.06, kit.size(0.6, 1.1)), wood, (0, -0.03, 0))
     cushion(
-        kit, group, (w, d, 0.3), (0, -d / 2, 0.38), kit.palette.new("fabric", (0.85, 0.85, 0.85))
+        kit,
+        group,
+        (width, depth, 0.3),
+        (0, -depth / 2, 0.38),
+        kit.palette.new("fabric", (0.85, 0.85, 0.85)),
     )
-    x, y = np.meshgrid(np.linspace(-w * 0.55, w * 0.55, 30), np.linspace(-d * 1.01, -d * 0.35, 24))
+    x, y = np.meshgrid(
+        np.linspace(-width * 0.55, width * 0.55, 30), np.linspace(-depth * 1.01, -depth * 0.35, 24)
+    )
     z = (
         0.55
         + 0.025 * np.sin(x * kit.size(4, 12) + 3 * np.sin(y * 4))
         + 0.015 * np.sin(y * 13 + x * 5)
     )
-    z -= np.clip(np.abs(x) - w * 0.48, 0, None) * 4
+    z -= np.clip(np.abs(x) - width * 0.48, 0, None) * 4
     group.add(surface(np.stack([x, y, z], axis=2)), kit.any_surface())
-    for side in (-0.25, 0.25) if w > 1.3 else (0.0,):
-        cushion(kit, group, (0.6, 0.4, 0.18), (side * w, -0.35, 0.58), kit.any_surface(), pitch=0.2)
+    for side in (-0.25, 0.25) if width > 1.3 else (0.0,):
+        cushion(
+            kit, group, (0.6, 0.4, 0.18), (side * width, -0.35, 0.58), kit.any_surface(), pitch=0.2
+        )
     return group

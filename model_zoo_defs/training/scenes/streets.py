@@ -156,6 +156,7 @@ def _grove(kit: Kit, group: Group, side: float, x: float) -> None:
 
 
 def _background(kit: Kit, group: Group) -> None:
+    """Adds far trees beside and beyond the street, and often hills."""
     far_trees = [tree(kit, far=True) for _ in range(3)]
     for _ in range(int(kit.rng.integers(5, 40))):
         x = kit.size(-60, 60)
@@ -190,11 +191,11 @@ def street(kit: Kit) -> Plan:
     if kit.chance(0.4):
         for _ in range(int(kit.rng.integers(1, 5))):
             y = kit.size(5, 60)
-            h = kit.size(5, 8)
+            height = kit.size(5, 8)
             group.add(
                 rod(
-                    (-half - 4, y, h),
-                    (half + 4, y + kit.size(-4, 4), h + kit.size(-1, 1)),
+                    (-half - 4, y, height),
+                    (half + 4, y + kit.size(-4, 4), height + kit.size(-1, 1)),
                     0.015,
                     sides=5,
                 ),
@@ -217,6 +218,7 @@ def street(kit: Kit) -> Plan:
 
 
 def _daylight(kit: Kit) -> tuple[tuple[Light, ...], Sky]:
+    """Returns the sun and the sky of a clear or an overcast day."""
     overcast = kit.chance(0.35)
     angle = kit.size(0, 6.3)
     power = kit.size(0.1, 0.4) if overcast else kit.size(1.2, 3.0)

@@ -24,10 +24,10 @@ def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Me
     """Returns a closed hull through stations of (y, half width, low z, high z)."""
     # A rounded rectangle: power 1 is an ellipse, 0 a rectangle.
     angle = np.linspace(0, 2 * np.pi, 25)
-    c = np.cos(angle)
-    s = np.sin(angle)
-    x = np.sign(c) * np.abs(c) ** power
-    z = np.sign(s) * np.abs(s) ** power
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    x = np.sign(cosine) * np.abs(cosine) ** power
+    z = np.sign(sine) * np.abs(sine) ** power
     # The ends are closed by stations of nearly no size.
     rows = [
         (
@@ -90,34 +90,38 @@ def car(kit: Kit) -> Group:
         "plain", None if vivid else base, gloss=0.7, mirror=kit.size(0.04, 0.12), vivid=1.0
     )
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.size(0.1, 0.25))
-    # Measures: f and b are the front and the back end.
+    # Measures: half its width, and heights of its lines above the road.
     long = kit.size(3.7, 4.8)
     half = kit.size(0.82, 0.93)
     low = kit.size(0.18, 0.24)
     belt = kit.size(0.82, 0.98)
     roof = kit.size(1.4, 1.72)
     hood = belt - kit.size(0.02, 0.14)
-    f = long / 2
-    b = -long / 2
+    front = long / 2
+    rear = -long / 2
     estate = kit.chance(0.55)
     # Body, cabin and roof.
     body = [
-        (b, half * 0.86, low + 0.12, belt * 0.85), (b + 0.12, half * 0.95, low + 0.03, belt * 0.97),
-        (b + 0.8, half, low, belt), (0.2, half, low, belt), (f - 1.2, half * 0.99, low, hood),
-        (f - 0.5, half * 0.96, low + 0.02, hood * 0.92),
-        (f - 0.1, half * 0.9, low + 0.06, hood * 0.8),
-        (f, half * 0.8, low + 0.12, hood * 0.62),
-    ]  # fmt: skip
+        (rear, half * 0.86, low + 0.12, belt * 0.85),
+        (rear + 0.12, half * 0.95, low + 0.03, belt * 0.97),
+        (rear + 0.8, half, low, belt),
+        (0.2, half, low, belt),
+        (front - 1.2, half * 0.99, low, hood),
+        (front - 0.5, half * 0.96, low + 0.02, hood * 0.92),
+        (front - 0.1, half * 0.9, low + 0.06, hood * 0.8),
+        (front, half * 0.8, low + 0.12, hood * 0.62),
+    ]
     group.add(_loft(body, 0.35), paint)
-    tail = b + (0.1 if estate else kit.size(0.45, 0.85))
+    tail = rear + (0.1 if estate else kit.size(0.45, 0.85))
     cabin = [
         (tail, half * 0.82, belt - 0.1, belt + 0.02),
         (tail + (0.3 if estate else 0.7), half * 0.76, belt - 0.1, roof - 0.04),
-        (0.1, half * 0.77, belt - 0.1, roof), (f - 1.95, half * 0.76, belt - 0.1, roof - 0.05),
-        (f - 1.1, half * 0.83, belt - 0.1, hood + 0.03),
-    ]  # fmt: skip
+        (0.1, half * 0.77, belt - 0.1, roof),
+        (front - 1.95, half * 0.76, belt - 0.1, roof - 0.05),
+        (front - 1.1, half * 0.83, belt - 0.1, hood + 0.03),
+    ]
     group.add(_loft(cabin, 0.4), glass)
-    top = [(y, w * 0.93, z - 0.05, z + 0.012) for y, w, _, z in cabin[1:4]]
+    top = [(y, half_width * 0.93, z - 0.05, z + 0.012) for y, half_width, _, z in cabin[1:4]]
     group.add(_loft(top, 0.5), paint)
     # On both sides: pillars, mirror, lights and trim.
     for side in (-1, 1):
@@ -139,75 +143,79 @@ def car(kit: Kit) -> Group:
         group.add(
             superquadric((0.16, 0.1, 0.12), vertical=0.5),
             paint,
-            (side * (half + 0.07), f - 1.5, belt + 0.05),
+            (side * (half + 0.07), front - 1.5, belt + 0.05),
         )
         light = kit.palette.new("plain", (0.9, 0.9, 0.85), gloss=0.8, mirror=0.2)
         group.add(
             superquadric((0.36, 0.16, 0.15), vertical=0.6),
             light,
-            (side * half * 0.66, f - 0.1, hood * 0.72),
+            (side * half * 0.66, front - 0.1, hood * 0.72),
         )
         red = kit.palette.new("plain", (0.6, 0.04, 0.04), gloss=0.8, glow=kit.size(0, 1))
         group.add(
             superquadric((0.2, 0.1, 0.3), vertical=0.5),
             red,
-            (side * half * 0.78, b + 0.06, belt * 0.85),
+            (side * half * 0.78, rear + 0.06, belt * 0.85),
         )
         group.add(box(0.005, long * 0.5, 0.02), kit.dark(), (side * half, -0.1, belt * 0.6))
     # Plates and bumper.
     plate = kit.palette.new("poster", (0.9, 0.9, 0.8), tile_m=0.5)
-    group.add(box(0.5, 0.02, 0.11), plate, (0, f + 0.005, low + 0.22))
-    group.add(box(0.5, 0.02, 0.11), plate, (0, b - 0.005, belt * 0.6))
-    group.add(box(half * 1.5, 0.06, 0.14), kit.dark(), (0, f - 0.03, low + 0.05))
+    group.add(box(0.5, 0.02, 0.11), plate, (0, front + 0.005, low + 0.22))
+    group.add(box(0.5, 0.02, 0.11), plate, (0, rear - 0.005, belt * 0.6))
+    group.add(box(half * 1.5, 0.06, 0.14), kit.dark(), (0, front - 0.03, low + 0.05))
     # Wheels.
     radius = kit.size(0.29, 0.36)
     # A dark box under the car and dark discs behind the wheels stand for the wheel arches.
     group.add(box(half * 1.8, long * 0.86, 0.3), kit.dark(), (0, 0, low - 0.02))
     arch = kit.dark()
-    for y in (f - 0.82, b + 0.78):
+    for y in (front - 0.82, rear + 0.78):
         group.add(
             cylinder(radius * 1.16, 2 * half + 0.012, sides=22),
             arch,
             (-half - 0.006, y, radius + 0.02),
             roll=np.pi / 2,
         )
-    _wheels(kit, group, half - 0.08, (f - 0.82, b + 0.78), radius)
+    _wheels(kit, group, half - 0.08, (front - 0.82, rear + 0.78), radius)
     return group
 
 
 def lorry(kit: Kit) -> Group:
     """Returns a van, bus or lorry."""
     group = Group()
-    # Materials and measures: f and b are the front and the back end.
+    # Materials, length and the heights of its parts.
     paint = kit.palette.new("plain", gloss=0.5, mirror=0.05, vivid=0.5)
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=0.2)
     long = kit.size(4.8, 11)
     half = kit.size(0.95, 1.25)
     tall = kit.size(1.9, 3.4)
-    f = long / 2
-    b = -long / 2
+    front = long / 2
+    rear = -long / 2
     # A closed body, or a cab before a load.
-    body = [(b, half, 0.4, tall), (f - 0.7, half, 0.4, tall), (f, half * 0.96, 0.4, tall * 0.55)]
+    body = [
+        (rear, half, 0.4, tall),
+        (front - 0.7, half, 0.4, tall),
+        (front, half * 0.96, 0.4, tall * 0.55),
+    ]
     if kit.chance(0.4):
         load = kit.surface("plain", "poster", "stripes", tile_m=2.5, vivid=0.4)
-        group.add(box(2 * half, long * 0.72, tall - 0.6), load, (0, b + long * 0.36, 0.7))
+        group.add(box(2 * half, long * 0.72, tall - 0.6), load, (0, rear + long * 0.36, 0.7))
         body = [
-            (f - 1.7, half * 0.95, 0.4, tall * 0.85),
-            (f - 0.3, half * 0.95, 0.4, tall * 0.85),
-            (f, half * 0.9, 0.4, tall * 0.6),
+            (front - 1.7, half * 0.95, 0.4, tall * 0.85),
+            (front - 0.3, half * 0.95, 0.4, tall * 0.85),
+            (front, half * 0.9, 0.4, tall * 0.6),
         ]
         group.add(box(half, long * 0.9, 0.3), kit.dark(), (0, 0, 0.5))
     group.add(_loft(body, 0.25), paint)
     # Windows at the sides, before and behind.
     for side in (-1, 1):
-        y = f - 1.6
+        y = front - 1.6
         while y > body[0][0] + 0.6:
             group.add(box(0.02, 0.9, 0.55), glass, (side * half * 0.995, y, tall * 0.55))
             y -= 1.1
-    group.add(box(half * 1.7, 0.05, tall * 0.3), glass, (0, f - 0.25, tall * 0.55), pitch=0.45)
-    group.add(box(half * 1.5, 0.02, tall * 0.25), glass, (0, b - 0.005, tall * 0.55))
+    group.add(box(half * 1.7, 0.05, tall * 0.3), glass, (0, front - 0.25, tall * 0.55), pitch=0.45)
+    group.add(box(half * 1.5, 0.02, tall * 0.25), glass, (0, rear - 0.005, tall * 0.55))
     # Wheels.
-    _wheels(kit, group, half - 0.1, (f - 0.9, b + 0.9), 0.42)
+    _wheels(kit, group, half - 0.1, (front - 0.9, rear + 0.9), 0.42)
     return group
 
 

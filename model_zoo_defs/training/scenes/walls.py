@@ -42,20 +42,22 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     # Reveals around the hole.
     deep = kit.size(0.08, 0.3)
     x = (u0 + u1) / 2
-    w = u1 - u0
-    h = v1 - v0
+    width = u1 - u0
+    height = v1 - v0
     for at, size in (
-        ((u0, deep / 2, v0), (0.004, deep, h)), ((u1, deep / 2, v0), (0.004, deep, h)),
-        ((x, deep / 2, v0), (w, deep, 0.004)), ((x, deep / 2, v1), (w, deep, 0.004)),
+        ((u0, deep / 2, v0), (0.004, deep, height)), ((u1, deep / 2, v0), (0.004, deep, height)),
+        ((x, deep / 2, v0), (width, deep, 0.004)), ((x, deep / 2, v1), (width, deep, 0.004)),
     ):  # fmt: skip
         side.add(box(*size), paint, at)
     # The frame.
     trim = kit.wood() if kit.chance(0.4) else kit.palette.new("plain", (0.9, 0.9, 0.88), gloss=0.3)
-    t = kit.size(0.04, 0.09)
+    thickness = kit.size(0.04, 0.09)
     for at, size in (
-        ((u0 + t / 2, deep, v0), (t, 0.05, h)), ((u1 - t / 2, deep, v0), (t, 0.05, h)),
-        ((x, deep, v1 - t), (w, 0.05, t)), ((x, deep, v0), (w, 0.05, t)),
-    ):  # fmt: skip
+        ((u0 + thickness / 2, deep, v0), (thickness, 0.05, height)),
+        ((u1 - thickness / 2, deep, v0), (thickness, 0.05, height)),
+        ((x, deep, v1 - thickness), (width, 0.05, thickness)),
+        ((x, deep, v0), (width, 0.05, thickness)),
+    ):
         side.add(box(*size), trim, at)
     # A door: what is behind it, and a leaf, open or closed.
     if v0 < 0.05:
@@ -64,25 +66,35 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
             door = kit.wood() if kit.chance(0.5) else kit.surface("plain", vivid=0.2)
             angle = kit.size(-1.7, -0.2) if kit.chance(0.4) else 0.0
             leaf = Group()
-            leaf.add(box(w - 2 * t, 0.04, h - t), door, (w / 2 - t, 0, 0))
-            for z in (0.15, h * 0.55):
-                leaf.add(box((w - 2 * t) * 0.7, 0.055, h * 0.35), door, (w / 2 - t, 0, z))
-            leaf.add(rod((w * 0.8, -0.06, 1.02), (w * 0.92, -0.06, 1.02), 0.01), kit.metal())
-            side.insert(leaf, (u0 + t, deep * 0.6, 0), yaw=angle)
+            leaf.add(
+                box(width - 2 * thickness, 0.04, height - thickness),
+                door,
+                (width / 2 - thickness, 0, 0),
+            )
+            for z in (0.15, height * 0.55):
+                leaf.add(
+                    box((width - 2 * thickness) * 0.7, 0.055, height * 0.35),
+                    door,
+                    (width / 2 - thickness, 0, z),
+                )
+            leaf.add(
+                rod((width * 0.8, -0.06, 1.02), (width * 0.92, -0.06, 1.02), 0.01), kit.metal()
+            )
+            side.insert(leaf, (u0 + thickness, deep * 0.6, 0), yaw=angle)
         return
     # A window: bars and sill.
     for along in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
-        side.add(box(0.05, 0.05, h), trim, (u0 + w * float(along), deep, v0))
+        side.add(box(0.05, 0.05, height), trim, (u0 + width * float(along), deep, v0))
     if kit.chance(0.4):
-        side.add(box(w, 0.04, 0.04), trim, (x, deep, v0 + h * kit.size(0.4, 0.7)))
-    side.add(box(w + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
+        side.add(box(width, 0.04, 0.04), trim, (x, deep, v0 + height * kit.size(0.4, 0.7)))
+    side.add(box(width + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
     # Curtains, or a blind.
     if kit.chance(0.5):
         _curtain(kit, side, u0, u1, v1)
     elif kit.chance(0.4):
         slat = kit.surface("plain", vivid=0.15)
-        for z in np.arange(v0 + h * kit.size(0, 0.6), v1, 0.06):
-            side.add(box(w - 0.02, 0.04, 0.002), slat, (x, deep * 0.5, float(z)), pitch=0.6)
+        for z in np.arange(v0 + height * kit.size(0, 0.6), v1, 0.06):
+            side.add(box(width - 0.02, 0.04, 0.002), slat, (x, deep * 0.5, float(z)), pitch=0.6)
     # Things on the sill.
     scatter_z = v0
     if kit.chance(0.4):
@@ -117,6 +129,7 @@ def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
 
 
 def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
+    """Adds a rod and two folded curtains beside a window from u0 to u1, up to `top`."""
     cloth = kit.surface("fabric", "plain", "stripes", tile_m=0.8, vivid=0.3)
     bottom = 0.03 if kit.chance(0.6) else top * 0.3
     side.add(rod((u0 - 0.3, -0.08, top + 0.1), (u1 + 0.3, -0.08, top + 0.1), 0.015), kit.metal())
@@ -136,23 +149,23 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
             continue
         choice = kit.rng.random()
         z = kit.size(1.1, max(1.2, height - 0.7))
-        w = kit.size(0.2, 1.0)
+        width = kit.size(0.2, 1.0)
         h = kit.size(0.2, 0.8)
         # A picture, some with a frame.
         if choice < 0.6:
             thick = kit.size(0.002, 0.04)
             if thick > 0.01:
                 edge = kit.wood() if kit.chance(0.5) else kit.dark()
-                side.add(box(w + 0.06, thick, h + 0.06), edge, (u, -thick / 2, z - 0.03))
+                side.add(box(width + 0.06, thick, h + 0.06), edge, (u, -thick / 2, z - 0.03))
             poster = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
-            side.add(box(w, 0.004, h, fit=h), poster, (u, -thick - 0.002, z))
+            side.add(box(width, 0.004, h, fit=h), poster, (u, -thick - 0.002, z))
         elif choice < 0.75:
             # A shelf with things.
-            side.add(box(w + 0.3, 0.2, 0.025), kit.wood(), (u, -0.1, z))
+            side.add(box(width + 0.3, 0.2, 0.025), kit.wood(), (u, -0.1, z))
             clutter.scatter(
                 kit,
                 side,
-                area=clutter.Rectangle((u - w / 2, -0.15), (u + w / 2, -0.06), z + 0.025),
+                area=clutter.Rectangle((u - width / 2, -0.15), (u + width / 2, -0.06), z + 0.025),
                 count=4,
                 tallest=0.3,
             )
@@ -172,11 +185,11 @@ def openings(kit: Kit, length: float, height: float) -> list[Hole]:
     u = kit.size(0.2, 0.8)
     while u < length - 1.0:
         chance = kit.rng.random()
-        w = kit.size(0.7, min(2.0, length - u - 0.2))
+        width = kit.size(0.7, min(2.0, length - u - 0.2))
         if chance < 0.22:
-            holes.append((u, kit.size(0.5, 1.0), u + w, min(height - 0.15, kit.size(1.7, 2.4))))
+            holes.append((u, kit.size(0.5, 1.0), u + width, min(height - 0.15, kit.size(1.7, 2.4))))
         elif chance < 0.4:
-            w = min(w, kit.size(0.75, 1.0))
-            holes.append((u, 0.0, u + w, min(height - 0.1, kit.size(1.95, 2.15))))
-        u += w + kit.size(0.3, 1.5)
+            width = min(width, kit.size(0.75, 1.0))
+            holes.append((u, 0.0, u + width, min(height - 0.1, kit.size(1.95, 2.15))))
+        u += width + kit.size(0.3, 1.5)
     return holes

@@ -16,11 +16,14 @@ from model_zoo_defs.training.rendering.shapes import FloatArray, Group, IntArray
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """A light at a position, or a sun in a direction; `radius` blurs its shadows."""
+    """A light at a position, or a sun in a direction."""
 
     position: tuple[float, float, float]
+    """Metres; of a sun, the direction towards it."""
     colour: tuple[float, float, float]
+    """Linear red, green and blue, of any brightness."""
     radius: float
+    """Twice the standard deviation of the points that it shines from, which blurs its shadows."""
     sun: bool = False
 
 
@@ -29,12 +32,19 @@ class Sky:
     """Colour of rays that leave the scene, and ambient light."""
 
     zenith: tuple[float, float, float]
+    """Linear colour straight up."""
     horizon: tuple[float, float, float]
+    """Linear colour at the horizon, and of haze."""
     clouds: float
+    """How white clouds are, 0..1."""
     ambient_up: tuple[float, float, float]
+    """Ambient light on surfaces that face up."""
     ambient_down: tuple[float, float, float]
+    """Ambient light on surfaces that face down."""
     haze_m: float
+    """Distance in which haze hides all but 1/e; 0 for none."""
     occlusion_m: float
+    """Distance up to which surfaces keep ambient light away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,16 +115,24 @@ def looking(
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
-    """First hits of n rays; `t` is in lengths of the ray's direction."""
+    """First hits of n rays; of a ray that meets nothing, all but `met` is without meaning."""
 
     met: npt.NDArray[np.bool_]
+    """(n,), whether the ray meets a surface."""
     t: FloatArray
+    """(n,) in lengths of the ray's direction."""
     face: IntArray
+    """Numbers of the triangles (n,)."""
     points: FloatArray
+    """(n, 3)."""
     flat: FloatArray
+    """Unit normals of the triangles (n, 3), towards the ray's origin."""
     normals: FloatArray
+    """Unit normals (n, 3), smooth over the vertices."""
     uv: FloatArray
+    """Texture coordinates (n, 2), metres."""
     material: IntArray
+    """Numbers of the materials (n,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,12 +160,14 @@ class World:
 
     @cached_property
     def _embree(self) -> EmbreeScene:
+        """The triangles as Embree takes them, for casting rays."""
         scene = EmbreeScene()
         TriangleMesh(scene, self.mesh.vertices, self.mesh.faces)
         return scene
 
     @cached_property
     def _attributes(self) -> FloatArray:
+        """Normal and texture coordinate of each vertex, (vertices, 5)."""
         return np.concatenate([self.mesh.normals, self.mesh.uv], axis=1)
 
     def depths(self, origins: FloatArray, directions: FloatArray) -> FloatArray:
@@ -162,7 +182,9 @@ class World:
         face = np.where(met, hit["primID"], 0).astype(np.int32)
         t = np.where(met, hit["tfar"], 0).astype(np.float32)
         corner = self.mesh.faces[face]
-        u, v = hit["u"][:, None], hit["v"][:, None]
+        # Normal and texture coordinate between those of the triangle's corners.
+        u = hit["u"][:, None]
+        v = hit["v"][:, None]
         mixed = self._attributes[corner[:, 0]] * (1 - u - v)
         mixed += self._attributes[corner[:, 1]] * u
         mixed += self._attributes[corner[:, 2]] * v
@@ -190,10 +212,12 @@ class World:
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
+    """Returns vectors (n, 3) of length 1 in the same directions."""
     length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
     return np.asarray(vectors / (length[:, None] + 1e-12), np.float32)
 
 
 def _facing(normals: FloatArray, directions: FloatArray) -> FloatArray:
+    """Returns normals (n, 3), turned where they look along the rays, so that all face these."""
     away = np.einsum("ij,ij->i", normals, directions) > 0
     return np.where(away[:, None], -normals, normals)

@@ -276,7 +276,7 @@ def _flattened(
 
     Args:
         content: The dict.
-        prefix: What its names begin with.
+        prefix: Beginning of its names, such as "layer.".
         depth: Number of dicts that it lies in, itself included.
 
     Raises:
