@@ -149,7 +149,12 @@ def _choose_axis(runs: Sequence[ComparedRun]) -> _Axis:
 
 
 def _lines(runs: Sequence[ComparedRun], axis: _Axis) -> dict[str, Line]:
-    """The lines of a plot by their label: one for each combination of the other options."""
+    """The lines of a plot by their label: one for each combination of values of other options.
+
+    Args:
+        runs: The runs of a study.
+        axis: The option along the axis, which all runs have.
+    """
 
     def position(run: ComparedRun) -> float:
         """Where the run lies on the axis."""

@@ -271,6 +271,7 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
         camera: The camera in pixels of the image.
         size: (H, W) of the image.
     """
+    # As many nodes a pixel along both sides, both ends among them.
     rows, columns = (
         np.linspace(0, side - 1, 2 + _RAY_NODES * (side - 1) // max(size)) for side in size
     )
