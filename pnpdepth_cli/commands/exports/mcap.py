@@ -199,7 +199,12 @@ def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
 
 
 def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
-    """The fields of an Image of pixels (H, W) or (H, W, C), little-endian, rows without padding."""
+    """The fields of an Image, little-endian, rows without padding.
+
+    Args:
+        pixels: (H, W) or (H, W, C), of the type that the encoding has.
+        encoding: ROS' name of the type of a pixel, such as `rgb8`.
+    """
     # (H, bytes of a row)
     rows = np.ascontiguousarray(pixels.reshape(len(pixels), -1))
     data = rows.astype(rows.dtype.newbyteorder("<"), copy=False).view(np.uint8)

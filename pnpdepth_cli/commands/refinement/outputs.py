@@ -287,5 +287,10 @@ def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.ui
 
 
 def _base64(values: NDArray[np.number], kind: str) -> str:
-    """The values in base64, row by row, as numbers of a kind such as `<f4`, NumPy's name of it."""
+    """The numbers in base64, row by row.
+
+    Args:
+        values: Numbers, of any shape.
+        kind: NumPy's name of the type that they are stored as, such as `<f4`.
+    """
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
