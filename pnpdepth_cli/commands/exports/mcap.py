@@ -92,7 +92,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _times(frames: Sequence[ExportFrame]) -> tuple[list[int], list[str]]:
-    """Nanoseconds of each frame, from 1970, by its name; and notes.
+    """Nanoseconds of each frame, as its name says; and notes.
 
     Where a name holds no time, all frames have made-up times at equal distances, and a note says
     so.
@@ -111,7 +111,7 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
 
     Args:
         frame: The frame.
-        time_ns: Stamp of all its messages, nanoseconds from 1970.
+        time_ns: Stamp of all its messages, nanoseconds.
         notes: Lines for a person; gets one on what is left out.
 
     Raises:
