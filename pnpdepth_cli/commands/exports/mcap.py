@@ -168,7 +168,11 @@ def _transform(pose: NDArray[np.float64]) -> _Fields:
 
 
 def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
-    """The fields of a CameraInfo of images (H, W) that are not rectified.
+    """The fields of a CameraInfo of images that are not rectified.
+
+    Args:
+        camera: The camera in pixels of the images.
+        size: (H, W) of the images.
 
     Raises:
         InputError: ROS has no model of the lens with so many coefficients.
