@@ -185,7 +185,7 @@ def _clouds(
 
     @functools.lru_cache(maxsize=_IN_MEMORY)
     def view(index: int) -> point_cloud.View:
-        """The same frame's points (H, W, 3) in its camera's coordinates, its camera and pose."""
+        """The frame of this index as (H, W, 3) points in its camera's coordinates, camera, pose."""
         depth, camera = depth_and_camera(index)
         return point_cloud.points_of_depth(depth, camera).astype(np.float32), camera, poses[index]
 

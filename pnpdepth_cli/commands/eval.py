@@ -257,7 +257,12 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
 
 
 def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Yields lines on pixels without prediction or given to the network, and on scales."""
+    """Yields lines on pixels without prediction or given to the network, and on scales.
+
+    Args:
+        scored: Records of the frames with scores.
+        request: The rules.
+    """
     with_truth = sum(_numbers(scored, "known"))
     empty = with_truth - sum(_numbers(scored, "predicted"))
     if empty:
@@ -290,7 +295,12 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
 
 
 def _notes_on_order(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Yields a warning if predictions look like depth and are disparity, or have another unit."""
+    """Yields a warning if predictions seem to be disparity where depth is read, or in another unit.
+
+    Args:
+        scored: Records of the frames with scores.
+        request: The rules, which say whether disparity is fitted.
+    """
     agreement = _agreement_of(scored)
     in_disparity = request.scale_by == "affine-disparity"
     if agreement.is_reversed and not in_disparity:

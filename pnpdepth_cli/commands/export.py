@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -54,11 +54,7 @@ def export_results(
         replace(_frame(result, export, output), unknown=unknown)
         for result in result_frames(results)
     ]
-    units = sorted(
-        {f"{frame.result.record.unit} (unit-scale {frame.unit_scale:g})" for frame in frames}
-    )
-    if len(units) > 1:
-        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
+    _check_units(frames)
     # Files of different names, none of which is there. Images in the folder stay where they are.
     copied = list[ExportFrame]()
     if export.copies_images:
@@ -86,6 +82,15 @@ def export_results(
     if export.in_model_units and frames[0].unit_scale != 1:
         unit = MODEL_UNITS
     return f"{count_of(len(frames), 'frame')} in {unit}", notes
+
+
+def _check_units(frames: Sequence[ExportFrame]) -> None:
+    """Raises InputError unless the depths of all frames are in one unit."""
+    units = sorted(
+        {f"{frame.result.record.unit} (unit-scale {frame.unit_scale:g})" for frame in frames}
+    )
+    if len(units) > 1:
+        raise InputError(f"the depths are in different units: {', '.join(units)}; refine all alike")
 
 
 def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
@@ -130,21 +135,30 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
             f"{result.depth} is not of the size of {image}; refine the whole image (--protocol"
             " whole)"
         )
-    # An image inside the output folder is used where it is.
-    path = output / "images" / name
-    folder = Path(os.path.realpath(output))
-    if isinstance(image, Path) and Path(os.path.realpath(image)).is_relative_to(folder):
-        path = image
     return ExportFrame(
         result=result,
         image=image,
-        image_path=path,
+        image_path=_image_path(image, output, name),
         image_name=name,
         size=size,
         camera=camera,
         pose=pose,
         unit_scale=scale,
     )
+
+
+def _image_path(image: ImageSource, output: Path, name: str) -> Path:
+    """Where a program reads the image: where it is, if that is in the output folder, else a copy.
+
+    Args:
+        image: The image: a file, or a frame of a video.
+        output: The output folder.
+        name: Name of the image below the folder of images.
+    """
+    folder = Path(os.path.realpath(output))
+    if isinstance(image, Path) and Path(os.path.realpath(image)).is_relative_to(folder):
+        return image
+    return output / "images" / name
 
 
 def _image_name(result: ResultFrame, image: ImageSource) -> str:

@@ -29,7 +29,7 @@ def project_scan(
         image: The image, which is drawn on.
         output: File of the sparse depth.
         options: The calibration of the two.
-        depth_scale: Numbers of the scan per metre. None: as the file says.
+        depth_scale: Numbers of the scan per metre. None: nothing is stated.
         overwrite: Whether existing files are replaced.
 
     Raises:

@@ -202,9 +202,10 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         message: A depth image or a cloud.
 
     Returns:
-        Depth (H, W) in metres of the images' camera, 0 where unknown, if `is_map`; else points
-        (N, 3) in metres in the coordinates of the scanner or the depth camera. Beside it the
-        numbers of points that were dropped, by the reason; none of depth.
+        Depth (H, W) in metres of the images' camera, 0 where unknown, if `is_map`. Else points
+        (N, 3) in the coordinates of the scanner or the depth camera: in metres, or as stored in a
+        cloud whose scale nobody states. Beside either the numbers of points that were dropped, by
+        the reason; none of depth.
 
     Raises:
         NoPointsError: Nothing was measured.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _CHANGING = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
 """Metadata that a plot lacks, by its suffix, so that the same runs give the same bytes."""
 _SIDE_INCHES = 3.2
-"""Side of a panel of a plot; two of them fit the width of a page."""
+"""Side of a panel of a plot."""
 _SEED = "seed"
 """An option whose values are random draws of one setting, so that runs are averaged over it."""
 
@@ -108,7 +108,7 @@ def _plot_measure(
         below.plot([*line], improvement, f"{colour}o-")
     above.set_ylabel(measure.heading)
     below.set(ylabel=f"improvement of {measure.title} [%]", xlabel=axis.option)
-    # Numbers above 0 are spread by their ratio, as studies double them; the ticks are the values.
+    # Numbers above 0 lie on a logarithmic axis; its ticks are the values themselves.
     below.set_xscale("log" if min(axis.positions.values()) > 0 else "linear")
     below.set_xticks([*axis.positions.values()], [*axis.positions])
     below.set_xticks([], minor=True)
@@ -149,7 +149,12 @@ def _choose_axis(runs: Sequence[ComparedRun]) -> _Axis:
 
 
 def _lines(runs: Sequence[ComparedRun], axis: _Axis) -> dict[str, Line]:
-    """The lines of a plot by their label: one for each combination of the other options."""
+    """The lines of a plot by their label: one for each combination of values of other options.
+
+    Args:
+        runs: The runs of a study.
+        axis: The option along the axis, which all runs have.
+    """
 
     def position(run: ComparedRun) -> float:
         """Where the run lies on the axis."""

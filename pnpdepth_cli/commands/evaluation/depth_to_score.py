@@ -94,7 +94,9 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
 def _depth_of_distances(
     distances: Depth, files: FrameFiles, result: ResultFrame, whole: tuple[int, int]
 ) -> Depth:
-    """Depth z of distances from the camera: that of the data set, else of the prediction's record.
+    """The depth z (H, W) of points at these distances from the camera, 0 where unknown.
+
+    The camera is that of the data set, else of the prediction's record.
 
     Args:
         distances: (H, W) metres in the part of the frame that is used, 0 where unknown.

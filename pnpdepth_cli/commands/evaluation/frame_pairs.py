@@ -74,7 +74,9 @@ def pair_frames(
 def _frames_with_truth(
     folder: Path, layout: str, frames: Sequence[FrameFiles], part: FramePart | None
 ) -> tuple[list[FrameFiles], str]:
-    """The frames of a data set that have ground truth, in the part that is scored, and a line.
+    """The frames of a data set that have ground truth, and a line on them for a person.
+
+    Each is cut to the part that is scored.
 
     Args:
         folder: The data set.

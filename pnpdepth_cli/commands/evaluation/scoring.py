@@ -117,13 +117,13 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     gt = read_truth(files, result, request)
     notes = [*gt.notes]
     try:
-        given = pixels_with_points(files, result, gt.values)
+        has_point = pixels_with_points(files, result, gt.values)
     # Where these pixels are scored, too, they are only counted, and no count is no error.
     except PnpDepthError:
         if rules.exclude_sparse:
             raise
-        given = None
-    truth = np.where(_where_scored(gt.values, given, rules), gt.values, np.float32(0))
+        has_point = None
+    truth = np.where(_where_scored(gt.values, has_point, rules), gt.values, np.float32(0))
     if not truth.any():
         raise InputError(
             f"{files.gt} has no known depth where protocol {request.protocol} scores; choose"
@@ -145,7 +145,7 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     if result.sigma is not None and fit is None:
         sigma = result.read_beside(result.sigma, depth)
         scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
-    scores |= _counts_and_agreement(prediction.values, depth, truth, given)
+    scores |= _counts_and_agreement(prediction.values, depth, truth, has_point)
     scores["factor"] = None
     scores["shift"] = None
     if fit is not None:
@@ -156,7 +156,7 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
 
 
 def _counts_and_agreement(
-    prediction: Depth, depth: Depth, truth: Depth, given: Mask | None
+    prediction: Depth, depth: Depth, truth: Depth, has_point: Mask | None
 ) -> Scores:
     """The numbers of pixels, and how prediction and truth agree; see `score_frame`.
 
@@ -164,7 +164,7 @@ def _counts_and_agreement(
         prediction: (H, W) as it was read, 0 where unknown.
         depth: (H, W) the prediction as the protocol changes it.
         truth: (H, W) the ground truth that is scored, 0 elsewhere.
-        given: (H, W) where the sparse depth was. None: that is not known.
+        has_point: (H, W) where the sparse depth was. None: that is not known.
     """
     both = (truth > 0) & (depth > 0)
     known = int((truth > 0).sum())
@@ -175,7 +175,7 @@ def _counts_and_agreement(
         "known": known,
         "predicted": predicted,
         "coverage": predicted / known,
-        "given": None if given is None else int((given & both).sum()),
+        "given": None if has_point is None else int((has_point & both).sum()),
         "median_ratio": agreement.ratio if both.any() else None,
         "ratio_spread": agreement.spread if both.any() else None,
         "rank_correlation": compare_depths(prediction, truth).rank,
@@ -196,20 +196,20 @@ def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
     return {**of_pixels, **of_images}
 
 
-def _where_scored(gt: Depth, given: Mask | None, rules: Protocol) -> Mask:
+def _where_scored(gt: Depth, has_point: Mask | None, rules: Protocol) -> Mask:
     """(H, W) true where the protocol scores: inside its crop and bounds, without input points.
 
     Args:
         gt: (H, W) ground truth in metres.
-        given: (H, W) where the sparse depth was. None: that is not known, nor needed.
+        has_point: (H, W) where the sparse depth was. None: that is not known, nor needed.
         rules: The protocol.
     """
     highest = np.inf if rules.max_depth is None else rules.max_depth
     inside = np.zeros(gt.shape, bool)
     inside[crop_window(rules.crop, gt.shape)] = True
     scored = inside & (gt > rules.min_depth) & (gt < highest)
-    if rules.exclude_sparse and given is not None:
-        scored &= ~given
+    if rules.exclude_sparse and has_point is not None:
+        scored &= ~has_point
     return scored
 
 

@@ -55,7 +55,12 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _write_map(path: Path, values: NDArray[np.floating]) -> None:
-    """Writes an (H, W, C) map."""
+    """Writes a map (H, W, C) as COLMAP's dense workspace has it.
+
+    Args:
+        path: The file.
+        values: (H, W, C) depth in units of the model, or normals.
+    """
     height, width, channels = values.shape
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{width}&{height}&{channels}&".encode())

@@ -52,7 +52,7 @@ def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     """The inverse depth of all frames, its scale, and the model unless there is one already."""
     names = [_PARAMETERS]
     if _needs_model(folder, frames):
-        names += [f"{part}.txt" for part in MODEL_PARTS]
+        names += [f"{file}.txt" for file in MODEL_PARTS]
     depths = [_depth_image(folder, frame) for frame in frames]
     return [*depths, *(_model(folder) / name for name in names)]
 
@@ -139,7 +139,7 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
         folder: The folder of the model.
         frames: The frames, whose poses are known and whose cameras have no lens.
     """
-    lines = {part: [_OURS.decode()] for part in MODEL_PARTS}
+    lines = {file: [_OURS.decode()] for file in MODEL_PARTS}
     for number, frame in enumerate(frames, 1):
         # The camera; COLMAP counts pixels from the image's corner, not from a pixel's centre.
         (fx, _, cx), (_, fy, cy), _ = frame.camera.intrinsics
@@ -161,8 +161,8 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
             place = " ".join(f"{value:.7g}" for value in point)
             point_number = len(lines["points3D"])
             lines["points3D"].append(f"{point_number} {place} {red} {green} {blue} 0\n")
-    for part, text in lines.items():
-        write_text(folder / f"{part}.txt", "".join(text))
+    for file, text in lines.items():
+        write_text(folder / f"{file}.txt", "".join(text))
 
 
 EXPORT = Export(needs_pose=False, files=_files, write=_write, copies_images=True)

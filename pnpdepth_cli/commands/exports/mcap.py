@@ -92,7 +92,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _times(frames: Sequence[ExportFrame]) -> tuple[list[int], list[str]]:
-    """Nanoseconds of each frame, from 1970, by its name; and notes.
+    """Nanoseconds of each frame, as its name says; and notes.
 
     Where a name holds no time, all frames have made-up times at equal distances, and a note says
     so.
@@ -111,7 +111,7 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
 
     Args:
         frame: The frame.
-        time_ns: Stamp of all its messages, nanoseconds from 1970.
+        time_ns: Stamp of all its messages, nanoseconds.
         notes: Lines for a person; gets one on what is left out.
 
     Raises:
@@ -168,7 +168,11 @@ def _transform(pose: NDArray[np.float64]) -> _Fields:
 
 
 def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
-    """The fields of a CameraInfo of images (H, W) that are not rectified.
+    """The fields of a CameraInfo of images that are not rectified.
+
+    Args:
+        camera: The camera in pixels of the images.
+        size: (H, W) of the images.
 
     Raises:
         InputError: ROS has no model of the lens with so many coefficients.
@@ -199,7 +203,12 @@ def _camera_info(camera: Camera, size: tuple[int, int]) -> _Fields:
 
 
 def _image(pixels: NDArray[Any], encoding: str) -> _Fields:
-    """The fields of an Image of pixels (H, W) or (H, W, C), little-endian, rows without padding."""
+    """The fields of an Image, little-endian, rows without padding.
+
+    Args:
+        pixels: (H, W) or (H, W, C), of the type that the encoding has.
+        encoding: ROS' name of the type of a pixel, such as `rgb8`.
+    """
     # (H, bytes of a row)
     rows = np.ascontiguousarray(pixels.reshape(len(pixels), -1))
     data = rows.astype(rows.dtype.newbyteorder("<"), copy=False).view(np.uint8)

@@ -98,7 +98,11 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
 
 
 def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
-    """The frame's entry in transforms.json, which lies in the folder: files, pose and camera.
+    """The frame's entry in transforms.json: its files, pose and camera.
+
+    Args:
+        folder: Output folder, which paths of the entry start from.
+        frame: The frame.
 
     Raises:
         InputError: The program has no lens with so many coefficients, or the pose is unknown.

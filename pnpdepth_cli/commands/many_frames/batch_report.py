@@ -101,18 +101,20 @@ def write_batch_report(
         )
     if results and basis == USED:
         notes.append("Without ground truth or --holdout, no error is measured.")
-    # What the page shows of all frames, and what its script sorts and draws by.
-    keys = [measure.key for measure in columns]
+    # What the page shows of all frames.
+    settings_of_first = next((result.settings for _, result in results), {})
     page = {
         "title": summary.output,
-        "facts": _facts(summary, results[0][1].settings if results else {}),
+        "facts": _facts(summary, settings_of_first),
         "notes": notes,
         "tables": means_tables(summary.errors, summary.unit, summary.titles, summary.columns),
         "without": [(frame.name, frame.message or "") for frame in records if frame.result is None],
     }
+    # What its script sorts and draws by: the first column is a change, unless there are none.
+    keys = [measure.key for measure in columns]
     data = {
         "columns": [measure.to_json() for measure in columns],
-        "sort_by": keys.index("rmse_after") if basis == USED else 0,
+        "sort_by": keys.index(f"rmse_{AFTER}") if basis == USED else 0,
         "signed": [key for key in keys if key.endswith(_CHANGE)],
         "unit": summary.unit,
     }

@@ -340,7 +340,8 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
         sources[f"depth {number}"], _ = file_and_part(depth)
     if files.sparse is not None:
         sources["sparse mask"] = files.sparse_mask
-    # The points of its neighbours, and the images by which a motion is estimated.
+    # The points of its neighbours, which may be sampled from their ground truth, and the images by
+    # which a motion is estimated.
     for neighbour in files.neighbours:
         points = neighbour.files.sparse or neighbour.files.gt
         if points is not None:

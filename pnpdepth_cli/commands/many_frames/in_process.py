@@ -36,8 +36,8 @@ def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterat
 
     Args:
         request: The batch.
-        deciding: These frames, in order. The first that can be read counts for all of that, others
-            for the range of the input and for how images are moved to their points.
+        deciding: These frames, in order. On the first that can be read all of that is found, on two
+            others the range of the input as well, and on all how images are moved to their points.
 
     Raises:
         UsageError: The request combines what cannot be combined.

@@ -51,7 +51,7 @@ class Worker:
     folder: Path
     """The folder that relative paths start from."""
     max_pixels: int | None
-    """What the user gave as the largest image. None: nothing."""
+    """Pixels of the largest image that the user allows. None: the user states none."""
     threads: int
     """Number of threads with which torch and OpenCV compute."""
     stack: ExitStack = field(default_factory=ExitStack)
@@ -302,7 +302,7 @@ def _connected(address: str) -> Iterator[ModuleType]:
             host, _, port = address.removeprefix("ray://").rpartition(":")
             socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    # Ray documents no errors of this; some of its failures end the process.
+    # Ray raises errors of many kinds here, SystemExit among them.
     except (Exception, SystemExit) as error:
         raise DeviceError(
             f"Ray cluster {address!r} cannot be used: {one_line(error)}; check the address, start"

@@ -218,6 +218,9 @@ def _identity(spec: str) -> tuple[str, str | None]:
     """The name and the SHA-256 of a file; the spec and None if it names no file.
 
     The name has no folder, so that a batch may be moved, but the part of FILE:PART.
+
+    Args:
+        spec: FILE, FILE:PART, or another name, such as that of a network.
     """
     path, part = file_and_part(Path(spec))
     if not path.exists():

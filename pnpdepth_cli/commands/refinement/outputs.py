@@ -273,6 +273,7 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
         camera: The camera in pixels of the image.
         size: (H, W) of the image.
     """
+    # As many nodes a pixel along both sides, both ends among them.
     rows, columns = (
         np.linspace(0, side - 1, 2 + _RAY_NODES * (side - 1) // max(size)) for side in size
     )
@@ -288,5 +289,10 @@ def _colours(image: NDArray[np.float32] | None, frame: Refined) -> NDArray[np.ui
 
 
 def _base64(values: NDArray[np.number], kind: str) -> str:
-    """The values in base64, row by row, as numbers of a kind such as `<f4`, NumPy's name of it."""
+    """The numbers in base64, row by row.
+
+    Args:
+        values: Numbers, of any shape.
+        kind: NumPy's name of the type that they are stored as, such as `<f4`.
+    """
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

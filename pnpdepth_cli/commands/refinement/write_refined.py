@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from pnpdepth_cli.dataset.depth_files import integer_scale, within_range
 from pnpdepth_cli.dataset.frame_as_read import ReadFrame
 from pnpdepth_cli.dataset.frame_record import BatchState, FrameRecord
 from pnpdepth_cli.dataset.result_record import record_of_frame, record_of_result
+from pnpdepth_cli.file_record import FigureRecord
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
 from pnpdepth_cli.io.atomic import all_or_none, make_folder
@@ -70,14 +72,9 @@ def write_refined(
         with timed(seconds, "write"):
             figures = write_outputs(outputs, inputs, frame, names_of_depths(result))
         # The record, which says which of them there are.
-        written = {
-            kind: path
-            for kind, path in outputs.items()
-            if kind != "improvement" or kind in figures  # not every frame can have that one
-        }
         result = replace(
             result,
-            outputs={kind: _path_in_record(path, folder) for kind, path in written.items()},
+            outputs=_outputs_in_record(outputs, figures, folder),
             depth_scale=scale if format_of_suffix(outputs["depth"]).integer else None,
             figures=figures,
             seconds=seconds,
@@ -109,6 +106,19 @@ def _score(
     )
 
 
-def _path_in_record(path: Path, folder: Path | None) -> str:
-    """The path as a record has it: from the output folder of a batch if there is one."""
-    return str(path) if folder is None else path.relative_to(folder).as_posix()
+def _outputs_in_record(
+    outputs: Outputs, figures: Mapping[str, FigureRecord], folder: Path | None
+) -> dict[str, str]:
+    """The files that were written, by kind, as a record names them.
+
+    Args:
+        outputs: The files that were to be written. Not every frame can have an improvement map.
+        figures: The figures that were written, by kind.
+        folder: Output folder of a batch, from which the names start. None: they are as given.
+    """
+    written = {
+        kind: path for kind, path in outputs.items() if kind != "improvement" or kind in figures
+    }
+    if folder is None:
+        return {kind: str(path) for kind, path in written.items()}
+    return {kind: path.relative_to(folder).as_posix() for kind, path in written.items()}

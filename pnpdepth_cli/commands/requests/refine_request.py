@@ -83,8 +83,8 @@ class RefineRequest:
     def read_options(self) -> ReadOptions:
         """How the frame's files are read, as the method needs it.
 
-        With the paper's method no image is moved and no occluded point dropped, unless the user
-        states it.
+        With the paper's method no occluded point is dropped, and no image is moved to the points
+        because they say so ("auto").
         """
         if not self.method.is_paper:
             return self.reading

@@ -69,7 +69,7 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
 
 
 def _peak_resident_bytes() -> int:
-    """The most memory that the process had so far; on macOS, which does not tell, what it has."""
+    """The most bytes of memory that the process had; on macOS, which does not tell, what it has."""
     # Linux tells it only here, in a line such as `VmHWM:  123456 kB`.
     status = Path("/proc/self/status")
     if status.exists():
