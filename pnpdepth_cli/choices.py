@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pnpdepth_cli import protocols
-from pnpdepth_cli.errors import UsageError
+from pnpdepth_cli.errors import PnpDepthError, UsageError, describe
 
 
 class OpenList(Mapping[str, Any]):
@@ -49,9 +49,13 @@ class OpenList(Mapping[str, Any]):
         self._in_file = in_file
 
     def __getitem__(self, name: str) -> Any:
-        """Returns the entry, which is imported. Raises UsageError for an unknown name."""
+        """Returns the entry, which is imported.
+
+        Raises:
+            UsageError: The name is unknown, or another package's entry cannot be imported.
+        """
         if name in self._entries:
-            return self._entries[name].load()
+            return self._load(self._entries[name])
         if self._in_file is not None and name in self:
             return _from_file(name, self._in_file)
         raise UsageError(f"{name!r} is none of the {self._group} {', '.join(self)}")
@@ -66,6 +70,18 @@ class OpenList(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+    def _load(self, entry: EntryPoint) -> Any:
+        """The object at an entry's location; UsageError if that of another package has none."""
+        try:
+            return entry.load()
+        except Exception as error:  # another package's code may raise anything
+            if entry.group == self._group or isinstance(error, PnpDepthError):
+                raise
+            raise UsageError(
+                f"entry point {entry.name} = {entry.value} of {entry.group} cannot be loaded:"
+                f" {describe(error)}; correct or uninstall its package"
+            ) from error
 
     @functools.cached_property
     def _entries(self) -> dict[str, EntryPoint]:

@@ -15,12 +15,15 @@ from pnpdepth_cli.io.depth import DEPTH_SUFFIXES
 
 @pytest.fixture
 def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OpenList[object]:
-    """The files of io/, with two entry points of another package, one of which is such a file."""
+    """The files of io/, with the entry points of another package.
+
+    One is such a file, one is elsewhere, and two cannot be loaded."""
     info = tmp_path / "other-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[pnpdepth.test_table]\nelsewhere = other_package:entry\nscans = other_package:entry\n"
+        "no-module = no_package:entry\nno-object = other_package:nothing\n"
     )
     (tmp_path / "other_package.py").write_text("entry = 'loaded from elsewhere'\n")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -31,7 +34,8 @@ def test_the_names_of_a_list_are_the_files_of_its_folder_and_then_the_entry_poin
     table: OpenList[object],
 ) -> None:
     names = list(table)
-    assert names == [*sorted({*names} - {"elsewhere"}), "elsewhere"]
+    installed = ["elsewhere", "no-module", "no-object"]
+    assert names == [*sorted({*names} - {*installed}), *installed]
     assert "scans" in names
     assert not {"--init--", "bags"} & set(names)  # subpackages are no entries
     assert len(table) == len(names)
@@ -45,6 +49,12 @@ def test_an_entry_is_loaded_from_this_package_first(table: OpenList[object]) -> 
 def test_a_name_that_is_not_in_a_list_is_refused_with_the_names(table: OpenList[object]) -> None:
     with pytest.raises(UsageError, match=r"'scanss' .* scans"):
         table["scanss"]
+
+
+@pytest.mark.parametrize("name", ["no-module", "no-object"])
+def test_an_entry_point_that_cannot_be_loaded_is_named(table: OpenList[object], name: str) -> None:
+    with pytest.raises(UsageError, match=rf"{name} = \w+:\w+ of pnpdepth.test_table cannot be"):
+        table[name]
 
 
 @pytest.mark.parametrize(

@@ -143,6 +143,12 @@ def _diverged(quantity: str, updates: int, step: float, so_far: Refinement | Non
         step: α as a number.
         so_far: The refinement until then, which is the error's `last_good`.
     """
+    if updates == 0:
+        return DivergedError(
+            f"the {quantity} is not finite before any update of z; are the network, its"
+            " precision and the loss right?",
+            so_far,
+        )
     plural = "" if updates == 1 else "s"
     return DivergedError(
         f"the {quantity} is not finite after {updates} update{plural} of z (step {step:.3g});"

@@ -113,7 +113,8 @@ def load_stored(path: Path, *, is_mask: bool = False) -> DepthFile:
         kind = formats.kind_of(data)
         if kind is not None:
             raise formats.no_depth(path, f"an 8-bit {kind}")
-        raise InputError(f"{path} is no depth file; give a 16-bit PNG, EXR, NPY, NPZ or PFM")
+        names = ", ".join(depth_format.name for depth_format in FORMATS.values())
+        raise InputError(f"{path} is no depth file; give one of {names}")
     stored = depth_format.read(path, data)
     # Integers whose scale the file itself does not state may have it in a file beside it.
     if stored.values.dtype.kind in "iu" and stored.reading.scale is None:

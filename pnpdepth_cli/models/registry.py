@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from pnpdepth_cli import choices
 from pnpdepth_cli.budget import check_network_file
-from pnpdepth_cli.errors import ModelError, describe, wrap_user_errors
+from pnpdepth_cli.errors import ModelError, UsageError, describe
 from pnpdepth_cli.models.definition import ASSUMED_MULTIPLE, ModelDefinition, assume_definition
 from pnpdepth_cli.models.output_parts import part_of, split_parts
 from pnpdepth_cli.models.weights import WEIGHT_SUFFIXES
@@ -58,8 +58,10 @@ def _definitions_of(family: str) -> Mapping[str, ModelDefinition]:
     Raises:
         ModelError: The family cannot be loaded, or holds no definitions.
     """
-    with wrap_user_errors(f"network family {family!r}"):  # the code of another package
+    try:
         entry = choices.NETWORKS[family]
+    except UsageError as error:  # another package's entry cannot be imported
+        raise ModelError(str(error)) from error
     # A module has one of two names; an entry point may also be the object itself.
     if isinstance(entry, ModuleType):
         entry = getattr(entry, "definitions", None) or getattr(entry, "definition", None)

@@ -361,7 +361,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("eigen", {"max_depth": 0.0}, "--max-depth"),
     ("paper", {"delta": 1.0}, "--delta"),
     ("paper", {"pred_scale": float("nan")}, "--pred-scale"),
-    ("paper", {"columns": ("rmse", "boundary")}, "boundary"),
+    ("paper", {"columns": ("rmse", "boundary")}, "delta3, boundary_f1"),
     ("paper", {"depth_limits": (2.0, 1.0)}, "--by-depth"),
     ("kitti-devkit", {"delta": 1.01}, "kitti-devkit"),
     ("kitti-devkit", {"depth_limits": (1.0, 2.0)}, "kitti-devkit"),

@@ -138,6 +138,11 @@ def test_what_is_no_depth_is_refused(tmp_path: Path, name: str, values: Any) -> 
         read_depth(save(tmp_path / name, values))
 
 
+def test_a_file_of_no_format_is_refused_with_the_formats(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="PNG, EXR, NPY, NPZ, PFM, TIFF"):
+        read_depth(save(tmp_path / "d.pfm", b"hello"))
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
 def test_pickled_objects_are_never_loaded(tmp_path: Path, suffix: str) -> None:
     evil = np.array([Hostile(open, str(tmp_path / "trace"), "w")], dtype=object)

@@ -103,7 +103,10 @@ class EvalRequest:
             raise UsageError(
                 f"--delta and --by-depth do not apply to {KITTI_DEVKIT}, which has its own measures"
             )
-        choose_measures((*self.measures, *OF_SIGMA), self.columns)  # raises for an unknown key
+        if self.columns is not None:
+            # An unknown key is refused with the names of all that there are.
+            on_request = () if self.is_devkit else choices.MEASURES.values()
+            choose_measures((*self.measures, *on_request, *OF_SIGMA), self.columns)
 
     @cached_property
     def rules(self) -> Protocol:
