@@ -525,6 +525,7 @@ def test_what_is_no_depth_map_is_refused_in_one_line(what: str, tmp_path: Path) 
         read(path)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert ("video" in str(caught.value)) == ("video" in what)
     assert caught.value.exit_code == 3
 
 

@@ -14,11 +14,12 @@ from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.resolve import (
     choose_input_range,
     default_layer,
+    normalisation_name,
     resolve_layer,
     resolve_member,
     wanted_field,
 )
-from pnpdepth_cli.models.definition import ModelDefinition, Multiple
+from pnpdepth_cli.models.definition import ModelDefinition, Multiple, Normalisation
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import Settings
 from tests.frames.scenes import Brightness, Nearest, frame_in_memory, member
@@ -41,6 +42,15 @@ def test_the_ranges_are_those_of_their_names() -> None:
     for name, (low, high) in {"unit": (0, 1), "symmetric": (-1, 1), "bytes": (0, 255)}.items():
         assert ranges[name].tolist() == [[low] * 3, [high] * 3]
     assert ranges["imagenet"][1].round(3).tolist() == [2.249, 2.429, 2.64]  # as is often printed
+
+
+def test_an_input_range_is_told_by_its_name_if_it_has_one_and_the_network_takes_an_image() -> None:
+    own = ModelDefinition(name="mine", build=Brightness, input_kind="rgb", size=Multiple(4))
+    for name, normalisation in NORMALISATIONS.items():
+        assert normalisation_name(replace(own, normalisation=normalisation)) == name
+    of_nobody = Normalisation(mean=(0.1, 0.2, 0.3))
+    assert normalisation_name(replace(own, normalisation=of_nobody)) is None
+    assert normalisation_name(replace(own, build=Nearest, input_kind="sparse")) is None
 
 
 def test_a_fraction_is_the_nearest_of_the_layers_that_the_definition_lists() -> None:

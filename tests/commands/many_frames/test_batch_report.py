@@ -220,8 +220,10 @@ def test_errors_of_a_frame_are_those_that_all_frames_share(unlike_frames: Report
     assert (frames["a"]["tag"], frames["b"]["tag"]) == ("", "at validation points")
 
 
-def test_a_frame_that_failed_is_named_on_the_page(unlike_frames: Reported) -> None:
-    assert [name for name, why in page_data(unlike_frames.report)["without"]] == ["d"]
+def test_a_frame_that_failed_is_on_the_page_with_its_reason(unlike_frames: Reported) -> None:
+    ((name, why),) = page_data(unlike_frames.report)["without"]
+    assert name == "d"
+    assert "d.png" in why
 
 
 def test_the_page_has_the_weights_of_each_frame_and_their_mean(unlike_frames: Reported) -> None:
