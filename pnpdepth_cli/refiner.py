@@ -170,6 +170,8 @@ class Refiner:
             method = self._method_for(frame)
             notes_on_registration = self._keep_registration(method, frame)
             refined = method.refine(frame, with_stages=stages)
+            # Until frames of this size decide together, each decides alone how its image is moved
+            # to the points, and two may decide differently.
             decides_alone = self._register == "auto" and frame.size not in method.registrations
             is_moved_otherwise = decides_alone and self._is_moved_otherwise(frame, refined)
         # What a person should know, and how the frame is saved.
@@ -180,7 +182,7 @@ class Refiner:
                 " `share_registration` decides once for a sequence"
             )
         refined = replace(refined, notes=tuple(notes), saver=save)
-        # A refinement that diverged is an error that has the frame before that.
+        # A refinement that diverged is an error, which holds the frame as it was before that.
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined

@@ -115,6 +115,8 @@ def read_predicted_depth(
 def _load(path: Path, part: str) -> DepthFile:
     """The numbers in a file, or in one part of it, as they are stored.
 
+    A grey picture of 8 or 16 bits may be depth, too.
+
     Args:
         path: The file.
         part: Name of an array of an NPZ, or of a channel of an EXR. Empty: the one that is depth.
@@ -122,6 +124,7 @@ def _load(path: Path, part: str) -> DepthFile:
     Raises:
         InputError: The file holds no such part, or no depth.
     """
+    # Files whose arrays or channels have names.
     data = read_bytes(path)
     kind = formats.kind_of(data)
     if kind == "NPZ":
@@ -135,16 +138,18 @@ def _load(path: Path, part: str) -> DepthFile:
         raise InputError(
             f"{path} has no part {part!r}; only arrays of an NPZ and channels of an EXR have names"
         )
+    # A depth map of COLMAP, and what is no map at all.
     if is_dense_map(data):
         return read_dense_map(path, data)
     if _is_video(data):
         raise InputError(f"{path} is a video; save the depth of the image's frame, as NPY")
     if kind is None and path.suffix.lower() in _LIST_SUFFIXES:
         raise InputError(f"{path} is a text, as of a list of points; {SAVE_RAW}")
+    # Pictures, and all other depth files.
     if kind in ("JPEG", "WEBP") or data[4:8] == b"ftyp":  # HEIC, which `kind_of` does not know
-        return _load_picture(path, kind or "HEIC")
+        return _load_grey_picture(path, kind or "HEIC")
     if kind in ("PNG", "TIFF") and not _holds_depth(path, data, kind):
-        return _load_picture(path, kind)
+        return _load_grey_picture(path, kind)
     return load_stored(path)
 
 
@@ -226,7 +231,7 @@ def _holds_depth(path: Path, data: bytes, kind: str) -> bool:
         return mode.startswith("I;16") or (kind == "TIFF" and mode in ("F", "I"))
 
 
-def _load_picture(path: Path, kind: str) -> DepthFile:
+def _load_grey_picture(path: Path, kind: str) -> DepthFile:
     """The levels (H, W) of a grey picture, of 8 or 16 bits.
 
     Args:

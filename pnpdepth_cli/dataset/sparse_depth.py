@@ -151,8 +151,9 @@ def read_map_points(
         options: Options of reading, which say what happens to occluded points.
         size: (H, W) of the image. None: it is that of the map.
         scale: Numbers per metre that the user or the data set states. None: the file's own.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `plausible.OF_DATA_SET`. Empty: it is stated of these numbers.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `plausible.OF_DATA_SET`. Floats are then divided only where they
+            cannot be metres. Empty: it is stated for these very numbers.
         inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
 
     Raises:
@@ -193,7 +194,8 @@ def read_map_points(
         stored_depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
     )
     points = points.select(is_inside)
-    # Numbers whose kind is stated may grow downwards.
+    # Numbers that grow towards the bottom of the image may be disparity. What is known to be
+    # disparity or 1/depth has become depth above.
     if inverse is None:
         unit_notes += check_rows(points)
     return SparseDepth(

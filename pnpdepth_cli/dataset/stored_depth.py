@@ -109,7 +109,7 @@ def read_stored_truth(path: Path, image: ImageSource | None) -> StoredDepth:
 def is_float(stored: StoredDepth) -> bool:
     """Returns whether a file holds floats: a scan, or a map or list whose numbers are floats."""
     if isinstance(stored, StoredPoints):
-        return stored.kind == "scan"
+        return stored.kind == "scan"  # a COLMAP model is in a unit of its own
     return not holds_integers(stored.file)
 
 

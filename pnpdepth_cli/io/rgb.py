@@ -173,7 +173,8 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
-    rgb = pixels[:, :, ::-1]
+    rgb = pixels[:, :, ::-1]  # OpenCV has B, G, R
+    # White is not 65535 where a camera stored fewer bits.
     white = _white_of(data, kind, int(rgb.max()))
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 

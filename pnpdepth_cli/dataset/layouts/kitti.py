@@ -21,7 +21,14 @@ from pathlib import Path
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose, file_of
-from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, Part, join_parts, layout_of_folders
+from pnpdepth_cli.dataset.layouts.layout import (
+    Finish,
+    Layout,
+    Part,
+    as_it_is,
+    join_parts,
+    layout_of_folders,
+)
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_inertial_pose
 from pnpdepth_cli.io.poses import read_oxts, read_poses
@@ -53,7 +60,7 @@ def _poses_of_sequence(place: Path) -> Finish:
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return replace
+        return as_it_is
     poses = [as_pose(pose) for pose in read_poses(path)]
 
     def with_pose(frame: FrameFiles) -> FrameFiles:
