@@ -205,16 +205,20 @@ class Refiner:
                 self._method_for(checked[0]).share_registration(checked)
 
     def _keep_registration(self, method: Method, frame: Frame) -> list[str]:
-        """Returns a note if this frame completes the `DECIDED_BY` of its size that decide together.
+        """Decides how images of a frame's size are moved, once `DECIDED_BY` frames of it tell how.
 
-        From then on, images of that size are all moved to their points alike.
+        From then on, all images of that size are moved to their points alike.
 
         Args:
             method: The method, which gets the registration.
             frame: The frame that is refined next.
+
+        Returns:
+            A note on the decision; none before it, after it, and where nothing changes by it.
         """
         if self._register != "auto" or frame.size in method.registrations:
-            return []
+            return []  # the user states it, or it is decided already
+        # What this frame tells is added to what those before it told.
         evidences = self._evidences.setdefault(frame.size, [])
         evidence = frame.evidence_of_registration
         if evidence is not None:
@@ -223,7 +227,7 @@ class Refiner:
             return []
         shared = estimate_registration(self._evidences.pop(frame.size))
         method.registrations[frame.size] = shared
-        # Nothing is said of images that were never moved, and stay.
+        # No note where images were never moved, and will not be. `_moved` holds texts.
         not_moved = str(None)
         moved_before = self._moved.get(frame.size, set()) - {not_moved}
         if shared is None and not moved_before:

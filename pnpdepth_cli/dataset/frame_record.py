@@ -281,7 +281,7 @@ class FrameRecord:
                 " again the command that wrote it"
             )
         try:
-            with _CONVERTING:
+            with _CONVERTING:  # msgspec is not safe to call first in two threads
                 return msgspec.convert(entry, cls)
         # msgspec raises ValidationError, also for our ValueErrors, and lets UsageError pass. A text
         # that is not Unicode ends its own message in a UnicodeError.

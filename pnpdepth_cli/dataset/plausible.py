@@ -266,6 +266,7 @@ def _describe_doubt(doubt: Doubt, median: float, reading: Reading, what: str, op
         what: Name of the depths.
         option: Option of the command line that states the scale.
     """
+    # Whole numbers are codes, in scales of depth files; other floats may be in another unit.
     scale = reading.scale or 1.0
     scales: tuple[float, ...] = _UNITS
     if doubt == "codes" or reading.scale is not None:

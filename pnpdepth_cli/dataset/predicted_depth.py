@@ -154,7 +154,10 @@ def _load(path: Path, part: str) -> DepthFile:
 
 
 def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
-    """The name of the array of an archive that is depth: the only map, or the only one named so.
+    """The name of the array of an archive that is depth.
+
+    It is the only map named as depth; else the only map; else the only array named as depth; else
+    the only array. An array named as something else, such as a mask, is none of these.
 
     Args:
         path: The archive, for messages.
@@ -164,8 +167,8 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
         InputError: No array is depth, or several are.
     """
     listed = one_line(", ".join(f"{name} {array.shape}" for name, array in arrays.items()))
-    # Arrays whose name is of nothing else; of these, those that are named depth, and those that are
-    # maps.
+    # Arrays that are not named as something else; of these, those that are named as depth, and
+    # those that are maps.
     eligible = [name for name in arrays if not _OTHER_WORDS.search(name.lower())]
     named_depth = [name for name in eligible if _DEPTH_WORDS.search(name.lower())]
     maps = list[str]()
@@ -175,8 +178,8 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
         if len(sides) == 2 and min(sides) > _LARGEST_MATRIX and dtype.kind in "fiu":
             maps.append(name)
     maps_named_depth = [name for name in maps if name in named_depth]
-    # Without a map, an array that is named depth, or the only one, is chosen, too: it is a stack of
-    # maps, say, which is refused later with its shape.
+    # Without a map, an array that is named as depth, or the only one, is chosen, too: it is a stack
+    # of maps, say, which is refused later with its shape.
     only_one = eligible if len(arrays) == 1 else []
     candidates = maps_named_depth or maps or named_depth or only_one
     if len(candidates) == 1:

@@ -154,13 +154,14 @@ def read_map_points(
         of_integers: Where the integers are that `scale` is stated for, if not here: path of the
             frame's other file, or `plausible.OF_DATA_SET`. Floats are then divided only where they
             cannot be metres. Empty: it is stated for these very numbers.
-        inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
+        inverse: For a file of disparity or 1/depth, the constant that depth × number is: baseline ×
+            focal length in metres × pixels, or 1. None: the file holds depth.
 
     Raises:
         InputError: Its numbers are no depth of this image.
         NoPointsError: No point is left.
     """
-    # The points as they are stored, without far values.
+    # The points as they are stored, without extreme values that are no depth.
     path = stored.path
     points, reading = points_from_stored(path, stored.file, size=size, scale=scale)
     if inverse is not None:
@@ -183,11 +184,12 @@ def read_map_points(
         blurred = interpolation_warning(as_depth_image(points))
         if blurred is not None:
             lines.append(blurred)
-    # Points that the camera does not see go.
+    # Points that the camera does not see are dropped.
+    stored_depth = points.depth
     visible = _visible_points(points, options)
     lines += visible.notes
-    # The others must be pixels of the image. The unit is that of all points, also hidden ones.
-    stored_depth = points.depth
+    # The others must be pixels of the image. The unit is told by the depth of all, also of hidden
+    # ones.
     points = visible.points.resized(*size)
     is_inside, pixel_notes = check_pixels(path, points.xy, size)
     divisor, unit_notes = divisor_to_metres(

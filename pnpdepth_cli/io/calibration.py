@@ -290,7 +290,7 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
 
 
 def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
-    """The possible cameras of rectified images, of which camera_info states the raw camera.
+    """The cameras that rectified images may have, where a ROS camera_info states the raw camera.
 
     ROS rectifies an image by R and P, and removes its distortion. No file says whether the poses of
     other sensors are in the coordinates of the rectified camera, as kitti2bag has it, or of the raw
@@ -326,6 +326,7 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
         poses["P with its offset"] = Extrinsics(turn, offset)
     if is_turned:
         poses["P and R"] = Extrinsics(turn, np.zeros(3))
+    # In any case other sensors may refer to the rectified camera itself, unless it is the raw one.
     has_same_intrinsics = np.allclose(intrinsics, raw.intrinsics, atol=_SAME_INTRINSICS_PX)
     if not poses and has_same_intrinsics and not raw.distortion:
         return {}

@@ -294,8 +294,8 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | 
 def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     """Returns a frame of a video, (H, W, 3) float32 in 0..1, as it is stored: not turned.
 
-    Frames are decoded from the first on and the last ones stay in memory, so that frames that are
-    read in order are decoded once.
+    Frames are decoded from the first on, and the last `_FRAMES_IN_MEMORY` decoded ones stay in
+    memory. So frames that are read in order are decoded once.
 
     Args:
         path: The video, an MP4 or MOV file.
@@ -308,16 +308,18 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     size_of_regular_file(path)
     mtime_ns = path.stat().st_mtime_ns
     with _VIDEO_LOCK:
+        # Pairs of number and pixels: of frames still to be decoded, and of those in memory.
         frames, decoded = _open_video(path, mtime_ns)
         # An earlier frame than those in memory is decoded from the beginning again.
         if decoded and index < decoded[0][0]:
             _open_video.cache_clear()
             frames, decoded = _open_video(path, mtime_ns)
-        while (bgr := dict(decoded).get(index)) is None:
+        while index not in dict(decoded):
             next_frame = next(frames, None)
             if next_frame is None:
                 raise InputError(f"{path} has no frame {index:,}; it ends before, or is cut short")
             decoded.append(next_frame)
+        bgr = dict(decoded)[index]
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 
 

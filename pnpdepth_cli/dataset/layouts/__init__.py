@@ -188,7 +188,7 @@ def list_frames(root: Path, name: str | None = None) -> DataSet:
     frames = list[FrameFiles]()
     unmatched = dict[Unmatched, None]()  # in their order, each once
     for folder, entry in entries:
-        if isinstance(entry, tuple):
+        if isinstance(entry, tuple):  # a file of no frame, and why
             unmatched[entry] = None
         elif folder == root:
             frames.append(entry)

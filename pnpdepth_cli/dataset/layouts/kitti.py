@@ -205,9 +205,12 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
         entries = list(_frames_of_camera(drive, camera.name, parts, shared))
         frames = [entry for entry in entries if isinstance(entry, FrameFiles)]
-        posed = _with_poses_of_drive(drive, frames)
+        with_pose = _with_poses_of_drive(drive, frames)
         for entry in entries:
-            yield posed.get(entry, entry) if isinstance(entry, FrameFiles) else entry
+            if isinstance(entry, FrameFiles):
+                yield with_pose.get(entry, entry)
+            else:
+                yield entry  # a file of no frame, and why
 
 
 def _with_poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:
@@ -250,7 +253,7 @@ def _frames_of_camera(
         shared: A frame whose fields all frames have.
     """
     for entry in join_parts(parts, replace(shared, camera=int(camera[-1]))):
-        if isinstance(entry, tuple):
+        if isinstance(entry, tuple):  # a file of no frame, and why
             yield entry
         else:
             yield replace(entry, name=f"{drive.name}_{entry.name}_{camera}")
