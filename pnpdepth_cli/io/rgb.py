@@ -25,6 +25,7 @@ _PLAUSIBLE = (0.2, 50.0)
 _WHITE = 65535  # of 16 bits
 _BITS = (8, 10, 12, 14)  # of the numbers of cameras' sensors
 _BRIGHTEST_LIGHT = 1e9  # taken for infinite light in an EXR; white is 1
+_ON_ITS_SIDE = (5, 6, 7, 8)  # EXIF orientations of images whose rows and columns are exchanged
 _PNG_HEAD = 512  # bytes, in which a PNG states its bits
 _FRAMES_IN_MEMORY = 8
 """Frames of a video that are kept, as threads ask for them slightly out of order."""
@@ -134,7 +135,7 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         with Image.open(path) as image:
             width, height = image.size
-            is_on_its_side = images.orientation_of(image) >= 5
+            is_on_its_side = images.orientation_of(image) in _ON_ITS_SIDE
             upright = (width, height) if is_on_its_side else (height, width)
             return upright, (height, width)
     except (OSError, Image.DecompressionBombError):  # Pillow does not read it, such as an EXR
@@ -206,7 +207,7 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
     Any other number means that the image is upright already.
     """
     # Rows and columns are exchanged, then the rows reversed, then the columns.
-    if orientation in (5, 6, 7, 8):
+    if orientation in _ON_ITS_SIDE:
         values = values.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
