@@ -254,10 +254,11 @@ class Refiner:
         return len(moved) > 1
 
     def _method_for(self, first: Frame) -> Method:
-        """The method with its networks open; what is left open is decided by the first frame.
+        """The method, with its networks cut open for refinement; made by the first call.
 
         Args:
-            first: The frame that is refined, which is the first if there is no method yet.
+            first: The frame that is refined. The first one decides the settings that the user left
+                open.
 
         Raises:
             UsageError: The refiner is closed, or another one uses a network.

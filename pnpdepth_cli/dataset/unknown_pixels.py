@@ -141,13 +141,14 @@ def _add_marks(unknown: _Unknown, values: Map) -> None:
 
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
-    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity.
+    """Adds the pixels of extreme values that many share: the sky, a far plane, a clip.
 
     Args:
         unknown: The unknown pixels, to which these are added.
         values: (H, W) numbers by their scale.
     """
-    # About one value, far from all others and mixed with them at its edges.
+    # Many about one value far from all others, with mixtures of the two at the edges. The numbers
+    # may be depth or 1/depth, so the sky may be at either end.
     known = unknown.known.astype(np.float64)
     if known.min(initial=np.inf) > 0:
         is_known = ~unknown.mask
@@ -158,7 +159,7 @@ def _add_ends(unknown: _Unknown, values: Map) -> None:
             pixels = np.zeros(values.shape, bool)
             pixels[is_known] = end.is_no_surface
             unknown.add(pixels, f"about {end.value:.6g}, where {bound} {end.reach:.4g}")
-    # Exactly one value.
+    # Many of exactly one value.
     for value, _ in repeated_ends(unknown.known):
         name = "smallest" if value <= float(unknown.known.min()) else "largest"
         unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")

@@ -345,9 +345,6 @@ def improvement(
         path: The PNG.
         unit: Name of the unit of depth.
 
-    Returns:
-        What a report needs to know of the figure, such as how many pixels improved.
-
     Raises:
         OutputError: The file cannot be written.
     """
