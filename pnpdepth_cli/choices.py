@@ -49,7 +49,11 @@ class OpenList(Mapping[str, Any]):
         self._in_file = in_file
 
     def __getitem__(self, name: str) -> Any:
-        """Returns the entry, which is imported. Raises UsageError for an unknown name."""
+        """Returns the entry of a name, which is imported, or the function in a user's Python file.
+
+        Raises:
+            UsageError: There is no such name, or the file cannot be run or has no such function.
+        """
         if name in self._entries:
             return self._entries[name].load()
         if self._in_file is not None and name in self:

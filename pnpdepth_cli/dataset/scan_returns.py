@@ -126,7 +126,7 @@ def _rows_of_returns(
         xyz: (N, 3), as they are stored.
         stored_range: (N,) distances from the scanner, in the unit of `xyz`; coordinates that are
             not finite count as 0.
-        drops: Counter of the other points, by the reason.
+        drops: Counter of the other points, by the reason; they are added to it.
 
     Raises:
         InputError: Many coordinates are none of a scan.

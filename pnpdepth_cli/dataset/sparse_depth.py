@@ -248,7 +248,7 @@ def _visible_points(points: Points, options: ReadOptions) -> _Visible:
 def depth_of_distances(sparse: SparseDepth, scan: ScanOptions, image: Path | None) -> SparseDepth:
     """Returns the points with depth z instead of their distances from the camera.
 
-    Points where the lens shows nothing go.
+    Points on pixels where the lens shows nothing are dropped.
 
     Args:
         sparse: Points whose depth is the distance from the camera.
@@ -380,8 +380,8 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     is_untracked = not len(rows)
     if is_untracked:
         rows = np.arange(len(points["number"]))
-    # Points of short tracks and with large reprojection errors go. Models of known poses may have
-    # points without any tracks.
+    # Points of short tracks and with large reprojection errors are dropped. Models of known poses
+    # may have points without any tracks; their tracks are not judged.
     total = len(rows)
     drops = DropCounter()
     least = min(_LEAST_TRACK, len(model.images))

@@ -191,11 +191,12 @@ def _white_of(data: bytes, kind: str, largest: int) -> float:
         kind: "PNG" or "TIFF".
         largest: Largest number in the image.
     """
-    # The chunk sBIT of a PNG states the significant bits of each channel after its name.
+    # The chunk sBIT of a PNG states the significant bits of each channel after its name. Without
+    # it, the fewest bits that hold the largest number are tried.
     at = data.find(b"sBIT", 0, _PNG_HEAD) if kind == "PNG" else -1
-    stated_bits = _BITS if at < 0 else (data[at + 4],)
-    for bits in stated_bits:
-        # Numbers beyond the stated bits were scaled to 16; 0 and 1 alone tell nothing.
+    bits_to_try = _BITS if at < 0 else (data[at + 4],)
+    for bits in bits_to_try:
+        # Numbers beyond these bits were scaled to 16; 0 and 1 alone tell nothing.
         if 1 < largest < 2**bits <= _WHITE:
             return float(2**bits - 1)
     return float(_WHITE)

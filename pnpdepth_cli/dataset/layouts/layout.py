@@ -111,11 +111,14 @@ def lacking(place: Path, needs: Iterable[str]) -> list[str]:
 
 
 def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
-    """The files of a part by their stem, in natural order, and those that share a stem."""
+    """The files that a part names, by their stem in natural order; and those that share a stem.
+
+    Both are empty without the part's folder.
+    """
     folder, pattern = part
     stem, _, ending = pattern.removesuffix("?").rpartition(".")
     suffixes = _SUFFIXES.get(ending, (f".{ending}",))
-    if stem == "**":
+    if stem == "**":  # files in the folder and below, whose stem is their path
         return find_files(folder, suffixes)
     # A regular expression of the whole name, whose groups are the frame's stem.
     stem_pattern = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
