@@ -57,6 +57,8 @@ class Camera:
         intrinsics = self.intrinsics.copy()
         intrinsics[0, 1] = -intrinsics[0, 1]
         intrinsics[0, 2] = width - 1 - intrinsics[0, 2]
+        # Coefficients of terms that differ between left and right change their sign; a fisheye has
+        # none.
         distortion = self.distortion
         if self.lens == "radial-tangential":
             distortion = tuple(

@@ -49,10 +49,11 @@ class OpenList(Mapping[str, Any]):
         self._in_file = in_file
 
     def __getitem__(self, name: str) -> Any:
-        """Returns the entry, which is imported.
+        """Returns the entry of a name, which is imported, or the function in a user's Python file.
 
         Raises:
-            UsageError: The name is unknown, or another package's entry cannot be imported.
+            UsageError: There is no such name, another package's entry cannot be imported, or the
+                file cannot be run or has no such function.
         """
         if name in self._entries:
             return self._load(self._entries[name])

@@ -344,7 +344,13 @@ def _boundary_counts(
 
 
 def _mean_quotient(numerators: Floats, denominators: Floats, weights: Sequence[float]) -> float:
-    """The weighted mean over the ratios of numerator / denominator, 0 where both are 0."""
+    """The weighted mean of numerators / denominators; 0 / 0 counts as 0.
+
+    Args:
+        numerators: (N,), each 0 where its denominator is 0.
+        denominators: (N,), none below 0.
+        weights: N weights, of any sum.
+    """
     import numpy as np
 
     divisors = np.where(denominators > 0, denominators, 1)

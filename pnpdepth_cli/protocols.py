@@ -60,13 +60,14 @@ class FramePart:
         return 2 if self.halved else self.blocks
 
     def apply(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Returns this part of an image (H, W) or (H, W, C).
+        """Returns this part of an image (H, W) or (H, W, C): halved or averaged, then cropped.
 
         Raises:
             InputError: The image is smaller than the crop.
         """
         top, left, height, width = self._window((image.shape[0], image.shape[1]))
-        # nearest neighbour at half the size: the pixel whose area holds the new pixel's centre
+        # The nearest neighbour at half the size: the centre of a new pixel is the corner that four
+        # pixels share, and the lower right one of these is taken.
         small = image[1::2, 1::2] if self.halved else _block_means(image, self.blocks)
         return small[top : top + height, left : left + width]
 

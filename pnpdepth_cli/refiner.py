@@ -170,6 +170,8 @@ class Refiner:
             method = self._method_for(frame)
             notes_on_registration = self._keep_registration(method, frame)
             refined = method.refine(frame, with_stages=stages)
+            # Until frames of this size decide together, each decides alone how its image is moved
+            # to the points, and two may decide differently.
             decides_alone = self._register == "auto" and frame.size not in method.registrations
             is_moved_otherwise = decides_alone and self._is_moved_otherwise(frame, refined)
         # What a person should know, and how the frame is saved.
@@ -180,7 +182,7 @@ class Refiner:
                 " `share_registration` decides once for a sequence"
             )
         refined = replace(refined, notes=tuple(notes), saver=save)
-        # A refinement that diverged is an error that has the frame before that.
+        # A refinement that diverged is an error, which holds the frame as it was before that.
         if refined.diverged is not None:
             raise DivergedError(str(refined.diverged), refined)
         return refined
@@ -203,16 +205,20 @@ class Refiner:
                 self._method_for(checked[0]).share_registration(checked)
 
     def _keep_registration(self, method: Method, frame: Frame) -> list[str]:
-        """Returns a note if this frame completes the `DECIDED_BY` of its size that decide together.
+        """Decides how images of a frame's size are moved, once `DECIDED_BY` frames of it tell how.
 
-        From then on, images of that size are all moved to their points alike.
+        From then on, all images of that size are moved to their points alike.
 
         Args:
             method: The method, which gets the registration.
             frame: The frame that is refined next.
+
+        Returns:
+            A note on the decision; none before it, after it, and where nothing changes by it.
         """
         if self._register != "auto" or frame.size in method.registrations:
-            return []
+            return []  # the user states it, or it is decided already
+        # What this frame tells is added to what those before it told.
         evidences = self._evidences.setdefault(frame.size, [])
         evidence = frame.evidence_of_registration
         if evidence is not None:
@@ -221,7 +227,7 @@ class Refiner:
             return []
         shared = estimate_registration(self._evidences.pop(frame.size))
         method.registrations[frame.size] = shared
-        # Nothing is said of images that were never moved, and stay.
+        # No note where images were never moved, and will not be. `_moved` holds texts.
         not_moved = str(None)
         moved_before = self._moved.get(frame.size, set()) - {not_moved}
         if shared is None and not moved_before:
@@ -248,10 +254,11 @@ class Refiner:
         return len(moved) > 1
 
     def _method_for(self, first: Frame) -> Method:
-        """The method with its networks open; what is left open is decided by the first frame.
+        """The method, with its networks cut open for refinement; made by the first call.
 
         Args:
-            first: The frame that is refined, which is the first if there is no method yet.
+            first: The frame that is refined. The first one decides the settings that the user left
+                open.
 
         Raises:
             UsageError: The refiner is closed, or another one uses a network.

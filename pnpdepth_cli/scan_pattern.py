@@ -46,6 +46,7 @@ def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | 
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
     if len(x) < _MIN_POINTS:
         return None
+    # Infinite where most points have no next one.
     along = _median_gap(x, y)
     across = _median_gap(y, x)
     if not _ACROSS_OVER_ALONG * along <= across < np.inf:

@@ -13,9 +13,10 @@ _noted: ContextVar[dict[str, float] | None] = ContextVar("_noted", default=None)
 
 @contextmanager
 def spent_on(part: str) -> Iterator[None]:
-    """Inside, the time counts as spent on one part of a stage, but for that on parts inside it.
+    """Adds the seconds of the block to those of one part of the stage that `parts_of` times.
 
-    Nothing is noted outside `parts_of`.
+    Blocks may be nested: the seconds of an inner one count for its own part alone. Outside
+    `parts_of` nothing is timed.
 
     Args:
         part: Name of the part, such as "import".
@@ -24,22 +25,22 @@ def spent_on(part: str) -> Iterator[None]:
     if seconds is None:
         yield
         return
-    start = time.perf_counter()
-    before = sum(seconds.values())
+    start_s = time.perf_counter()
+    noted_before_s = sum(seconds.values())
     try:
         yield
     finally:
-        on_others = sum(seconds.values()) - before
-        on_this = time.perf_counter() - start - on_others
-        seconds[part] = seconds.get(part, 0.0) + on_this
+        on_inner_s = sum(seconds.values()) - noted_before_s
+        on_this_s = time.perf_counter() - start_s - on_inner_s
+        seconds[part] = seconds.get(part, 0.0) + on_this_s
 
 
 @contextmanager
 def parts_of(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Inside, `spent_on` notes parts of a stage; afterwards their seconds are added to a table.
+    """Adds to a table the seconds that the block's parts took, as `spent_on` times them.
 
     Args:
-        seconds: The table, seconds by name; a part is under `STAGE: PART`.
+        seconds: The table, seconds by name; a part is under `STAGE: PART`. It is changed.
         stage: Name of the stage, such as "load network".
     """
     parts = dict[str, float]()

@@ -186,7 +186,7 @@ def raw_depth(path: Path, image: ImageSource | None) -> DepthFile | None:
     """
     if path.suffix.lower() != ".jpg" or not isinstance(image, Path):
         return None
-    _, size = sizes_of(image)
+    _, size = sizes_of(image)  # of the pixels as they are stored
     if file_bytes.size_of_regular_file(path) != 4 * math.prod(size):
         return None
     file_bytes.check_value_count(path, math.prod(size), value_bytes=4)
@@ -199,9 +199,10 @@ def depth_of_inverse(file: DepthFile, factor: float, scale: float | None) -> Dep
 
     Args:
         file: Numbers of any shape, 0 where unknown, as `read_depth` returns them.
-        factor: Depth × number, as `inverse_factor` returns it: 1 of 1/depth.
-        scale: Numbers per unit that the user states, by which floats are divided first. None: none.
-            Integers are divided by it already.
+        factor: The constant that depth × number is: 1 for 1/depth, and baseline × focal length in
+            metres × pixels for disparity.
+        scale: Numbers per 1/m or per pixel of disparity that the user states. Floats are divided by
+            it first; integers have been already. None: none is stated.
     """
     values = file.values.astype(np.float64)
     if file.reading.scale is None and scale is not None:

@@ -211,7 +211,7 @@ class ReadOptions:
 
 
 def inverse_factor(option: str, kind: str | None) -> float | None:
-    """Returns depth × number, a constant, of a file that holds 1/depth or disparity.
+    """Returns the constant that depth × number is in a file of 1/depth or disparity.
 
     Args:
         option: Option, or column of a list, that states the kind; for messages.

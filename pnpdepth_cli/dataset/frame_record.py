@@ -215,9 +215,10 @@ class FrameRecord:
     """The refined depth. None of a frame that failed, or that `eval` scored."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for errors without those of the result, and for a batch's half record.
+        """Raises ValueError for a record that lacks what is read of it later.
 
-        A summary and a report read more of a frame of a batch than of others.
+        Errors must have the stage after refinement. A refined frame of a batch must have its
+        result, and the number of pixels or points behind its errors.
         """
         for basis, stages in self.errors.items():
             if AFTER not in stages:
@@ -227,7 +228,8 @@ class FrameRecord:
         if self.result is None:
             raise ValueError("it does not say how the frame was refined")
         for basis, stages in self.errors.items():
-            if stages[AFTER].get("pixels" if basis == GT else "points") is None:
+            count = "pixels" if basis == GT else "points"
+            if stages[AFTER].get(count) is None:
                 raise ValueError(f"the errors {basis} lack how many pixels or points they are of")
 
     def refined(self) -> ResultRecord:
@@ -281,7 +283,7 @@ class FrameRecord:
                 " again the command that wrote it"
             )
         try:
-            with _CONVERTING:
+            with _CONVERTING:  # msgspec is not safe to call first in two threads
                 return msgspec.convert(entry, cls)
         # msgspec raises ValidationError, also for our ValueErrors, and lets UsageError pass. A text
         # that is not Unicode ends its own message in a UnicodeError.

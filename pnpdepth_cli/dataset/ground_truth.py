@@ -164,11 +164,12 @@ def compare_with_sparse(
     reading: Reading,
     sparse: SparseDepth,
 ) -> list[str]:
-    """Returns warnings if ground truth and sparse depth seem to be of two scales, or one depth.
+    """Returns warnings if ground truth and sparse depth contradict each other, or are the same.
 
     Args:
         files: The files of the frame.
-        options: Options of reading; a kind that the user states of a file is not refused.
+        options: Options of reading. If the kind of a file is stated, such as disparity, opposite
+            orders are a warning and no error.
         gt: (H, W) metres, 0 = unknown: the ground truth of the part of the frame that is used.
         reading: How the ground truth was read.
         sparse: The sparse depth of that part.

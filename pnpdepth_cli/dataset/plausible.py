@@ -87,8 +87,9 @@ def plausible_map(
         what: Name of the depths in lines for a person, such as "gt".
         option: Option of the command line that states the scale, for messages.
         scale: Numbers per metre that the user or the data set states. None: nothing is stated.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `OF_DATA_SET`. Empty: it is stated of these very numbers.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `OF_DATA_SET`. Floats are then divided only where they
+            cannot be metres. Empty: it is stated for these very numbers.
 
     Raises:
         InputError: The depths are implausible in metres.
@@ -144,8 +145,9 @@ def divisor_to_metres(
         option: Option of the command line that states the scale, for messages.
         scale: Numbers per metre that the user or the data set states. None: nothing is stated.
         medians: The smallest and the largest median, metres, that is plausible.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `OF_DATA_SET`. Empty: it is stated of these very numbers.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `OF_DATA_SET`. Floats are then divided only where they
+            cannot be metres. Empty: it is stated for these very numbers.
 
     Raises:
         InputError: The depths are implausible, and nothing that the user states explains it.
@@ -264,6 +266,7 @@ def _describe_doubt(doubt: Doubt, median: float, reading: Reading, what: str, op
         what: Name of the depths.
         option: Option of the command line that states the scale.
     """
+    # Whole numbers are codes, in scales of depth files; other floats may be in another unit.
     scale = reading.scale or 1.0
     scales: tuple[float, ...] = _UNITS
     if doubt == "codes" or reading.scale is not None:

@@ -115,6 +115,8 @@ def read_predicted_depth(
 def _load(path: Path, part: str) -> DepthFile:
     """The numbers in a file, or in one part of it, as they are stored.
 
+    A grey picture of 8 or 16 bits may be depth, too.
+
     Args:
         path: The file.
         part: Name of an array of an NPZ, or of a channel of an EXR. Empty: the one that is depth.
@@ -122,6 +124,7 @@ def _load(path: Path, part: str) -> DepthFile:
     Raises:
         InputError: The file holds no such part, or no depth.
     """
+    # Files whose arrays or channels have names.
     data = read_bytes(path)
     kind = formats.kind_of(data)
     if kind == "NPZ":
@@ -135,21 +138,26 @@ def _load(path: Path, part: str) -> DepthFile:
         raise InputError(
             f"{path} has no part {part!r}; only arrays of an NPZ and channels of an EXR have names"
         )
+    # A depth map of COLMAP, and what is no map at all.
     if is_dense_map(data):
         return read_dense_map(path, data)
     if _is_video(data):
         raise InputError(f"{path} is a video; save the depth of the image's frame, as NPY")
     if kind is None and path.suffix.lower() in _LIST_SUFFIXES:
         raise InputError(f"{path} is a text, as of a list of points; {SAVE_RAW}")
+    # Pictures, and all other depth files.
     if kind in ("JPEG", "WEBP") or data[4:8] == b"ftyp":  # HEIC, which `kind_of` does not know
-        return _load_picture(path, kind or "HEIC")
+        return _load_grey_picture(path, kind or "HEIC")
     if kind in ("PNG", "TIFF") and not _holds_depth(path, data, kind):
-        return _load_picture(path, kind)
+        return _load_grey_picture(path, kind)
     return load_stored(path)
 
 
 def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
-    """The name of the array of an archive that is depth: the only map, or the only one named so.
+    """The name of the array of an archive that is depth.
+
+    It is the only map named as depth; else the only map; else the only array named as depth; else
+    the only array. An array named as something else, such as a mask, is none of these.
 
     Args:
         path: The archive, for messages.
@@ -159,8 +167,8 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
         InputError: No array is depth, or several are.
     """
     listed = one_line(", ".join(f"{name} {array.shape}" for name, array in arrays.items()))
-    # Arrays whose name is of nothing else; of these, those that are named depth, and those that are
-    # maps.
+    # Arrays that are not named as something else; of these, those that are named as depth, and
+    # those that are maps.
     eligible = [name for name in arrays if not _OTHER_WORDS.search(name.lower())]
     named_depth = [name for name in eligible if _DEPTH_WORDS.search(name.lower())]
     maps = list[str]()
@@ -170,8 +178,8 @@ def _choose_array(path: Path, arrays: dict[str, ArrayKind]) -> str:
         if len(sides) == 2 and min(sides) > _LARGEST_MATRIX and dtype.kind in "fiu":
             maps.append(name)
     maps_named_depth = [name for name in maps if name in named_depth]
-    # Without a map, an array that is named depth, or the only one, is chosen, too: it is a stack of
-    # maps, say, which is refused later with its shape.
+    # Without a map, an array that is named as depth, or the only one, is chosen, too: it is a stack
+    # of maps, say, which is refused later with its shape.
     only_one = eligible if len(arrays) == 1 else []
     candidates = maps_named_depth or maps or named_depth or only_one
     if len(candidates) == 1:
@@ -226,7 +234,7 @@ def _holds_depth(path: Path, data: bytes, kind: str) -> bool:
         return mode.startswith("I;16") or (kind == "TIFF" and mode in ("F", "I"))
 
 
-def _load_picture(path: Path, kind: str) -> DepthFile:
+def _load_grey_picture(path: Path, kind: str) -> DepthFile:
     """The levels (H, W) of a grey picture, of 8 or 16 bits.
 
     Args:

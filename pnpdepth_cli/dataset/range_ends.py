@@ -58,7 +58,7 @@ _NEXT = 10
 class _End(NamedTuple):
     """What lies at one end of a range of numbers, which are depths or 1/depths."""
 
-    is_no_surface: Mask  # (N,) which of the numbers are of no surface; none, if the end is one
+    is_no_surface: Mask  # (N,) which numbers are of no surface; none of them if the end is one
     value: float  # the extreme number; 0 if the end is a surface
     reach: float  # number that 98 % of the others do not exceed; 0 if it is a surface
 
@@ -156,8 +156,8 @@ def _upper_end(numbers: Floats, rare: float) -> _End:
 
     Args:
         numbers: Depths, or 1/depths.
-        rare: Number beyond which surfaces are rare. One that many share exactly is none there, if
-            it is beyond all others.
+        rare: Number beyond which surfaces are rare. Numbers beyond it that are exactly the same are
+            no surface even where they are not far above all others.
     """
     surface = _End(np.zeros(len(numbers), bool), 0.0, 0.0)
     if len(numbers) < _FEW:
@@ -193,8 +193,8 @@ def _upper_end(numbers: Floats, rare: float) -> _End:
 def _usual_numbers(numbers: Floats, is_alike: Mask, least_count: float) -> Floats:
     """The numbers (M,) that are not at the end, and have no value that many share either.
 
-    Values that many share are left in if most of the others have one, or if there are many of them,
-    as in a drawing.
+    Shared values are left in where there are many of them or few different values, as in a drawing,
+    and where most of the numbers have one.
 
     Args:
         numbers: (N,) all numbers.
@@ -202,13 +202,13 @@ def _usual_numbers(numbers: Floats, is_alike: Mask, least_count: float) -> Float
         least_count: How many have a value that many share, at least.
     """
     others = numbers[~is_alike]
-    distinct, place, counts = np.unique(
+    distinct, index_of_value, counts = np.unique(
         numbers.astype(np.float32), return_inverse=True, return_counts=True
     )
     is_shared = counts >= least_count
     if len(distinct) < _FEW_VALUES or np.count_nonzero(is_shared) > _FEW:
         return others
-    unshared = numbers[~(is_alike | is_shared[place])]
+    unshared = numbers[~(is_alike | is_shared[index_of_value])]
     if not unshared.size or unshared.size < len(others) / 2:
         return others
     return unshared

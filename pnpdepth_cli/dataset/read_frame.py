@@ -240,7 +240,7 @@ def _camera_of(
 
 
 def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -> Points:
-    """The points of the used part of another frame of the sequence, as reading it gives them.
+    """The points of another frame of the sequence, in the part of it that is used.
 
     Args:
         files: The files of the other frame.
@@ -252,7 +252,8 @@ def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -
         stored = read_stored_frame(files, options)
         truth = read_ground_truth(files, options, stored)
         return sample_truth(files, options, stored.rgb, truth, seed).points
-    # Of its other files, nothing is needed but whether a scale is of the ground truth's integers.
+    # Of its other files only the ground truth may matter: `--depth-scale` is of its integers alone
+    # if it holds any.
     stored_truth = None
     if options.depth_scale is not None and files.gt is not None:
         stored_truth = stored_depth.read_stored_truth(files.gt, files.image)
@@ -262,6 +263,7 @@ def _points_of(files: FrameFiles, options: ReadOptions, size: Size, seed: int) -
         truth=stored_truth,
         sparse=stored_depth.read_stored_sparse(files.sparse, options.scan.over(files)),
     )
+    # How image and points belong together is not searched again.
     later = replace(files, is_first=False)
     return read_sparse_depth(later, options, stored, None, size, seed).points
 

@@ -39,11 +39,12 @@ def choose_camera(
         frames: Images (H, W, 3) in 0…1, each with a scan (N, 3) in the scanner's coordinates.
         topic: Topic of the images. Empty: they are of files, or their topic is not known.
     """
-    # The candidates, of which the first is meant by the topic or by the usual meaning.
-    cameras = {
-        name: Calibration(camera=camera, scanner=raw.scanner and of_raw @ raw.scanner)
-        for name, (camera, of_raw) in raw.rectified.items()
-    }
+    # The candidates. The first is the usual one: a rectified camera if the topic says so, else the
+    # raw one.
+    cameras = dict[str, Calibration]()
+    for name, (camera, pose_of_raw) in raw.rectified.items():
+        scanner = None if raw.scanner is None else pose_of_raw @ raw.scanner
+        cameras[name] = Calibration(camera=camera, scanner=scanner)
     candidates = cameras if "image_rect" in topic else {"K and distortion": raw} | cameras
     choice = next(iter(candidates))
     usual = candidates[choice]

@@ -62,26 +62,29 @@ def interpolation_warning(depth: NDArray[np.float32]) -> str | None:
 
 
 def _fraction_of_twice(depth: NDArray[np.float32]) -> float | None:
-    """The fraction of the pairs of known neighbours of which one is twice the other.
+    """The fraction of the pairs of neighbours, both known, in which one depth is twice the other.
 
-    None where these are as many as chance makes. Where neighbours are surfaces, no more have this
-    ratio than have one beside it. After a resize to half or a quarter, 0.5 to 38 % have it in 30
-    maps of seven sets, and 6 to 500 times as many as beside it. Before it, of 130 maps that have 5
-    times as many, none has it at more than 0.14 %.
+    None where these pairs are so few that chance explains them. Depths of surfaces have the ratio 2
+    no more often than a ratio a little below or above it. After a resize to half or a quarter, in
+    30 maps of seven sets, 0.5 to 38 % of the pairs have the ratio 2. They are 6 to 500 times as
+    many as those with a ratio a little off. Of maps that were not resized, 130 have 5 times as
+    many, but in none of these they are more than 0.14 % of the pairs.
 
     Args:
         depth: (H, W), 0 where unknown.
     """
+    # Neighbours in a row, then in a column.
     log_ratios = list[NDArray[np.float32]]()
     for first, second in ((depth[:, 1:], depth[:, :-1]), (depth[1:], depth[:-1])):
         are_known = (first > 0) & (second > 0)
         log_ratios.append(np.abs(np.log(first[are_known] / second[are_known])))
     off_twice = np.abs(np.concatenate(log_ratios) - np.log(np.float32(2)))
     twice = int(np.count_nonzero(off_twice < _NEAR_TWICE))
-    # The ratios beside 2 have two windows, below and above it, which are together twice as wide.
+    # Chance: as many pairs have a ratio a little off 2. These are counted on both sides of it, in
+    # windows that are together twice as wide, hence half of them.
     is_a_little_off = (off_twice > 2 * _NEAR_TWICE) & (off_twice < 4 * _NEAR_TWICE)
-    beside = np.count_nonzero(is_a_little_off) / 2
-    pairs = len(off_twice)
-    if twice < max(_FEWEST_TWICE, _LEAST_TWICE * pairs, _MORE_TWICE * beside):
+    by_chance = np.count_nonzero(is_a_little_off) / 2
+    pair_count = len(off_twice)
+    if twice < max(_FEWEST_TWICE, _LEAST_TWICE * pair_count, _MORE_TWICE * by_chance):
         return None
-    return twice / pairs
+    return twice / pair_count

@@ -1,9 +1,9 @@
-"""Whether a scan belongs to its image, and by which other reading it belongs better.
+"""Whether a scan belongs to its image, or would belong to it better if something was different.
 
-One score, `sensors.edge_fit`, judges all readings: the scan as it is, turned, moved along the
-camera's axis as by a difference of time, by other axes, another camera, a mirrored image, a
-calibration of another size. The verdict is one of three: nothing is said, or a reading that is
-better is named, or the two do not seem to fit. Nothing is moved.
+One score, `sensors.edge_fit`, judges the scan as it is and all alternatives: the scan turned, moved
+along the camera's axis as by a difference of time, by other axes, another camera, a mirrored image,
+a calibration of another size. The verdict is one of three: nothing is said, or an alternative that
+is better is named, or the two do not seem to fit. Nothing is moved.
 """
 
 from __future__ import annotations
@@ -83,11 +83,11 @@ _BY_CHANCE = 2.5
 
 
 class _Needed(NamedTuple):
-    """What another reading of the scan needs, at least, so that a person is told of it.
+    """What an alternative to the scan as it is needs, at least, so that a person is told of it.
 
-    The more readings of a kind there are, the better is the best of them by chance. All numbers are
-    from right and wrong inputs made of KITTI's frames for object detection and depth completion by
-    `benchmarks.scan_fit`, whose other frames report what comes of them.
+    The more alternatives of a kind there are, the better is the best of them by chance. All numbers
+    are from right and wrong inputs made of KITTI's frames for object detection and depth completion
+    by `benchmarks.scan_fit`, whose other frames report what comes of them.
     """
 
     score: float
@@ -103,7 +103,7 @@ _NEEDED = {
     "other": _Needed(score=4.5, more=1.5),
     "size": _Needed(score=4.5, more=1.5),
 }
-"""By the kind of reading."""
+"""By the kind of alternative."""
 _NEEDED_OF_FEW = {
     "turn": _Needed(score=7.0, more=4.5),
     "roll": _Needed(score=6.0, more=3.0),
@@ -115,15 +115,15 @@ _NEEDED_OF_FEW = {
 """The same of scans with fewer than `_MANY_JUMPS`."""
 
 
-class _Fit(NamedTuple):
-    """Another way to read the scan, such as turned, and how well it belongs to the image so."""
+class _Alternative(NamedTuple):
+    """An alternative to the scan as it is, such as the scan turned, and how well it fits."""
 
     kind: str
     """A key of `_NEEDED`."""
     score: float
-    """Standard deviations by chance."""
+    """How well it belongs to the image, in standard deviations by chance."""
     text: str
-    """What the reading is, as a line for a person ends."""
+    """What is different, as a line for a person ends."""
 
 
 def fit_warning(
@@ -135,6 +135,9 @@ def fit_warning(
     is_whole: bool = True,
 ) -> list[str]:
     """Returns a warning if the image's edges contradict how the scan is projected, or none.
+
+    They do if they meet the scan's jumps of depth clearly better with an alternative, such as the
+    scan turned, or no better than by chance.
 
     Args:
         scan: (N, 3) metres in the scanner's coordinates.
@@ -148,26 +151,26 @@ def fit_warning(
     # Too few jumps of depth tell nothing.
     size = (rgb.shape[0], rgb.shape[1])
     jumps = _jumps(scan, calibration, size)
-    if jumps is None or jumps.clear < (_SOME_JUMPS if is_whole else _MANY_JUMPS):
+    fewest_jumps = _SOME_JUMPS if is_whole else _MANY_JUMPS
+    if jumps is None or jumps.clear < fewest_jumps:
         return []
-    # Readings that are clearly better than the scan as it is.
+    # Alternatives that fit well, and clearly better than the scan as it is.
     judge = _Judge(rgb, calibration.camera, jumps)
-    readings = list(_readings(judge, scan, calibration, others, size))
-    needed = _NEEDED if jumps.clear >= _MANY_JUMPS else _NEEDED_OF_FEW
-    better = [
-        reading
-        for reading in readings
-        if reading.score >= needed[reading.kind].score
-        and reading.score >= judge.score_as_it_is + needed[reading.kind].more
-    ]
+    needed_by_kind = _NEEDED if jumps.clear >= _MANY_JUMPS else _NEEDED_OF_FEW
+    better = list[_Alternative]()
+    for alternative in _alternatives(judge, scan, calibration, others, size):
+        needed = needed_by_kind[alternative.kind]
+        least_score = max(needed.score, judge.score_as_it_is + needed.more)
+        if alternative.score >= least_score:
+            better.append(alternative)
     if better:
-        best = max(better, key=lambda reading: reading.score)
+        best = max(better, key=lambda alternative: alternative.score)
         return [
             "warning: the image's edges meet the scan's jumps of depth better"
             f" {best.text}: {best.score:.1f} standard deviations above chance instead of"
             f" {judge.score_as_it_is:.1f}; check calibration and times"
         ]
-    # None is, and the scan as it is fits no better than by chance.
+    # No alternative is better, and the scan as it is fits no better than by chance.
     if is_whole and judge.score_as_it_is < _BY_CHANCE and jumps.clear >= _MANY_JUMPS:
         return [
             "warning: the image's edges do not meet the scan's jumps of depth"
@@ -179,9 +182,10 @@ def fit_warning(
 
 
 class _Judge:
-    """Scores of other readings of one scan, in standard deviations by chance.
+    """How well one scan, moved by a pose, belongs to its image.
 
-    A pose is (4,): degrees about the camera's x, y and z, and metres ahead.
+    Scores are in standard deviations by chance. A pose is (4,): degrees about the camera's x, y and
+    z, and metres ahead.
     """
 
     def __init__(self, rgb: NDArray[np.float32], camera: Camera, jumps: Jumps) -> None:
@@ -212,20 +216,20 @@ class _Judge:
         return (self.edges.score(xy, weights) - self.chance) / self.spread
 
     def of_pose(self, pose: Floats) -> float:
-        """The score of the scan moved to a pose (4,)."""
+        """The score of the scan moved by a pose (4,)."""
         xy, weights = _at_pose(self.jumps, pose).projected(self.camera)
         return self.of_pixels(xy, weights)
 
     def of_pose_coarsely(self, pose: Floats) -> float:
-        """The score of the scan moved to a pose (4,), by its largest jumps alone: a quick one."""
+        """As `of_pose`, by the largest jumps of depth alone: quick, for the search."""
         xy, weights = _at_pose(self.largest_jumps, pose).projected(self.camera)
         return self.of_pixels(xy, weights)
 
     def climb(self, start: Floats, steps: Floats) -> tuple[float, Floats]:
-        """The best score around a pose (4,), and its pose, which the largest jumps find.
+        """The best pose (4,) around another, which the largest jumps find, after its score.
 
         Args:
-            start: The pose.
+            start: Pose (4,) from which the search begins.
             steps: Steps (4,) of its coordinates; one of 0 stays as it is.
         """
         _, pose = _climb(self.of_pose_coarsely, start, steps)
@@ -254,9 +258,11 @@ def _at_pose(jumps: Jumps, pose: Floats) -> Jumps:
 def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tuple[float, Floats]:
     """The highest score around a place (K,), coordinate by coordinate; and where it is, (K,).
 
+    The search ends where no step raises the score, or after `_ROUNDS` of all coordinates.
+
     Args:
         score: Function of a place that is to be high.
-        start: The place.
+        start: Place from which the search begins.
         steps: Steps (K,) of its coordinates; one of 0 stays as it is.
     """
     best_score = score(start)
@@ -279,14 +285,14 @@ def _climb(score: Callable[[Floats], float], start: Floats, steps: Floats) -> tu
     return best_score, best
 
 
-def _readings(
+def _alternatives(
     judge: _Judge,
     scan: NDArray[np.floating],
     calibration: Calibration,
     others: Mapping[str, Calibration],
     size: Size,
-) -> Iterator[_Fit]:
-    """Yields the readings but the scan as it is, with their scores.
+) -> Iterator[_Alternative]:
+    """Yields the alternatives to the scan as it is, with their scores.
 
     Args:
         judge: Scores of the scan.
@@ -298,14 +304,14 @@ def _readings(
     yield from _turned(judge)
     yield from _rolled(judge)
     yield from _of_another_time(judge)
-    if judge.score_as_it_is >= _GOOD:
+    if judge.score_as_it_is >= _GOOD:  # its axes and its camera are right
         return
     yield from _mirrored(judge, size)
     # The scan by other axes and cameras, whose points have other jumps.
-    for text, reading in _other_readings(calibration, others).items():
-        jumps = _jumps(scan, reading, size)
+    for text, other in _other_calibrations(calibration, others).items():
+        jumps = _jumps(scan, other, size)
         if jumps is not None:
-            yield _Fit("other", judge.of_pixels(*jumps.projected(reading.camera)), text)
+            yield _Alternative("other", judge.of_pixels(*jumps.projected(other.camera)), text)
     # The calibration of an image that was resized.
     resized, factor = _resized(calibration, size)
     jumps = None if resized is None else _jumps(scan, resized, size)
@@ -316,10 +322,10 @@ def _readings(
         best = int(np.argmax(scores))
         factor *= float(_AROUND_FACTOR[best])
         text = f"with the intrinsics × {factor:.3g}, as of an image that was resized"
-        yield _Fit("size", scores[best], text)
+        yield _Alternative("size", scores[best], text)
 
 
-def _turned(judge: _Judge) -> Iterator[_Fit]:
+def _turned(judge: _Judge) -> Iterator[_Alternative]:
     """Yields the best turns about the camera's x and y, which are shifts of the image at first."""
     # The angles of all shifts, whose middle is no shift: (rows, 1) down and (1, columns) right.
     focal_x_px = float(judge.camera.intrinsics[0, 0])
@@ -349,10 +355,10 @@ def _turned(judge: _Judge) -> Iterator[_Fit]:
                 f"with the extrinsics turned by {pose[0]:.1f}° about the camera's x,"
                 f" {pose[1]:.1f}° about y and {pose[2]:.1f}° about its axis"
             )
-            yield _Fit("turn", best, text)
+            yield _Alternative("turn", best, text)
 
 
-def _rolled(judge: _Judge) -> Iterator[_Fit]:
+def _rolled(judge: _Judge) -> Iterator[_Alternative]:
     """Yields the best turn about the camera's axis, unless it is small."""
     # Turns of the scan as it is, and of the best pose that its calibration may mean.
     angles = np.arange(_LEAST_TURN_DEG, _MOST_ROLL_DEG + 0.1, _ROLL_STEP_DEG)
@@ -366,10 +372,12 @@ def _rolled(judge: _Judge) -> Iterator[_Fit]:
     # Around the best of these.
     best, pose = judge.climb(start, _ROLL_STEPS)
     if abs(pose[2]) >= _LEAST_TURN_DEG:
-        yield _Fit("roll", best, f"with the extrinsics turned by {pose[2]:.1f}° about its axis")
+        yield _Alternative(
+            "roll", best, f"with the extrinsics turned by {pose[2]:.1f}° about its axis"
+        )
 
 
-def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
+def _of_another_time(judge: _Judge) -> Iterator[_Alternative]:
     """Yields the best way along the camera's axis, unless it is short."""
     # Ways of the scan as it is, and of the best pose that its calibration may mean.
     ways = np.arange(_LEAST_AHEAD_M, _MOST_AHEAD_M + 0.1, _AHEAD_STEP_M)
@@ -385,10 +393,10 @@ def _of_another_time(judge: _Judge) -> Iterator[_Fit]:
     if abs(pose[3]) >= _LEAST_AHEAD_M:
         where = "ahead" if pose[3] > 0 else "back"
         text = f"{abs(pose[3]):.1f} m {where}, as if the scan was of another time than the image"
-        yield _Fit("late", best, text)
+        yield _Alternative("late", best, text)
 
 
-def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
+def _mirrored(judge: _Judge, size: Size) -> Iterator[_Alternative]:
     """Yields the image mirrored and turned, as EXIF says or as rows are stored.
 
     The points are put where the mirrored image has them. Their weights are x·x, y·y and x·y of the
@@ -403,7 +411,7 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     from_bottom = height - 1 - y
     # What keeps the image's size.
     mirrored = weights * np.array([1, 1, -1])
-    readings = [
+    mirrors = [
         ("with the image mirrored", np.column_stack([from_right, y]), mirrored),
         ("with the image's rows in reverse", np.column_stack([x, from_bottom]), mirrored),
         ("with the image turned by 180°", np.column_stack([from_right, from_bottom]), weights),
@@ -412,7 +420,7 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
     if height == width:
         exchanged = weights[:, [1, 0, 2]]
         turned = exchanged * np.array([1, 1, -1])
-        readings += [
+        mirrors += [
             ("with the image's rows and columns exchanged", np.column_stack([y, x]), exchanged),
             ("with the image turned by 90°", np.column_stack([y, from_right]), turned),
             ("with the image turned by -90°", np.column_stack([from_bottom, x]), turned),
@@ -422,8 +430,8 @@ def _mirrored(judge: _Judge, size: Size) -> Iterator[_Fit]:
                 exchanged,
             ),
         ]
-    for text, pixels, pixel_weights in readings:
-        yield _Fit("mirror", judge.of_pixels(pixels, pixel_weights), text)
+    for text, pixels, pixel_weights in mirrors:
+        yield _Alternative("mirror", judge.of_pixels(pixels, pixel_weights), text)
 
 
 def _resized(calibration: Calibration, size: Size) -> tuple[Calibration | None, float]:
@@ -456,7 +464,7 @@ def _resized(calibration: Calibration, size: Size) -> tuple[Calibration | None, 
     ), factor
 
 
-def _other_readings(
+def _other_calibrations(
     calibration: Calibration, others: Mapping[str, Calibration]
 ) -> dict[str, Calibration]:
     """Other calibrations by which the scan may have to be projected, by words for a person.
@@ -468,7 +476,7 @@ def _other_readings(
         others: Further calibrations, by words for a person.
     """
     scanner = calibration.known_scanner
-    readings = {"with the extrinsics inverted": replace(calibration, scanner=scanner.inverse())}
+    calibrations = {"with the extrinsics inverted": replace(calibration, scanner=scanner.inverse())}
     for text, matrix in (
         ("with x of the scan negated", np.diag([-1.0, 1.0, 1.0])),
         (
@@ -480,14 +488,14 @@ def _other_readings(
         ("with the scan turned by 180° about z", np.diag([-1.0, -1.0, 1.0])),
     ):
         other_axes = Extrinsics(np.asarray(matrix, np.float64), np.zeros(3))
-        readings[text] = replace(calibration, scanner=scanner @ other_axes)
-    return readings | dict(others)
+        calibrations[text] = replace(calibration, scanner=scanner @ other_axes)
+    return calibrations | dict(others)
 
 
-def points_by_reading(
+def points_by_alternative(
     scan: NDArray[np.floating], calibration: Calibration, size: Size
 ) -> dict[str, int]:
-    """Returns how many points of a scan are in the image if the scan has other axes.
+    """Returns how many points of a scan are in the image if its axes or its pose are different.
 
     The counts are by words for a person, such as "with z of the scan negated".
 
@@ -497,13 +505,13 @@ def points_by_reading(
         size: (H, W) of the image.
     """
     counts = dict[str, int]()
-    for text, reading in _other_readings(calibration, {}).items():
-        xyz = reading.known_scanner.apply(scan)
-        seen, _ = points_in_image(xyz, reading.camera, size)
+    for text, other in _other_calibrations(calibration, {}).items():
+        xyz = other.known_scanner.apply(scan)
+        seen, _ = points_in_image(xyz, other.camera, size)
         counts[text] = len(seen)
     return counts
 
 
-def _jumps(scan: NDArray[np.floating], reading: Calibration, size: Size) -> Jumps | None:
-    """The jumps of depth of the scan (N, 3) that are in the image (H, W); None of too few."""
-    return jumps_of(scan, reading.camera, reading.known_scanner, size)
+def _jumps(scan: NDArray[np.floating], calibration: Calibration, size: Size) -> Jumps | None:
+    """The jumps of depth of a scan (N, 3) that are in the image (H, W); None if too few are."""
+    return jumps_of(scan, calibration.camera, calibration.known_scanner, size)

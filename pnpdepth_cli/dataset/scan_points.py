@@ -15,7 +15,7 @@ from pnpdepth_cli.camera import SAME_PLACE, Camera, Extrinsics
 from pnpdepth_cli.dataset.arrays import check_camera
 from pnpdepth_cli.dataset.frame_files import ScanOptions
 from pnpdepth_cli.dataset.rectified_camera import choose_camera
-from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_reading
+from pnpdepth_cli.dataset.scan_fit import fit_warning, points_by_alternative
 from pnpdepth_cli.dataset.scan_returns import cloud_points, has_scanner, scan_returns
 from pnpdepth_cli.dataset.sparse_depth import SparseDepth
 from pnpdepth_cli.errors import InputError, NoPointsError, UsageError
@@ -104,8 +104,9 @@ def read_scan_points(
             leaves that open. None: there is none.
         rgb: (H, W, 3) in 0…1, the image, if its file has been read.
         scale: Numbers of the scan per metre that the user or the data set states.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `plausible.OF_DATA_SET`. Empty: it is stated of these numbers.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `plausible.OF_DATA_SET`. Floats are then divided only where they
+            cannot be metres. Empty: it is stated for these very numbers.
         search: Whether it is searched how image and scan belong together.
 
     Raises:
@@ -178,7 +179,8 @@ def _read_cloud(
         path: The scan.
         calibration: Calibration with the pose of the scanner.
         scale: Numbers per metre that are stated. None: none are.
-        of_integers: Whose integers the scale is stated of; empty if it is stated of this scan.
+        of_integers: Where the integers are that `scale` is stated for, as `read_scan_points` has
+            it. Empty: it is stated for this scan.
     """
     stored, source = read_scan(path)
     if _is_of_scanner(calibration, stored):
@@ -230,7 +232,8 @@ def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occlud
         keep_occluded: Whether points stay that nearer ones hide from the camera.
 
     Raises:
-        NoPointsError: There is none. It names the axes of the scan by which there are some.
+        NoPointsError: There is none. It names the axes or the pose of the scan by which there would
+            be some.
     """
     try:
         return project_velodyne(
@@ -242,9 +245,9 @@ def _project(cloud: _Cloud, calibration: Calibration, size: Size, *, keep_occlud
             has_scanner=cloud.of_scanner,
         )
     except NoPointsError as error:
-        # The axes by which most points would be in the image.
-        counts = points_by_reading(cloud.xyz, calibration, size)
-        text = max(counts, key=lambda reading: counts[reading])
+        # The axes or the pose of the scan by which most points would be in the image.
+        counts = points_by_alternative(cloud.xyz, calibration, size)
+        text = max(counts, key=lambda alternative: counts[alternative])
         count = counts[text]
         if not count:
             raise

@@ -82,8 +82,9 @@ def scan_returns(
         path: Path or topic of the scan, for messages.
         xyz: (N, 3) in the scanner's coordinates, as they are stored.
         scale: Numbers per metre that the user or the data set states. None: nothing is stated.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `OF_DATA_SET`. Empty: it is stated of these very numbers.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `OF_DATA_SET`. Floats are then divided only where they cannot be
+            metres. Empty: it is stated for these very numbers.
 
     Raises:
         InputError: Many coordinates are none of a scan, or are implausible in metres.
@@ -125,7 +126,7 @@ def _rows_of_returns(
         xyz: (N, 3), as they are stored.
         stored_range: (N,) distances from the scanner, in the unit of `xyz`; coordinates that are
             not finite count as 0.
-        drops: Counter of the other points, by the reason.
+        drops: Counter of the other points, by the reason; they are added to it.
 
     Raises:
         InputError: Many coordinates are none of a scan.

@@ -151,15 +151,17 @@ def read_map_points(
         options: Options of reading, which say what happens to occluded points.
         size: (H, W) of the image. None: it is that of the map.
         scale: Numbers per metre that the user or the data set states. None: the file's own.
-        of_integers: Whose integers the scale is stated of, if not of these numbers: path of the
-            frame's other file, or `plausible.OF_DATA_SET`. Empty: it is stated of these numbers.
-        inverse: Depth × number of a file of disparity or 1/depth. None: it holds depth.
+        of_integers: Where the integers are that `scale` is stated for, if not here: path of the
+            frame's other file, or `plausible.OF_DATA_SET`. Floats are then divided only where they
+            cannot be metres. Empty: it is stated for these very numbers.
+        inverse: For a file of disparity or 1/depth, the constant that depth × number is: baseline ×
+            focal length in metres × pixels, or 1. None: the file holds depth.
 
     Raises:
         InputError: Its numbers are no depth of this image.
         NoPointsError: No point is left.
     """
-    # The points as they are stored, without far values.
+    # The points as they are stored, without extreme values that are no depth.
     path = stored.path
     points, reading = points_from_stored(path, stored.file, size=size, scale=scale)
     if inverse is not None:
@@ -182,18 +184,20 @@ def read_map_points(
         blurred = interpolation_warning(as_depth_image(points))
         if blurred is not None:
             lines.append(blurred)
-    # Points that the camera does not see go.
+    # Points that the camera does not see are dropped.
+    stored_depth = points.depth
     visible = _visible_points(points, options)
     lines += visible.notes
-    # The others must be pixels of the image. The unit is that of all points, also hidden ones.
-    stored_depth = points.depth
+    # The others must be pixels of the image. The unit is told by the depth of all, also of hidden
+    # ones.
     points = visible.points.resized(*size)
     is_inside, pixel_notes = check_pixels(path, points.xy, size)
     divisor, unit_notes = divisor_to_metres(
         stored_depth, reading, "sparse", "--depth-scale", scale, of_integers=of_integers
     )
     points = points.select(is_inside)
-    # Numbers whose kind is stated may grow downwards.
+    # Numbers that grow towards the bottom of the image may be disparity. What is known to be
+    # disparity or 1/depth has become depth above.
     if inverse is None:
         unit_notes += check_rows(points)
     return SparseDepth(
@@ -244,7 +248,7 @@ def _visible_points(points: Points, options: ReadOptions) -> _Visible:
 def depth_of_distances(sparse: SparseDepth, scan: ScanOptions, image: Path | None) -> SparseDepth:
     """Returns the points with depth z instead of their distances from the camera.
 
-    Points where the lens shows nothing go.
+    Points on pixels where the lens shows nothing are dropped.
 
     Args:
         sparse: Points whose depth is the distance from the camera.
@@ -376,8 +380,8 @@ def _points_in(model: ColmapModel, name: str, unit_scale: float) -> tuple[Points
     is_untracked = not len(rows)
     if is_untracked:
         rows = np.arange(len(points["number"]))
-    # Points of short tracks and with large reprojection errors go. Models of known poses may have
-    # points without any tracks.
+    # Points of short tracks and with large reprojection errors are dropped. Models of known poses
+    # may have points without any tracks; their tracks are not judged.
     total = len(rows)
     drops = DropCounter()
     least = min(_LEAST_TRACK, len(model.images))

@@ -96,20 +96,24 @@ def read_stored_truth(path: Path, image: ImageSource | None) -> StoredDepth:
 
     Args:
         path: The file.
-        image: The image. None: there is none. Depth without a header has its size (ETH3D).
+        image: The image, whose size a depth map without a header has, as in ETH3D. None: there is
+            none, and no such map.
 
     Raises:
         InputError: The file cannot be read.
     """
     if path.suffix.lower() in SCAN_ONLY_SUFFIXES:
         return StoredPoints(path=path, kind="scan")
-    return StoredNumbers(path=path, file=raw_depth(path, image) or load_stored(path))
+    depth_without_header = raw_depth(path, image)
+    if depth_without_header is not None:
+        return StoredNumbers(path=path, file=depth_without_header)
+    return StoredNumbers(path=path, file=load_stored(path))
 
 
 def is_float(stored: StoredDepth) -> bool:
     """Returns whether a file holds floats: a scan, or a map or list whose numbers are floats."""
     if isinstance(stored, StoredPoints):
-        return stored.kind == "scan"
+        return stored.kind == "scan"  # a COLMAP model is in a unit of its own
     return not holds_integers(stored.file)
 
 

@@ -72,8 +72,9 @@ def read_stored_frame(files: FrameFiles, options: ReadOptions) -> StoredFrame:
 
 
 def rgb_of_file(files: FrameFiles, stored: StoredFrame) -> NDArray[np.float32] | None:
-    """Returns the image (H, W, 3) in 0…1 whose edges a scan is compared with.
+    """Returns the image (H, W, 3) in 0…1 of a frame that has an image file of its own.
 
-    None without an image, and of a frame of a video, which is no file of its own.
+    None without an image, and for a frame of a video. A scan is compared with the edges of this
+    image.
     """
     return None if files.image_file is None else stored.rgb

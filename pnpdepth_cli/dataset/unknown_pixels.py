@@ -116,7 +116,10 @@ def _add_ends_of_codes(unknown: _Unknown, codes: NDArray[Any]) -> None:
 
 
 def _add_marks(unknown: _Unknown, values: Map) -> None:
-    """Adds the only number below 0; and 0, unless it is one of many numbers of both signs.
+    """Adds the pixels that hold a mark of unknown depth: the only number below 0, and 0.
+
+    0 is no mark where known numbers are of both signs, as logarithms are, unless it is far more
+    frequent than any other.
 
     Args:
         unknown: The unknown pixels, to which these are added.
@@ -126,25 +129,26 @@ def _add_marks(unknown: _Unknown, values: Map) -> None:
     below_zero = np.unique(known[known < 0])
     if len(below_zero) == 1 and known.max(initial=0) > 0:
         unknown.add(values == below_zero[0], f"{below_zero[0]:.6g}, the only number below 0")
-    # Between numbers of both signs, as of logarithms, 0 is a number as any other, unless it is far
-    # more frequent.
+    # What is known without that number: between both signs, 0 must be frequent to be a mark.
     known = unknown.known
     zeros = int(np.count_nonzero(known == 0))
     if zeros and known.min() < 0 < known.max():
         _, counts = np.unique(known[known != 0], return_counts=True)
-        if zeros < max(_FILLED * values.size, _MORE_ZEROS * int(counts.max())):
+        fewest_of_mark = max(_FILLED * values.size, _MORE_ZEROS * int(counts.max()))
+        if zeros < fewest_of_mark:
             return
     unknown.add(values == 0, "0")
 
 
 def _add_ends(unknown: _Unknown, values: Map) -> None:
-    """Adds extreme values of many pixels: the sky, a far plane, a clip, also of 1/disparity.
+    """Adds the pixels of extreme values that many share: the sky, a far plane, a clip.
 
     Args:
         unknown: The unknown pixels, to which these are added.
         values: (H, W) numbers by their scale.
     """
-    # About one value, far from all others and mixed with them at its edges.
+    # Many about one value far from all others, with mixtures of the two at the edges. The numbers
+    # may be depth or 1/depth, so the sky may be at either end.
     known = unknown.known.astype(np.float64)
     if known.min(initial=np.inf) > 0:
         is_known = ~unknown.mask
@@ -155,7 +159,7 @@ def _add_ends(unknown: _Unknown, values: Map) -> None:
             pixels = np.zeros(values.shape, bool)
             pixels[is_known] = end.is_no_surface
             unknown.add(pixels, f"about {end.value:.6g}, where {bound} {end.reach:.4g}")
-    # Exactly one value.
+    # Many of exactly one value.
     for value, _ in repeated_ends(unknown.known):
         name = "smallest" if value <= float(unknown.known.min()) else "largest"
         unknown.add(values == np.float32(value), f"{value:.6g} exactly, the {name} value")

@@ -177,7 +177,7 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
 
 @contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
-    """Lets one shard of a folder at a time into the block; the others wait for it."""
+    """Lets one process that writes to a folder at a time into the block; the others wait for it."""
     with _hold(folder / ".batch.summary.lock", timeout_s=-1):
         yield
 

@@ -209,24 +209,28 @@ def read_calibration(path: Path, camera: int | None = None) -> Calibration:
 
 
 def _values_of_json(path: Path) -> tuple[_Fields, str]:
-    """The values of a JSON file under the names of a plain file, and a name of its kind.
+    """The values of a JSON file, and a name of the file's kind for a person.
 
-    Record3D and Open3D write K by columns, and more than a camera, which is left out.
+    Files of Record3D and Open3D are known by the names in them. Only K and size of these are taken,
+    as they hold more than a camera. Any other file has all its values as they are.
+
+    Raises:
+        InputError: The file is no JSON, or K is not made of 9 numbers that a camera can have.
     """
     fields = _Fields(path, read_json(path))
     if set(_OF_RECORD3D) <= set(fields.values):
-        by_columns = fields.matrix("K")
+        by_columns = fields.matrix("K")  # so its transpose is K by rows
         size = [fields.values["w"], fields.values["h"]]
         return _Fields(path, {"K": by_columns.T, "size": size}), "Record3D's metadata"
     if set(_OF_OPEN3D) <= set(fields.values):
-        by_columns = fields.matrix("intrinsic_matrix")
+        by_columns = fields.matrix("intrinsic_matrix")  # so its transpose is K by rows
         size = [fields.values["width"], fields.values["height"]]
         return _Fields(path, {"K": by_columns.T, "size": size}), "Open3D's camera"
     return fields, "calibration"
 
 
 def _bare_numbers(path: Path, text: str) -> _Fields:
-    """K of a text of numbers alone; six are fx fy cx cy width height."""
+    """The values of a text of numbers alone: K; or K and the size, of fx fy cx cy width height."""
     numbers = numbers_in(text) or []
     if len(numbers) == 6:
         return _Fields(path, {"K": numbers[:4], "size": numbers[4:]})
@@ -286,7 +290,7 @@ def camera_in_yaml(path: Path, content: object, camera: int | None) -> Calibrati
 
 
 def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, Extrinsics]]:
-    """The possible cameras of rectified images, of which camera_info states the raw camera.
+    """The cameras that rectified images may have, where a ROS camera_info states the raw camera.
 
     ROS rectifies an image by R and P, and removes its distortion. No file says whether the poses of
     other sensors are in the coordinates of the rectified camera, as kitti2bag has it, or of the raw
@@ -322,6 +326,7 @@ def _rectified_cameras(fields: _Fields, raw: Camera) -> dict[str, tuple[Camera, 
         poses["P with its offset"] = Extrinsics(turn, offset)
     if is_turned:
         poses["P and R"] = Extrinsics(turn, np.zeros(3))
+    # In any case other sensors may refer to the rectified camera itself, unless it is the raw one.
     has_same_intrinsics = np.allclose(intrinsics, raw.intrinsics, atol=_SAME_INTRINSICS_PX)
     if not poses and has_same_intrinsics and not raw.distortion:
         return {}
@@ -404,10 +409,10 @@ def _kitti_folder(folder: Path, camera: int | None) -> Calibration:
 
 
 def _single_camera(fields: _Fields, camera: int | None, source: str) -> Calibration:
-    """The calibration of the one camera of a plain file, or of one of OpenCV, ROS or Kalibr.
+    """The calibration of one camera, and of the scanner beside it if its pose is among the values.
 
     Args:
-        fields: Values of the camera.
+        fields: Values of the camera, by the names of `_PLAIN`, or those of OpenCV, ROS or Kalibr.
         camera: Number that the user gave, of which such a file has none; None if none was given.
         source: Name of the file's kind, for a person.
 
@@ -445,7 +450,7 @@ def _single_camera(fields: _Fields, camera: int | None, source: str) -> Calibrat
         scanner = pose_of_matrix(path, "T_cam_lidar", pose_numbers)
     elif "R" in fields.values or "t" in fields.values:
         scanner = fields.pose("t")
-    # The size of the image.
+    # The size of the image; KITTI's files do not state it, but their intrinsics are known.
     sides = fields.numbers("size", "resolution", count=2, optional=True)
     if not sides:
         width = fields.numbers("image_width", "width", count=1, optional=True)

@@ -233,16 +233,22 @@ def _camera(path: Path, name: str, width: int, height: int, parameters: Sequence
 
 
 def _pose(numbers: Sequence[float] | Sequence[str]) -> Extrinsics:
-    """The pose of the model's coordinates in the camera's, of qw qx qy qz tx ty tz.
+    """The pose of the model's coordinates in the camera's, in model units.
+
+    Args:
+        numbers: qw qx qy qz tx ty tz. The quaternion need not be of length 1.
 
     Raises:
-        ValueError: A number is not finite, or the quaternion is so short or long that it is none.
+        ValueError: A number is not finite, or the quaternion is far too short or long to be one.
     """
-    quaternion, translation = np.split(np.array(numbers, np.float64), [4])
-    is_finite = np.isfinite(quaternion).all() and np.isfinite(translation).all()
-    shortest, longest = _QUATERNION_LENGTHS
-    if not is_finite or not shortest < np.linalg.norm(quaternion) < longest:
+    qw_to_tz = np.array(numbers, np.float64)
+    if not np.isfinite(qw_to_tz).all():
         raise ValueError("a pose that is not made of finite numbers")
+    quaternion, translation = np.split(qw_to_tz, [4])
+    shortest, longest = _QUATERNION_LENGTHS
+    length = np.linalg.norm(quaternion)
+    if not shortest < length < longest:
+        raise ValueError(f"a quaternion of length {length:.2g}")
     return Extrinsics(rotation_of(quaternion), translation)
 
 

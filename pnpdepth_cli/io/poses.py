@@ -135,9 +135,10 @@ def check_pose(path: Path, name: str, rotation: Floats, translation: Floats) -> 
         translation: Translation, which should be of a place on the earth.
 
     Raises:
-        InputError: The matrix is no rotation, or the translation is farther.
+        InputError: The matrix is no rotation, or the translation is `_FARTHEST_M` or more.
     """
     if not is_rotation(rotation):
+        # A mirror is told apart: the scan's axes are left-handed.
         if not np.linalg.det(rotation) > 0:
             raise InputError(
                 f"{path}: {name} is no rotation (determinant −1: a left-handed scan?); correct it"

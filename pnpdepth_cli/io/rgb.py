@@ -25,6 +25,7 @@ _PLAUSIBLE = (0.2, 50.0)
 _WHITE = 65535  # of 16 bits
 _BITS = (8, 10, 12, 14)  # of the numbers of cameras' sensors
 _BRIGHTEST_LIGHT = 1e9  # taken for infinite light in an EXR; white is 1
+_ON_ITS_SIDE = (5, 6, 7, 8)  # EXIF orientations of images whose rows and columns are exchanged
 _PNG_HEAD = 512  # bytes, in which a PNG states its bits
 _FRAMES_IN_MEMORY = 8
 """Frames of a video that are kept, as threads ask for them slightly out of order."""
@@ -134,7 +135,7 @@ def sizes_of(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     try:
         with Image.open(path) as image:
             width, height = image.size
-            is_on_its_side = images.orientation_of(image) >= 5
+            is_on_its_side = images.orientation_of(image) in _ON_ITS_SIDE
             upright = (width, height) if is_on_its_side else (height, width)
             return upright, (height, width)
     except (OSError, Image.DecompressionBombError):  # Pillow does not read it, such as an EXR
@@ -173,7 +174,8 @@ def _decode_16_bit(path: Path, data: bytes, kind: str) -> tuple[NDArray[np.float
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if pixels is None:
         raise damaged(path, kind, "cannot be decoded")
-    rgb = pixels[:, :, ::-1]
+    rgb = pixels[:, :, ::-1]  # OpenCV has B, G, R
+    # White is not 65535 where a camera stored fewer bits.
     white = _white_of(data, kind, int(rgb.max()))
     return np.asarray(np.divide(rgb, np.float32(white), dtype=np.float32)), float(white)
 
@@ -189,11 +191,12 @@ def _white_of(data: bytes, kind: str, largest: int) -> float:
         kind: "PNG" or "TIFF".
         largest: Largest number in the image.
     """
-    # The chunk sBIT of a PNG states the significant bits of each channel after its name.
+    # The chunk sBIT of a PNG states the significant bits of each channel after its name. Without
+    # it, the fewest bits that hold the largest number are tried.
     at = data.find(b"sBIT", 0, _PNG_HEAD) if kind == "PNG" else -1
-    stated_bits = _BITS if at < 0 else (data[at + 4],)
-    for bits in stated_bits:
-        # Numbers beyond the stated bits were scaled to 16; 0 and 1 alone tell nothing.
+    bits_to_try = _BITS if at < 0 else (data[at + 4],)
+    for bits in bits_to_try:
+        # Numbers beyond these bits were scaled to 16; 0 and 1 alone tell nothing.
         if 1 < largest < 2**bits <= _WHITE:
             return float(2**bits - 1)
     return float(_WHITE)
@@ -205,7 +208,7 @@ def _turn_upright(values: NDArray[np.float32], orientation: int) -> NDArray[np.f
     Any other number means that the image is upright already.
     """
     # Rows and columns are exchanged, then the rows reversed, then the columns.
-    if orientation in (5, 6, 7, 8):
+    if orientation in _ON_ITS_SIDE:
         values = values.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
@@ -293,8 +296,8 @@ def read_focal_length(path: Path, size: tuple[int, int]) -> tuple[float, str] | 
 def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     """Returns a frame of a video, (H, W, 3) float32 in 0..1, as it is stored: not turned.
 
-    Frames are decoded from the first on and the last ones stay in memory, so that frames that are
-    read in order are decoded once.
+    Frames are decoded from the first on, and the last `_FRAMES_IN_MEMORY` decoded ones stay in
+    memory. So frames that are read in order are decoded once.
 
     Args:
         path: The video, an MP4 or MOV file.
@@ -307,16 +310,18 @@ def read_video_frame(path: Path, index: int) -> NDArray[np.float32]:
     size_of_regular_file(path)
     mtime_ns = path.stat().st_mtime_ns
     with _VIDEO_LOCK:
+        # Pairs of number and pixels: of frames still to be decoded, and of those in memory.
         frames, decoded = _open_video(path, mtime_ns)
         # An earlier frame than those in memory is decoded from the beginning again.
         if decoded and index < decoded[0][0]:
             _open_video.cache_clear()
             frames, decoded = _open_video(path, mtime_ns)
-        while (bgr := dict(decoded).get(index)) is None:
+        while index not in dict(decoded):
             next_frame = next(frames, None)
             if next_frame is None:
                 raise InputError(f"{path} has no frame {index:,}; it ends before, or is cut short")
             decoded.append(next_frame)
+        bgr = dict(decoded)[index]
     return np.divide(bgr[:, :, ::-1], np.float32(255), dtype=np.float32)
 
 

@@ -253,7 +253,7 @@ def _decompress_rows(columns: list[Column], point_count: int, body: bytes) -> by
     """The body that a compressed PCD would have uncompressed, point after point.
 
     Args:
-        columns: Fields of a point, in their order.
+        columns: Name, NumPy type and count of numbers of each field of a point, in their order.
         point_count: Number of points that the header claims.
         body: The bytes after the header: two sizes, then all numbers of each field, compressed.
 
@@ -374,7 +374,7 @@ def _xyz(columns: list[Column], point_count: int, body: bytes, order: str | None
     """x y z (N, 3) of the points of a PCD or a PLY.
 
     Args:
-        columns: Fields of a point, in their order.
+        columns: Name, NumPy type and count of numbers of each field of a point, in their order.
         point_count: Number of points that the header claims.
         body: The bytes after the header, which may go on after the points.
         order: Byte order, "<" or ">", of binary numbers. None: the body is text, a line a point.
@@ -391,10 +391,12 @@ def _xyz(columns: list[Column], point_count: int, body: bytes, order: str | None
         return np.empty((0, 3), np.float32)
     if not 0 <= point_count * sum(counts) <= len(body):  # each number has a byte at least
         raise ValueError(f"it claims {point_count:,} points in {len(body):,} bytes")
-    # A row has a field f0, f1, … for each column, as names may occur twice.
+    # A row is an element of a structured array. Its fields are f0, f1, …, one for each column, as
+    # names of columns may occur twice. Numbers of a text are read as float64.
     fields = []
     for index, (_, kind, count) in enumerate(columns):
-        fields.append((f"f{index}", "f8" if order is None else order + kind, (count,)))
+        number_type = "f8" if order is None else order + kind
+        fields.append((f"f{index}", number_type, (count,)))
     layout = np.dtype(fields)
     if order is None:
         rows = np.loadtxt(io.BytesIO(body), layout, comments=None, ndmin=1, max_rows=point_count)
@@ -402,7 +404,9 @@ def _xyz(columns: list[Column], point_count: int, body: bytes, order: str | None
         rows = np.frombuffer(body, layout, min(point_count, len(body) // layout.itemsize))
     if len(rows) < point_count:
         raise ValueError(f"it is cut short: {len(rows):,} of {point_count:,} points")
-    return _first_columns(np.hstack([rows[f"f{names.index(name)}"] for name in "xyz"]))
+    # Each of x, y and z is one number, a field (N, 1).
+    xyz = [rows[f"f{names.index(name)}"] for name in "xyz"]
+    return _first_columns(np.hstack(xyz))
 
 
 def _parse_text(path: Path, data: bytes) -> tuple[Points, str]:

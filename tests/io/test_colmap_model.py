@@ -90,6 +90,8 @@ IMAGE = "1 1 0 0 0 0 0 0 1 a.png\n"
         ("cameras", "\n\n1 PINHOLE 64 48 1 2 3 x\n"),
         ("images", f"{IMAGE}5 5 -1\n\n{IMAGE}"),
         ("images", f"{IMAGE}5 5\n"),
+        ("images", "1 nan 0 0 0 0 0 0 1 a.png\n\n"),
+        ("images", "1 0 0 0 0 0 0 0 1 a.png\n\n"),
         ("points3D", "# x\n7 1 2 3 9 8 7 0.5 1\n"),
     ],
 )

@@ -129,6 +129,15 @@ def test_the_exif_orientation_is_told(orientation: int, tmp_path: Path) -> None:
     assert orientation_in(tmp_path / "a.png") == 1
 
 
+def test_an_exif_orientation_that_does_not_exist_turns_no_image(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    exif = Image.Exif()
+    exif[274] = 9
+    Image.new("RGB", (8, 4)).save(path, exif=exif)
+    assert read_rgb(path).values.shape == (4, 8, 3)
+    assert sizes_of(path) == ((4, 8), (4, 8))
+
+
 def test_the_orientation_of_an_exr_which_has_no_exif_is_upright(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     path.write_bytes(b"\x76\x2f\x31\x01")  # how an EXR begins

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from pnpdepth_cli.choices import LAYOUTS
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, check_path
-from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, layout_of_folders
+from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, as_it_is, layout_of_folders
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.file_bytes import read_bytes
 
@@ -39,11 +39,15 @@ def _name_with_place(mark: str) -> Callable[[Path, Path, str], str]:
 
 
 def _test_frames_of(place: Path) -> Finish:
-    """The function that keeps the frames of VOID's test split, or all where no split is listed."""
+    """The function that keeps the frames of VOID's test split, or all where no split is listed.
+
+    Args:
+        place: Folder of one sequence of VOID, data/SEQUENCE, with test_image.txt beside data/.
+    """
     split = place.parent.parent / "test_image.txt"
     if place.parent.name != "data" or not split.is_file():
-        return replace
-    # The split lists images as .../SEQUENCE/image/STEM.png; a place is one sequence.
+        return as_it_is
+    # The split lists images of all sequences as .../SEQUENCE/image/STEM.png.
     words = read_bytes(split).decode("utf-8", "replace").split()
     stems = {path.stem for path in map(Path, words) if path.parts[-3:-2] == (place.name,)}
 
@@ -184,7 +188,7 @@ def list_frames(root: Path, name: str | None = None) -> DataSet:
     frames = list[FrameFiles]()
     unmatched = dict[Unmatched, None]()  # in their order, each once
     for folder, entry in entries:
-        if isinstance(entry, tuple):
+        if isinstance(entry, tuple):  # a file of no frame, and why
             unmatched[entry] = None
         elif folder == root:
             frames.append(entry)

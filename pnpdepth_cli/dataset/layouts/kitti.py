@@ -21,7 +21,14 @@ from pathlib import Path
 
 from pnpdepth_cli.camera import Extrinsics
 from pnpdepth_cli.dataset.frame_files import FrameFiles, Unmatched, as_pose, file_of
-from pnpdepth_cli.dataset.layouts.layout import Finish, Layout, Part, join_parts, layout_of_folders
+from pnpdepth_cli.dataset.layouts.layout import (
+    Finish,
+    Layout,
+    Part,
+    as_it_is,
+    join_parts,
+    layout_of_folders,
+)
 from pnpdepth_cli.errors import InputError
 from pnpdepth_cli.io.calibration import read_calibration, read_inertial_pose
 from pnpdepth_cli.io.poses import read_oxts, read_poses
@@ -53,7 +60,7 @@ def _poses_of_sequence(place: Path) -> Finish:
     folder = place.absolute()  # the parents of "." are in its absolute path
     path = folder.parents[1] / "poses" / f"{folder.name}.txt"
     if not path.is_file():
-        return replace
+        return as_it_is
     poses = [as_pose(pose) for pose in read_poses(path)]
 
     def with_pose(frame: FrameFiles) -> FrameFiles:
@@ -198,9 +205,12 @@ def _frames_of_raw(root: Path) -> Iterator[FrameFiles | Unmatched]:
         shared = FrameFiles(calib=calibration, gt_scale=256.0)
         entries = list(_frames_of_camera(drive, camera.name, parts, shared))
         frames = [entry for entry in entries if isinstance(entry, FrameFiles)]
-        posed = _with_poses_of_drive(drive, frames)
+        with_pose = _with_poses_of_drive(drive, frames)
         for entry in entries:
-            yield posed.get(entry, entry) if isinstance(entry, FrameFiles) else entry
+            if isinstance(entry, FrameFiles):
+                yield with_pose.get(entry, entry)
+            else:
+                yield entry  # a file of no frame, and why
 
 
 def _with_poses_of_drive(drive: Path, frames: Sequence[FrameFiles]) -> dict[FrameFiles, FrameFiles]:
@@ -243,7 +253,7 @@ def _frames_of_camera(
         shared: A frame whose fields all frames have.
     """
     for entry in join_parts(parts, replace(shared, camera=int(camera[-1]))):
-        if isinstance(entry, tuple):
+        if isinstance(entry, tuple):  # a file of no frame, and why
             yield entry
         else:
             yield replace(entry, name=f"{drive.name}_{entry.name}_{camera}")

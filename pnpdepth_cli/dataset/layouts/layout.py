@@ -63,6 +63,12 @@ class Layout:
 Finish = Callable[[FrameFiles], FrameFiles | None]
 """Returns a frame with further fields, such as its pose, or None for one that is not wanted."""
 
+
+def as_it_is(frame: FrameFiles) -> FrameFiles:
+    """Returns the frame itself: the `Finish` of frames that need no further fields."""
+    return frame
+
+
 Part = tuple[Path, str]
 """The folder of one part of a frame, such as its images, and a pattern of the names of its files.
 
@@ -105,11 +111,14 @@ def lacking(place: Path, needs: Iterable[str]) -> list[str]:
 
 
 def _files_of(part: Part) -> tuple[dict[str, Path], list[Unmatched]]:
-    """The files of a part by their stem, in natural order, and those that share a stem."""
+    """The files that a part names, by their stem in natural order; and those that share a stem.
+
+    Both are empty without the part's folder.
+    """
     folder, pattern = part
     stem, _, ending = pattern.removesuffix("?").rpartition(".")
     suffixes = _SUFFIXES.get(ending, (f".{ending}",))
-    if stem == "**":
+    if stem == "**":  # files in the folder and below, whose stem is their path
         return find_files(folder, suffixes)
     # A regular expression of the whole name, whose groups are the frame's stem.
     stem_pattern = stem if "(" in stem else re.escape(stem).replace(r"\*", "(.+)")
@@ -225,13 +234,17 @@ def layout_of_folders(
         return sorted(place for place in places if not lacking(place, needs))
 
     def frames(root: Path) -> Iterator[FrameFiles | Unmatched]:
-        """The frames of all places, and the files of no frame."""
+        """Yields the finished frames of all places below a root, and the files of no frame."""
         for place in find_places(root):
-            calibration = place / calib if calib and (place / calib).is_file() else None
-            finish = finish_of(place) if finish_of else replace
+            # What all frames of the place have.
+            has_calibration = bool(calib) and (place / calib).is_file()
+            calibration = place / calib if has_calibration else None
+            shared_in_place = replace(shared, calib=calibration)
+            # Its frames, which have only their stems as names at first.
+            finish = as_it_is if finish_of is None else finish_of(place)
             parts_of_place = {field: _part_in(place, text) for field, text in parts.items()}
-            for entry in join_parts(parts_of_place, replace(shared, calib=calibration)):
-                if isinstance(entry, tuple):
+            for entry in join_parts(parts_of_place, shared_in_place):
+                if isinstance(entry, tuple):  # a file of no frame, and why
                     yield entry
                     continue
                 frame = finish(entry)

@@ -62,7 +62,11 @@ class Bag:
     """Function of a message's bytes and the name of its type."""
 
     def topics(self, kinds: Sequence[str]) -> dict[str, int]:
-        """Returns the number of messages by topic, of topics with one of these message types."""
+        """Returns the number of messages by topic, of topics with one of these message types.
+
+        Raises:
+            InputError: The bag is damaged.
+        """
         with _as_our_errors(self.path):
             topics = sorted(self.reader.topics.items())
             return {name: int(topic.msgcount) for name, topic in topics if topic.msgtype in kinds}
@@ -72,6 +76,9 @@ class Bag:
 
         Args:
             topics: Names of topics; those that the bag does not have are ignored.
+
+        Raises:
+            InputError: The bag is damaged.
         """
         wanted = [
             connection for connection in self.reader.connections if connection.topic in topics

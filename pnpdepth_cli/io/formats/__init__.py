@@ -190,7 +190,7 @@ def _parse_header(path: Path, stream: io.BytesIO, kind: str) -> _Header:
     try:
         version = npy.read_magic(stream)
         read_header = _HEADERS[version]
-        with _LOCK:
+        with _LOCK:  # NumPy evaluates the header as Python, which threads must not do at once
             shape, is_fortran, dtype = read_header(stream)
         has_sizes = all(type(side) is int and 0 <= side <= sys.maxsize for side in shape)
         if not has_sizes or len(shape) > _MOST_AXES:
