@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from pnpdepth_cli.completion.image_registration import (
     ImageRegistration,
@@ -13,7 +15,7 @@ from pnpdepth_cli.completion.image_registration import (
 )
 from pnpdepth_cli.completion.registration_evidence import evidence
 from pnpdepth_cli.points import SparsePoints
-from tests.completion.unregistered import UNREGISTERED, frame
+from tests.completion.unregistered import SIZE, UNREGISTERED, frame
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -142,6 +144,28 @@ def test_depth_that_is_mirrored_or_turned_is_told_and_moves_nothing(
         assert known is not None
         assert said in str(better_orientation([known]))
         assert estimate_registration([known]) is None
+
+
+@pytest.mark.parametrize(
+    ("of_depth", "said"),
+    [
+        (lambda x, y, last: (y, last - x), "turned by 90°"),
+        (lambda x, y, last: (last - y, x), "turned by −90°"),
+        (lambda x, y, last: (y, x), "exchanged"),
+        (lambda x, y, last: (last - y, last - x), "exchanged, and turned by 180°"),
+    ],
+)
+def test_in_a_square_image_quarter_turns_and_exchanged_axes_are_told(
+    of_depth: Callable[[Tensor, Tensor, int], tuple[Tensor, Tensor]], said: str
+) -> None:
+    side = SIZE[0]
+    rgb, points = frame(0, None, 3000)
+    inside = points.select(points.xy[:, 0] < side)
+    x, y = inside.xy.unbind(dim=1)
+    xy = torch.stack(of_depth(x, y, side - 1), dim=1)
+    known = evidence(np.ascontiguousarray(rgb[:, :side]), replace(inside, xy=xy, size=(side, side)))
+    assert known is not None
+    assert str(better_orientation([known])).endswith(said)
 
 
 @pytest.mark.parametrize("count", [100, 500, 2000])
