@@ -352,9 +352,13 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
 
 
 def _has_kind(reading: str, kind: str) -> bool:
-    """Whether numbers taken for this (a reading) can be fitted by these parameters (a kind).
+    """Whether a network's output, read as this quantity, can be fitted by these parameters.
 
-    The inverse of a disparity, and a power, are fitted by scale and shift together, never by one.
+    As an inverted disparity or a power it is fitted by scale and shift together, not by one.
+
+    Args:
+        reading: The quantity, one of `choices.READINGS`.
+        kind: The parameters, one of `choices.FITS`.
     """
     return kind == "affine" or reading in ("depth", "disparity", "log")
 

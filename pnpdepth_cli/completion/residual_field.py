@@ -64,7 +64,7 @@ class ResidualField:
         return torch.isin(all_keys, outlier_keys).to(self.points.xy.device)
 
     def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
-        """Returns the residual (H, W) at every pixel, or (M,) at the coordinates of M points.
+        """Returns log measured − log predicted depth at every pixel, (H, W), or at M points, (M,).
 
         It is predicted from the points that are no outliers, and lies between their least and
         largest residual.
