@@ -248,8 +248,11 @@ class _Posterior(NamedTuple):
     """(columns,) shifts to the right in pixels of the image."""
 
     def mean(self) -> ImageRegistration:
-        """Returns the mean zoom and the mean shift, rounded to what is shown."""
-        probability = np.exp(self.logits - logsumexp(self.logits))
+        """Returns the mean zoom and the mean shift.
+
+        They are rounded to the decimals that are shown, so that what is shown is what was applied.
+        """
+        probability = np.exp(self.logits - logsumexp(self.logits))  # (zoom, down, right)
         return ImageRegistration(
             zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
             right=round(float(self.right @ probability.sum((0, 1))), 2),

@@ -286,7 +286,11 @@ class _Grid(NamedTuple):
         return self.number[(self.number >= 0) & ~is_inner]
 
     def squares(self, xy: Floats) -> _Squares:
-        """Returns which positions (M, 2) are in full squares, with corners and weights."""
+        """Returns which positions (M, 2) are in full squares, with corners and weights.
+
+        A square is full if there is a point at each of its corners.
+        """
+        # The square of each position, and how far it lies in that: 0…1, NaN outside the grid.
         column, right = _between(self.columns, xy[:, 0])
         row, down = _between(self.rows, xy[:, 1])
         inside = self.full[row, column] & ~np.isnan(right) & ~np.isnan(down)

@@ -45,12 +45,20 @@ class ResidualField:
 
     @functools.cached_property
     def at_points(self) -> Residuals:
-        """The residuals at the points. Raises NoPointsError if no point has a prediction."""
+        """The residuals at the points that have a prediction.
+
+        Raises:
+            NoPointsError: No point has one.
+        """
         return residuals_of(self.prediction, self.points, self._rgb)
 
     @functools.cached_property
     def at_inliers(self) -> Residuals:
-        """The residuals at the points that are no outliers; errors as of `at_points`."""
+        """The residuals at the points that are no outliers.
+
+        Raises:
+            NoPointsError: No point has a prediction.
+        """
         return outliers.without_outliers(self.at_points)
 
     @functools.cached_property

@@ -101,5 +101,6 @@ def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
     As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
     """
     _, number, count = np.unique(values, return_inverse=True, return_counts=True)
+    # Equal values have the ranks up to their cumulative count; the mean is in the middle of these.
     mean_rank = np.cumsum(count) - (count - 1) / 2
     return np.asarray(mean_rank[number], np.float64)

@@ -415,8 +415,8 @@ def trust(
     validation points change them.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points is that of `alone`, and none if it is twice that. Without validation
-    points it has none. Another one has what `trust_in_image` says.
+    the validation points, the residual not propagated, is that of `alone`, and none if it is twice
+    that. Without validation points it has none. Another one has what `trust_in_image` says.
 
     Args:
         network: The network, open.

@@ -160,10 +160,10 @@ def shares_on_lines(
 def _shares_of_scanner(
     experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The user's completion networks that have a weight beside the fused depth, as they fit.
+    """The user's completion networks that fit the points, with weights beside the fused depth.
 
-    A network fits if its error at the points, which it was given, is at most the error of the
-    experts' mean at the validation points, which they were not given.
+    A network fits if its error at all points, which it was given, is at most the error of the
+    experts' mean at the validation points, which they were not given. No share if none fits.
 
     Args:
         experts: The experts.
@@ -173,7 +173,7 @@ def _shares_of_scanner(
     of_scanner = [expert for expert in experts if expert.of_scanner]
     if not of_scanner:
         return []
-    # Those that fit the points that they were given.
+    # Those that fit the points that they were given, by mean absolute error in metres.
     mean = weighted_mean([(expert.at_validation, weights[expert.name]) for expert in experts])
     limit = split.error(mean)
     points = split.whole.points

@@ -106,7 +106,7 @@ class EdgeMap(NamedTuple):
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3), as of `Jumps.projected`.
+            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
         """
         height, width = self.strength.shape[:2]
         x, y = self._reduced(xy)
@@ -122,7 +122,7 @@ class EdgeMap(NamedTuple):
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3), as of `Jumps.projected`.
+            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
             reach_px: Largest shift to each side, down and right, in pixels of the full image.
         """
         height, width = self.strength.shape[:2]
@@ -172,7 +172,8 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
             2 * (across_x * across_y).sum(axis=2),
         ]
     )
-    # The strength of edges is relative to their surroundings.
+    # The strength of edges is relative to their surroundings; the square root lets
+    # a strong edge count less than in proportion.
     squared = products[:, :, 0] + products[:, :, 1] + _LEAST_SQUARE
     strength = np.sqrt(squared)
     relative = np.sqrt(strength / (_widely_blurred(strength, _SURROUNDINGS) + _DARK))

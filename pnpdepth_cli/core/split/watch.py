@@ -98,11 +98,11 @@ class Watch(TorchDispatchMode):
             self.protect(tensors)
 
     def note_injection(self, z: Tensor, original: Tensor | None) -> None:
-        """Notes that the network goes on with z.
+        """Notes that the cut layer gives z in place of its own output.
 
         Args:
-            z: What the cut layer gives.
-            original: Tensor of the network that z stands for; None if the layer did not run.
+            z: The tensor that it gives.
+            original: Its own output, for which z stands; None if the layer did not run.
         """
         self._touches += 1  # from here on the network reads z
         self._marked.add(storage_of(z))
