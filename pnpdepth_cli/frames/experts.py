@@ -104,11 +104,12 @@ class NetworkExpert(Expert):
     def dense(self) -> Tensor:
         """(H, W) metres, 0 = unknown: from all points, the residual not propagated.
 
-        With `mirrored` it is the mean of the depths of both frames, z updated.
+        With `mirrored` it is the mean of the depths of both frames.
         """
+        depth = _mix_with_aligned(self.whole, self.share_of_aligned)
         if self.mirrored is None:
-            return _mix_with_aligned(self.whole, self.share_of_aligned)
-        return weighted_mean([(self.whole.updated, 1), (self.mirrored, 1)])
+            return depth
+        return weighted_mean([(depth, 1), (self.mirrored, 1)])
 
 
 class Experts(NamedTuple):
@@ -495,7 +496,8 @@ def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, f
             frame = expert.frame
             if frame is not None and len(frame.points) < MIRRORED_BELOW:
                 turned = fusing.refine(frame.mirrored(), updates=frame.prior is None)
-                expert = replace(expert, mirrored=turned.updated.flip(-1))
+                depth = _mix_with_aligned(turned, expert.share_of_aligned)
+                expert = replace(expert, mirrored=depth.flip(-1))
         every.append(expert)
     return experts.replaced(every)
 
