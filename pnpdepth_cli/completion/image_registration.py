@@ -177,7 +177,12 @@ def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
 
 
 def _orientation_factor(frames: Sequence[Evidence], orient: _Orient) -> float:
-    """The log of the Bayes factor over chance of images that belong to their depth turned so."""
+    """The log of the Bayes factor, over chance, of images that belong to their turned depth.
+
+    Args:
+        frames: What single frames tell of their registration.
+        orient: Function that turns or mirrors positions in the image.
+    """
     maps = [replace(frame, between=orient(frame.between)).log_likelihood(1.0) for frame in frames]
     return _bayes_factor(frames, maps, _no_shift(maps[0]))
 

@@ -152,9 +152,12 @@ class Watch(TorchDispatchMode):
 
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
-        """Inside this context, `Tensor.numpy` and the like are seen while the module runs.
+        """Inside this context, values that reach Python by `Tensor.numpy` and the like are noted.
 
-        They are not in torch's fused layers (`_FUSED`), nor where escapes are not noted at all.
+        They are not noted in torch's fused layers (`_FUSED`), nor if the watch notes no escapes.
+
+        Args:
+            module: The submodule that runs inside the context.
         """
         seen_outside = self._sees_escapes
         is_fused = getattr(type(module), "forward", None) in _FUSED
