@@ -352,9 +352,13 @@ def where_predicted(prediction: Tensor, points: SparsePoints) -> tuple[Tensor, S
 
 
 def _has_kind(reading: str, kind: str) -> bool:
-    """Whether numbers taken for this (a reading) can be fitted by these parameters (a kind).
+    """Whether a network's output, read as this quantity, can be fitted by these parameters.
 
-    The inverse of a disparity, and a power, are fitted by scale and shift together, never by one.
+    As an inverted disparity or a power it is fitted by scale and shift together, not by one.
+
+    Args:
+        reading: The quantity, one of `choices.READINGS`.
+        kind: The parameters, one of `choices.FITS`.
     """
     return kind == "affine" or reading in ("depth", "disparity", "log")
 
@@ -383,7 +387,14 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
 
 
 def _level(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment:
-    """The best alignment whose scale is 0: depth is the same everywhere. Arguments as of `_fit`."""
+    """The best alignment whose scale is 0, so that depth is the same everywhere.
+
+    Args:
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+        candidate: The reading and the parameters; the reading is depth instead where it is of 1/x
+            or log x.
+    """
     # Of scale 0, a line in 1/x or log x says no more than one in x, and has no `_least_x`.
     is_in_x = _READINGS[candidate.reading].x_space == "depth"
     reading = candidate.reading if is_in_x else "depth"
@@ -395,7 +406,14 @@ def _level(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment:
 def _with_errors(
     x: Tensor, depth: Tensor, candidate: Candidate, line: tuple[float, float]
 ) -> Alignment:
-    """The alignment by the line (scale, shift), with the points' errors; the rest as of `_fit`."""
+    """The alignment by a line, with its errors at the points.
+
+    Args:
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+        candidate: The reading and the parameters.
+        line: (scale, shift).
+    """
     scale, shift = line
     nearest, farthest = _bounds(depth).tolist()
     fit = Alignment(
@@ -407,6 +425,7 @@ def _with_errors(
         points=len(x),
     )
     errors = (fit.depth(x).log() - depth.log()).abs()
+    # The error is that of the best points; what is far above the median is an outlier.
     best_errors = errors.sort().values[: max(1, round(_BEST * len(errors)))]
     least_outlying = max(_GROSS_STDS * MAD_TO_STD * float(errors.median()), _GROSS)
     return replace(
@@ -512,7 +531,13 @@ def _is_alike(fit: Alignment, best: Alignment, x: Tensor, depth: Tensor) -> bool
 
 
 def _relative_errors(fit: Alignment, x: Tensor, depth: Tensor) -> Tensor:
-    """(N,) the errors of log depth at the points, over their mean; arguments as of `_is_alike`."""
+    """(N,) the errors of log depth at the points, over their mean.
+
+    Args:
+        fit: The fit.
+        x: (N,) float64 the network's numbers at the points.
+        depth: (N,) float64 the points' depth in metres.
+    """
     errors = (fit.depth(x).log() - depth.log()).abs().clamp_max(MAX_ERROR)
     return errors / max(fit.misfit, _LEAST_ERROR)
 

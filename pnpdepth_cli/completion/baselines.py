@@ -76,7 +76,10 @@ def align_locally(points: SparsePoints, prediction: Tensor) -> Tensor:
 
 
 def _aligned(points: SparsePoints, prediction: Tensor, *, kind: str, reading: str) -> Tensor:
-    """The prediction aligned with the points, (H, W) metres; arguments as of `align_prediction`."""
+    """The prediction aligned with the points, (H, W) metres, 0 = unknown.
+
+    It is `align_prediction` with the arguments of a baseline, points first.
+    """
     return align_prediction(prediction, points, kind=kind, reading=reading)
 
 

@@ -209,12 +209,12 @@ def _folds_of_cells(
     else:
         cell = torch.arange(count)
     # Each point's position in a list that has cell after cell, the cells in random order.
-    order = torch.randperm(int(cell.max()) + 1, generator=generator)
+    rank_of_cell = torch.randperm(int(cell.max()) + 1, generator=generator)
     position = torch.empty(count, dtype=torch.long)
-    position[order[cell].argsort(stable=True)] = torch.arange(count)
+    position[rank_of_cell[cell].argsort(stable=True)] = torch.arange(count)
     # The list is cut into folds of equal length; a cell is in the fold of its first point.
-    first_position = torch.full((len(order),), count).scatter_reduce(0, cell, position, "amin")
-    return (first_position[cell] * folds // count).clamp_max(folds - 1)
+    first_position = torch.full_like(rank_of_cell, count).scatter_reduce(0, cell, position, "amin")
+    return first_position[cell] * folds // count
 
 
 def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> float:

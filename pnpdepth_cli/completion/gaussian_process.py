@@ -488,14 +488,17 @@ def _predict_blocks(residuals: Residuals, side: int, shift: int) -> tuple[Tensor
 
 
 def _block_side(points: SparsePoints) -> int:
-    """The largest side of blocks in pixels for which nearly no block has too many points.
+    """The largest side in pixels of square blocks nearly none of which is crowded.
 
-    A block has too many if it contains more than 1 / `_IN_BLOCK` of the points that predict it.
+    A block is predicted from the `NEIGHBOURS` points nearest to its middle. It is crowded if it
+    contains more points than that number / `_IN_BLOCK`. Crowded blocks may contain the fraction
+    `_CROWDED` of all points.
     """
     side = max(points.size)
     x, y = points.xy.unbind(1)
     while side > _MIN_BLOCK_PX:
         # How many points are in each block; there are never more columns of blocks than of pixels.
+        # Coordinates of the first pixel begin at −0.5, which belongs to the first block.
         row = (y / side).floor().clamp_min(0)
         column = (x / side).floor().clamp_min(0)
         count = torch.bincount((row * points.size[1] + column).long())

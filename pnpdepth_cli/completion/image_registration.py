@@ -177,7 +177,12 @@ def _orientations(size: tuple[int, int]) -> dict[str, _Orient]:
 
 
 def _orientation_factor(frames: Sequence[Evidence], orient: _Orient) -> float:
-    """The log of the Bayes factor over chance of images that belong to their depth turned so."""
+    """The log of the Bayes factor, over chance, of images that belong to their turned depth.
+
+    Args:
+        frames: What single frames tell of their registration.
+        orient: Function that turns or mirrors positions in the image.
+    """
     maps = [replace(frame, between=orient(frame.between)).log_likelihood(1.0) for frame in frames]
     return _bayes_factor(frames, maps, _no_shift(maps[0]))
 
@@ -248,8 +253,11 @@ class _Posterior(NamedTuple):
     """(columns,) shifts to the right in pixels of the image."""
 
     def mean(self) -> ImageRegistration:
-        """Returns the mean zoom and the mean shift, rounded to what is shown."""
-        probability = np.exp(self.logits - logsumexp(self.logits))
+        """Returns the mean zoom and the mean shift.
+
+        They are rounded to the decimals that are shown, so that what is shown is what was applied.
+        """
+        probability = np.exp(self.logits - logsumexp(self.logits))  # (zoom, down, right)
         return ImageRegistration(
             zoom=round(float(_ZOOMS @ probability.sum((1, 2))), 4),
             right=round(float(self.right @ probability.sum((0, 1))), 2),

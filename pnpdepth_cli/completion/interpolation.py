@@ -54,6 +54,8 @@ _NEIGHBOURS = WeakKeyDictionary[SparsePoints, Tensor]()
 def nearest(points: SparsePoints) -> Tensor:
     """Returns (H, W) float32 metres: at every pixel the depth of the point nearest in the image.
 
+    Of several points at the same coordinates the one of least depth counts.
+
     Raises:
         NoPointsError: There is no point.
     """
@@ -111,7 +113,11 @@ class Triangulation:
         """The last coordinates that `at` was given, and where they lie."""
 
     def dense(self, space: str = "depth") -> Tensor:
-        """Returns depth (H, W) float32 metres at every pixel, computed once for each space."""
+        """Returns depth (H, W) float32 metres at every pixel, computed once for each space.
+
+        Args:
+            space: Quantity of depth that is linear, one of `choices.SPACES`.
+        """
         if space not in self._dense:
             pixels = pixels_of(self._points.size).numpy()
             depth = self._depth(pixels, self._locate_pixels(), space)
@@ -122,6 +128,10 @@ class Triangulation:
         """Returns depth (M,) float32 metres at pixel coordinates (M, 2).
 
         Where the last coordinates lie is remembered, as several steps ask for the same ones.
+
+        Args:
+            xy: The coordinates.
+            space: Quantity of depth that is linear, one of `choices.SPACES`.
         """
         coordinates = xy.cpu().double().numpy()
         if self._last is None or self._last[0] is not xy:
@@ -276,7 +286,11 @@ class _Grid(NamedTuple):
         return self.number[(self.number >= 0) & ~is_inner]
 
     def squares(self, xy: Floats) -> _Squares:
-        """Returns which positions (M, 2) are in full squares, with corners and weights."""
+        """Returns which positions (M, 2) are in full squares, with corners and weights.
+
+        A square is full if there is a point at each of its corners.
+        """
+        # The square of each position, and how far it lies in that: 0…1, NaN outside the grid.
         column, right = _between(self.columns, xy[:, 0])
         row, down = _between(self.rows, xy[:, 1])
         inside = self.full[row, column] & ~np.isnan(right) & ~np.isnan(down)

@@ -158,7 +158,8 @@ def inlier_mask(residuals: Residuals) -> Tensor:
             deviations = errors[0].abs() / variances[0].sqrt()
             typical = max(MAD_TO_STD * float(deviations.median()), _MIN_ERROR)
             weight = _biweight(deviations / (cutoff * typical))
-    # Points of little weight are suspected, unless their neighbours are, too.
+    # Points of little weight are suspected. Where their neighbours are, too, they are inliers,
+    # which have at least the weight that tells the two apart.
     inliers = weight > _MIN_WEIGHT
     inliers = inliers | _suspected_together(residuals.points, ~inliers)
     weight = torch.where(inliers, weight.clamp_min(_MIN_WEIGHT), weight)

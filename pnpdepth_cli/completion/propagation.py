@@ -85,7 +85,15 @@ def _nodes(length: int, step: int) -> Tensor:
 def _lines_at(
     nodes: Tensor, points: SparsePoints, residual: Tensor, regressor: Tensor, inlier_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Shift and slope, (M,) each, of the lines around nodes (M, 2), x and y; see `local_lines`."""
+    """Shift and slope, (M,) each, of the line around each of M nodes, by weighted least squares.
+
+    Args:
+        nodes: (M, 2) pixel coordinates of the nodes, float64.
+        points: The N points.
+        residual: (N,) float64 quantity at the points that the lines give.
+        regressor: (N,) float64 quantity at the points over which the lines run.
+        inlier_weight: (N,) weight 0…1 of each point.
+    """
     distance, near = nearest_points(points, nodes, min(NEIGHBOURS, len(points)))
     closeness = distance.clamp_min(_AT_A_POINT_PX).pow(-POWER)
     weight = closeness * (inlier_weight[near] + _OUTLIER_WEIGHT)

@@ -147,7 +147,15 @@ class Evidence:
         return np.asarray(gains, np.float64)
 
     def _sample_likelihoods(self, zoom: float, right: int, down: int) -> Floats:
-        """(S,) the log likelihood of each sample by a registration; arguments as of `gain`."""
+        """(S,) the log likelihood of a registration by each sample; 0 for one outside the image.
+
+        It is the strength of the edge at the sample, times the sample's weight.
+
+        Args:
+            zoom: Zoom of the registration.
+            right: Shift to the right in pixels of the reduced image.
+            down: Shift downwards, likewise.
+        """
         rows, columns = self.edges.shape
         x, y = (self._zoomed_pixels(zoom) + np.array([right, down])).T
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)

@@ -45,12 +45,20 @@ class ResidualField:
 
     @functools.cached_property
     def at_points(self) -> Residuals:
-        """The residuals at the points. Raises NoPointsError if no point has a prediction."""
+        """The residuals at the points that have a prediction.
+
+        Raises:
+            NoPointsError: No point has one.
+        """
         return residuals_of(self.prediction, self.points, self._rgb)
 
     @functools.cached_property
     def at_inliers(self) -> Residuals:
-        """The residuals at the points that are no outliers; errors as of `at_points`."""
+        """The residuals at the points that are no outliers.
+
+        Raises:
+            NoPointsError: No point has a prediction.
+        """
         return outliers.without_outliers(self.at_points)
 
     @functools.cached_property
@@ -64,7 +72,7 @@ class ResidualField:
         return torch.isin(all_keys, outlier_keys).to(self.points.xy.device)
 
     def residual(self, queries: SparsePoints | None = None, *, kind: str = "gp") -> Tensor:
-        """Returns the residual (H, W) at every pixel, or (M,) at the coordinates of M points.
+        """Returns log measured − log predicted depth at every pixel, (H, W), or at M points, (M,).
 
         It is predicted from the points that are no outliers, and lies between their least and
         largest residual.

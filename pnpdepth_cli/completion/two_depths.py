@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MOST = 20_000
-"""Pairs that are compared; more tell no more."""
+"""Pairs that are compared, up to twice as many; more tell no more."""
+_QUANTILES = (0.16, 0.5, 0.84)
+"""Of normal values: one standard deviation below the mean, the mean, and one above."""
 FEWEST_PAIRS = 10
 """Fewer pairs decide nothing."""
 _CLEAR = 0.5
@@ -59,6 +61,8 @@ class Agreement(NamedTuple):
 def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) -> Agreement:
     """Returns the rank correlation of two depths, and the median and spread of their ratio.
 
+    Without pixels that both know, the rank correlation is 0, and median and spread are NaN.
+
     Args:
         first: Depths of any shape, not above 0 where unknown.
         second: The others, of the same shape and pixels.
@@ -67,12 +71,13 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
     pairs = np.stack([first[both], second[both]]).astype(np.float64)  # (2, N)
     count = pairs.shape[1]
     if not count:
-        return Agreement(0, 0.0, math.nan, math.nan)
+        return Agreement(pairs=0, rank=0.0, ratio=math.nan, spread=math.nan)
+    # Of many pairs every second, third, …
     compared = pairs[:, :: max(1, count // _MOST)]
     log_ratio = np.log(compared[0]) - np.log(compared[1])
-    low, middle, high = np.quantile(log_ratio, (0.16, 0.5, 0.84)).tolist()
+    low, middle, high = np.quantile(log_ratio, _QUANTILES).tolist()
     rank = rank_correlation(compared[0], compared[1])
-    return Agreement(count, rank, math.exp(middle), (high - low) / 2)
+    return Agreement(pairs=count, rank=rank, ratio=math.exp(middle), spread=(high - low) / 2)
 
 
 def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
@@ -96,5 +101,6 @@ def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
     As scipy.stats.rankdata gives them, whose import takes as long as all other imports of SciPy.
     """
     _, number, count = np.unique(values, return_inverse=True, return_counts=True)
+    # Equal values have the ranks up to their cumulative count; the mean is in the middle of these.
     mean_rank = np.cumsum(count) - (count - 1) / 2
     return np.asarray(mean_rank[number], np.float64)

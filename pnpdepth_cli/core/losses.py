@@ -49,24 +49,28 @@ def checked_loss(name: str) -> Loss:
 
 
 def l1(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean |p − d|, the paper's loss."""
+    """Mean |p − d| of predicted depth p and true depth d, (N,) metres: the paper's loss."""
     return (predicted - true).abs().mean()
 
 
 def l2(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean (p − d)²."""
+    """Mean (p − d)² of predicted depth p and true depth d, (N,) metres."""
     return (predicted - true).square().mean()
 
 
 def huber(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean of e²/2 for |e| ≤ 1 m and of |e| − 1/2 above, e = p − d (Huber)."""
+    """Mean of e²/2 for |e| ≤ 1 m and of |e| − 1/2 above (Huber).
+
+    e = p − d, of predicted depth p and true depth d, (N,) metres.
+    """
     return F.huber_loss(predicted, true)
 
 
 def berhu(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean of |e| up to c and of (e² + c²)/2c above, e = p − d, c = max|e|/5.
+    """Mean of |e| up to c and of (e² + c²)/2c above, c = max|e|/5.
 
-    The reverse Huber loss of Laina et al. 2016, equation 2.
+    e = p − d, of predicted depth p and true depth d, (N,) metres. The reverse Huber loss of Laina
+    et al. 2016, equation 2.
     """
     error = (predicted - true).abs()
     # Above 0 also where all errors are 0, because it is divided by.
@@ -75,11 +79,11 @@ def berhu(predicted: Tensor, true: Tensor) -> Tensor:
 
 
 def cauchy(predicted: Tensor, true: Tensor) -> Tensor:
-    """Mean c·log(1 + (e/c)²), e = log p − log d: robust to outliers.
+    """Mean c·log(1 + (e/c)²): robust to outliers.
 
-    c is the standard deviation of e, estimated robustly from the median of |e|, and at least
-    MIN_CAUCHY_SCALE, because smaller errors are not outliers. Errors far beyond c have little
-    influence.
+    e = log p − log d, of predicted depth p and true depth d, (N,) metres. c is the standard
+    deviation of e, estimated robustly from the median of |e|, and at least MIN_CAUCHY_SCALE,
+    because smaller errors are not outliers. Errors far beyond c have little influence.
     """
     error = predicted.clamp_min(MIN_DEPTH).log() - true.log()
     c = (MAD_TO_STD * error.detach().abs().median()).clamp_min(MIN_CAUCHY_SCALE)

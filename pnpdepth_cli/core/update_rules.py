@@ -36,7 +36,9 @@ def normalised() -> Update:
     """
 
     def update(gradient: Tensor) -> Tensor:
-        # Divided by the largest element first: squares of tiny gradients would underflow.
+        """The gradient, of any shape, divided by the root of its mean square."""
+        # Divided by the largest element first: squares of tiny gradients would underflow. A zero
+        # gradient is divided by `tiny`, so that it stays zero.
         largest = gradient.abs().max().clamp_min(torch.finfo(gradient.dtype).tiny)
         relative = gradient / largest
         return relative / relative.square().mean().sqrt().clamp_min(torch.finfo().tiny)
@@ -52,6 +54,7 @@ def momentum(decay: float = 0.9) -> Update:
     velocity: Tensor | None = None
 
     def update(gradient: Tensor) -> Tensor:
+        """The velocity v after this gradient, of the same shape."""
         nonlocal velocity
         velocity = gradient if velocity is None else decay * velocity + gradient
         return velocity
@@ -75,6 +78,7 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
     step = 0
 
     def update(gradient: Tensor) -> Tensor:
+        """The unbiased mean gradient over the root of the unbiased mean square, elementwise."""
         nonlocal mean, mean_square, step
         step += 1
         mean = (1 - beta1) * gradient + (0 if mean is None else beta1 * mean)

@@ -44,6 +44,8 @@ WITH_PRIOR = 0.45
 """Prior weight of `compact` with that network's depth as a prior. Without one it has the rest."""
 WITHOUT_IMAGE = 0.05
 """Prior weight of every expert that leaves the image out."""
+LEAST_WEIGHT = 1e-6
+"""A sum of weights is at least this before it is divided by."""
 DOUBT = 2.0
 """Standard errors by which the image lowers the error at the validation points, from which on no
 expert that leaves the image out joins."""
@@ -100,10 +102,14 @@ class NetworkExpert(Expert):
 
     @functools.cached_property
     def dense(self) -> Tensor:
-        """(H, W) metres, 0 = unknown: from all points, the residual not propagated."""
+        """(H, W) metres, 0 = unknown: from all points, the residual not propagated.
+
+        With `mirrored` it is the mean of the depths of both frames.
+        """
+        depth = _mix_with_aligned(self.whole, self.share_of_aligned)
         if self.mirrored is None:
-            return _mix_with_aligned(self.whole, self.share_of_aligned)
-        return weighted_mean([(self.whole.updated, 1), (self.mirrored, 1)])
+            return depth
+        return weighted_mean([(depth, 1), (self.mirrored, 1)])
 
 
 class Experts(NamedTuple):
@@ -150,9 +156,9 @@ def expert_of(
     updates: bool = True,
     unexplained: float = 1.0,
 ) -> NetworkExpert:
-    """Returns what one network predicts from all points, and without the validation points.
+    """Returns an expert: what one network predicts from all points, and without validation points.
 
-    The prior weight of the expert is still 0.
+    Its prior weight in the fused depth is still 0.
 
     Args:
         network: The network, open.
@@ -160,28 +166,29 @@ def expert_of(
         name: Name of the expert.
         prediction: What the network predicts from all points. None: it is computed.
         prior: Expert whose aligned depth the network takes as its prior. None: it takes none.
-        user: The user's network whose depth it is, or has as a prior.
-        updates: Whether z may be updated.
-        unexplained: What the network leaves unexplained, see `unexplained_by`.
+        user: The user's network, whose depth the expert has, or takes as its prior. None: neither.
+        updates: Whether z, the output of the cut layer, may be updated.
+        unexplained: Part of the points' depth that the network leaves unexplained, as returned by
+            `unexplained_by`; 1 for a network that takes points.
     """
     # The network predicts from all points; a prior is made from all points, too.
     whole = split.whole if prior is None else replace(split.whole, prior=prior.whole.aligned)
     if prediction is None:
         prediction = network.refine(whole, updates=updates)
-    # A strong network's depth is that before updates of z, unless the user states their number. A
-    # depth map has no z, so its two depths are one.
+    # The stronger a network is, the more of its depth is that before updates of z, unless the user
+    # states their number. Without updates the two depths are one.
     is_updated = network.settings.iterations > 0
     share_of_aligned = 0.0
     if is_updated and not network.always_updated:
         share_of_aligned = strength_of(unexplained)
-    nothing = split.points.depth[:0]  # the prediction without validation points, (0,)
+    no_depth = split.points.depth[:0]  # the prediction without validation points, (0,)
     expert = NetworkExpert(
         name=name,
-        at_validation=nothing,
-        updated_at_validation=nothing,
+        at_validation=no_depth,
+        updated_at_validation=no_depth,
         points=whole.points,
         whole=prediction,
-        kept=prediction,
+        kept=prediction,  # until it predicts without the validation points
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
@@ -409,8 +416,8 @@ def trust(
     validation points change them.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points is that of `alone`, and none if it is twice that. Without validation
-    points it has none. Another one has what `trust_in_image` says.
+    the validation points, the residual not propagated, is that of `alone`, and none if it is twice
+    that. Without validation points it has none. Another one has what `trust_in_image` says.
 
     Args:
         network: The network, open.
@@ -489,7 +496,8 @@ def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, f
             frame = expert.frame
             if frame is not None and len(frame.points) < MIRRORED_BELOW:
                 turned = fusing.refine(frame.mirrored(), updates=frame.prior is None)
-                expert = replace(expert, mirrored=turned.updated.flip(-1))
+                depth = _mix_with_aligned(turned, expert.share_of_aligned)
+                expert = replace(expert, mirrored=depth.flip(-1))
         every.append(expert)
     return experts.replaced(every)
 
@@ -510,4 +518,4 @@ def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
         weight_if_known = (depth > 0) * weight
         logarithm += weight_if_known * depth.clamp_min(torch.finfo(depth.dtype).tiny).log()
         total += weight_if_known
-    return torch.where(total > 0, (logarithm / total.clamp_min(1e-6)).exp(), 0.0)
+    return torch.where(total > 0, (logarithm / total.clamp_min(LEAST_WEIGHT)).exp(), 0.0)

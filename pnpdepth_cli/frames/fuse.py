@@ -50,7 +50,7 @@ def fit_weights(
     none. Where an expert predicts nothing, the others' mean stands for it.
 
     Args:
-        experts: The experts, of which one has a prior weight.
+        experts: The experts, at least one of which has a prior weight above 0.
         split: The frame and its validation points.
         chosen: (M,) bool, the validation points to fit. None: all.
     """
@@ -60,15 +60,16 @@ def fit_weights(
     fitted = prior
     is_chosen = torch.ones(len(split.points), dtype=torch.bool) if chosen is None else chosen
     if len(weighted) > 1 and bool(is_chosen.any()):
-        # Log predictions and log depths, relative to the prediction with the prior weights.
+        # Log predictions and log depths, relative to the prediction with the prior weights. An
+        # unknown prediction is put at that mean.
         of_experts = [expert.at_validation[is_chosen].double() for expert in weighted]
         mean = weighted_mean(list(zip(of_experts, prior.tolist(), strict=True)))
         centre = log_of(mean)
         predicted = torch.stack(of_experts, dim=1)
         offsets = torch.where(predicted > 0, log_of(predicted) - centre[:, None], 0.0)
         residual = log_of(split.points.depth.double()[is_chosen]) - centre
-        counts = split.weights[is_chosen].double()
-        fitted = _fit(prior, offsets.numpy(), residual.numpy(), counts.numpy())
+        point_weights = split.weights[is_chosen].double()
+        fitted = _fit(prior, offsets.numpy(), residual.numpy(), point_weights.numpy())
     # An expert without prior weight has none.
     weights = {expert.name: 0.0 for expert in experts}
     for expert, weight in zip(weighted, fitted, strict=True):
@@ -76,7 +77,7 @@ def fit_weights(
     return weights
 
 
-def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Floats:
+def _fit(prior: Floats, offsets: Floats, residual: Floats, point_weights: Floats) -> Floats:
     """Weights (E,) of E experts, >= 0, their sum 1, that fit the experts' depths to the points.
 
     `offsets @ weights` is close to `residual` by Huber's loss, and the weights are close to the
@@ -86,12 +87,12 @@ def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Fl
         prior: (E,) prior weights, all above 0, their sum 1.
         offsets: (M, E) log depth of each expert at each of M points, less a mean of the experts'.
         residual: (M,) measured log depth at the points, less the same mean.
-        counts: (M,) how much each point counts.
+        point_weights: (M,) how much each point counts.
     """
     from scipy.optimize import nnls
 
     # The residual from which on Huber's loss is linear: their standard deviation.
-    mean_size = float(np.average(np.abs(residual), weights=counts))
+    mean_size = float(np.average(np.abs(residual), weights=point_weights))
     scale = max(_STD_OF_MEAN * mean_size, _LEAST_STD)
     # The factor of the rows of the prior weights, so that they count as `STRENGTH` such residuals.
     ridge = np.sqrt(STRENGTH) * scale
@@ -100,7 +101,7 @@ def _fit(prior: Floats, offsets: Floats, residual: Floats, counts: Floats) -> Fl
     for _ in range(_PASSES):
         # Large residuals are weighed down.
         size = np.abs(residual - offsets @ fitted)
-        root = np.sqrt(counts * np.minimum(1, scale / np.maximum(size, _LEAST_SIZE)))
+        root = np.sqrt(point_weights * np.minimum(1, scale / np.maximum(size, _LEAST_SIZE)))
         # Rows of the least squares: the points, the prior weights, and the sum of 1.
         rows = [offsets * root[:, None], ridge * np.eye(len(prior)), sum_of_weights]
         targets = [residual * root, ridge * prior, [_SUM_WEIGHT]]
@@ -159,10 +160,10 @@ def shares_on_lines(
 def _shares_of_scanner(
     experts: Sequence[Expert], split: ValidatedFrame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """The user's completion networks that have a weight beside the fused depth, as they fit.
+    """The user's completion networks that fit the points, with weights beside the fused depth.
 
-    A network fits if its error at the points, which it was given, is at most the error of the
-    experts' mean at the validation points, which they were not given.
+    A network fits if its error at all points, which it was given, is at most the error of the
+    experts' mean at the validation points, which they were not given. No share if none fits.
 
     Args:
         experts: The experts.
@@ -172,7 +173,7 @@ def _shares_of_scanner(
     of_scanner = [expert for expert in experts if expert.of_scanner]
     if not of_scanner:
         return []
-    # Those that fit the points that they were given.
+    # Those that fit the points that they were given, by mean absolute error in metres.
     mean = weighted_mean([(expert.at_validation, weights[expert.name]) for expert in experts])
     limit = split.error(mean)
     points = split.whole.points

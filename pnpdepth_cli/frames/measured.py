@@ -46,7 +46,8 @@ def with_measured(refined: Refined) -> Refined:
 def with_note_on_measured(refined: Refined) -> Refined:
     """Returns a refined frame with a note on its measured pixels whose depth differs, if any does.
 
-    A pixel differs from `CHANGED_M` on. Only a frame whose points are a depth map has a note.
+    It differs if it changed by more than `CHANGED_M`. Only a frame whose points are a depth map has
+    a note.
     """
     points = refined.used
     height, width = points.size

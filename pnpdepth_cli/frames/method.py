@@ -115,7 +115,8 @@ class Method:
         asked: Settings that the user gives: the method, and values for its steps. Those of a step
             of the network are for the first network; the others have their own.
         first: The first frame, which decides what definitions leave open.
-        more: Function of further frames, which decide as well; called only if a network needs it.
+        more: Function that returns further frames, which decide as well; called only if a network
+            needs it. `tuple` returns none.
         validated: Whether the paper's method is validated, for which each frame is refined again.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         keep_measured: Whether the result has the points' own depth at their pixels.

@@ -291,7 +291,7 @@ def _at_full_size(
 def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """Returns the frame as the network takes it: resized, its points in the network's pixels.
 
-    The points may be none, if all lie outside what the network sees.
+    It has no points if all lie in what is cropped from the image for the network.
 
     Args:
         network: The network, whose definition says what it takes.
@@ -299,7 +299,7 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
 
     Raises:
         UsageError: The network needs an image or intrinsics, and the frame has none.
-        ModelError: The definition does not make arguments of it.
+        ModelError: The definition's function for the network's arguments fails.
     """
     to_network = FrameMap.fit(network.definition.size, *frame.size)
     image = network.image_of(to_network, None if frame.rgb is None else frame.rgb[None])
@@ -310,12 +310,15 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
     intrinsics = None if camera is None else to_network.intrinsics_to_network(camera)
 
     def arguments_for(points: SparsePoints) -> tuple[Tensor, ...]:
-        """The network's arguments for points in its pixels; for a stored depth map, that map."""
+        """The network's arguments for points in its pixels.
+
+        A stored depth map in place of a network has itself as its only argument.
+        """
         if network.definition.input_kind == "map":
             return (frame.predicted[network.definition.map_number][None, None],)
         return network.arguments_of(image, points, prior, intrinsics)
 
-    # A network that weighs its points takes the outliers, too.
+    # A network that weighs its points takes the outliers, too: it finds them itself.
     inliers = to_network.points_to_network(frame.points)
     taken = inliers
     if frame.outliers is not None and network.definition.weighs_points:
@@ -345,7 +348,7 @@ def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None
         return
 
     def encode(_module: nn.Module, _inputs: object, run: Run) -> object:
-        """What the encoder gives, in place of its own forward."""
+        """The output of the encoder's first call; later calls return the same one."""
         if name not in encoded:
             encoded[name] = run()
         return encoded[name]

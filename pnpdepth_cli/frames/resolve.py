@@ -126,7 +126,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
     enough_px = min(wanted_field(frame.network, point_count), *frame.network)
 
     def decide() -> list[str]:
-        """The layer, as the only one of a list."""
+        """The layer that is chosen, in a list of one, which is the form that is remembered."""
         with out_of_memory_is_a_device_error(network.device):
             arguments = network.synthetic_arguments(frame)
             fields = fields_of(network, arguments, definition.layers)
@@ -284,8 +284,8 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
     What the user gives replaces the network's own value. The paper's method takes the rest from the
     paper. The other methods propagate the residual, and take for the rest what serves that: at most
     `UPDATES` updates of z, none of a network that takes the points but no prior, and none of a
-    depth map. With them a network of metres from the image alone is aligned where the points say
-    that it should be.
+    depth map. They also align a network that gives metres from the image alone, where the points
+    say that it should be.
 
     Args:
         network: The network, its definition with nothing left open.

@@ -20,6 +20,10 @@ WEAK = 0.8
 """The same quotient, from which on a network is not strong at all."""
 FITTED = 2
 """Parameters of an alignment, which explain so many points by themselves."""
+LEAST_LOG_ERROR = 1e-9
+"""Errors of log depth are at least this before they are divided by."""
+LEAST_SQUARES = 1e-12
+"""Sums of squares of log depth are at least this before they are divided by."""
 USELESS = 0.25
 """Fraction of the variance of log depth that a network explains at points that its alignment was
 not fitted to, up to which it has no prior weight. A network of random weights has less than this in
@@ -48,13 +52,13 @@ class Judged(NamedTuple):
 
 
 def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
-    """Returns the part, mostly 0…1, of the depth of the points that a network leaves unexplained.
+    """Returns which part of the points' depth, mostly 0…1, a network leaves unexplained.
 
-    The network takes the image alone. The part is the error with which its aligned depth, the
-    residual propagated, predicts each point from the others, over the same error of a constant
-    depth, whose residual follows position and colour alone. It is 1 with fewer than `MIN_POINTS`
-    points, and on scan lines, where each point has a neighbour on its line, so that it says
-    nothing.
+    That is a quotient of two leave-one-out errors: that with which the network's aligned depth, its
+    residual propagated, predicts each point from the others, over that of a constant depth, whose
+    residual follows position and colour alone. The network takes the image alone, so that it has
+    not seen the points. It is 1 with fewer than `MIN_POINTS` points. It is 1 on scan lines, too:
+    there each point has a neighbour on its line, which predicts it whatever the network says.
 
     The alignment was fitted to all points. So the error of N points is multiplied by
     (N − 1) / (N − 1 − FITTED), as in the unbiased estimate of a variance.
@@ -75,7 +79,7 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
 
 
 def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
-    """Returns the part that a depth leaves unexplained, see `unexplained_by`.
+    """Returns which part of the points' depth another depth leaves unexplained: `unexplained_by`.
 
     It is 1 with fewer than `MIN_POINTS` points.
 
@@ -88,7 +92,7 @@ def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
         return 1.0
     of_depth = field.at_inliers.leave_one_out_error
     of_constant = constant.at_inliers.leave_one_out_error
-    return of_depth / max(of_constant, 1e-9) * (count - 1) / (count - 1 - FITTED)
+    return of_depth / max(of_constant, LEAST_LOG_ERROR) * (count - 1) / (count - 1 - FITTED)
 
 
 def strength_of(unexplained: float) -> float:
@@ -122,13 +126,14 @@ def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
         return 0.0
     x = x - x.mean()
     y = y - y.mean()
-    slope = (x @ y) / (x @ x).clamp_min(1e-12)
+    squares = (x @ x).clamp_min(LEAST_SQUARES)
+    slope = (x @ y) / squares
     if slope <= 0:
         return 0.0  # it says that far is near
     # The error at each point of the line through the others is that of the line through all, over
     # 1 − leverage; so is that of the others' mean.
-    leverage_left = 1 - 1 / count - x.square() / (x @ x).clamp_min(1e-12)
+    leverage_left = 1 - 1 / count - x.square() / squares
     errors = (y - slope * x) / leverage_left
-    total = (y / (1 - 1 / count)).square().sum().clamp_min(1e-12)
+    total = (y / (1 - 1 / count)).square().sum().clamp_min(LEAST_SQUARES)
     explained = float(1 - errors.square().sum() / total)
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))

@@ -20,6 +20,8 @@ MIN_POINTS = 5
 """With fewer points none is for validation: a fold would have less than one."""
 MOST_VALIDATION_POINTS = 1000
 """Of more validation points, so many at random are predicted. It bounds the time of a LiDAR's."""
+_LEAST_STANDARD_ERROR = 1e-12
+"""A standard error of log depth is at least this before it is divided by."""
 _LEAST_DEPTH = 1e-6
 """Metres; depth is at least this before its logarithm is taken."""
 
@@ -62,7 +64,7 @@ class ValidatedFrame(ValidationPoints):
         # The mean over its standard error.
         mean = (fractions * gains).sum()
         standard_error = (fractions.square() * (gains - mean).square()).sum().sqrt()
-        return float(mean / standard_error.clamp_min(1e-12))
+        return float(mean / standard_error.clamp_min(_LEAST_STANDARD_ERROR))
 
 
 def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:

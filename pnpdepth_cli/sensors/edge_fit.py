@@ -48,6 +48,13 @@ _LEAST_DEPTH_M = 0.1
 """Depth before the camera from which on a point has a pixel."""
 _LEAST_JUMPS = 30
 """Points at jumps of weight 1; fewer tell too little."""
+_LEAST_DISTANCE_PX = 1e-6
+"""Distances between points are at least this before they are divided by: a point is among its own
+nearest, at 0."""
+_LEAST_LENGTH = 1e-9
+"""Vectors are at least this long before they are divided by their length."""
+_LEAST_SQUARE = 1e-12
+"""Added to the square of an image's gradient, so that it can be divided by."""
 
 
 class Jumps(NamedTuple):
@@ -78,7 +85,7 @@ class Jumps(NamedTuple):
         ahead = (self.xyz[:, 2] > _LEAST_DEPTH_M) & (self.beyond[:, 2] > _LEAST_DEPTH_M)
         xy = pixels_of(camera, self.xyz[ahead])
         steps = pixels_of(camera, self.beyond[ahead]) - xy
-        steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+        steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), _LEAST_LENGTH)
         x, y = steps.T
         products = np.column_stack([x * x, y * y, x * y])
         return xy, products * self.weights[ahead, None]
@@ -99,7 +106,7 @@ class EdgeMap(NamedTuple):
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3), as of `Jumps.projected`.
+            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
         """
         height, width = self.strength.shape[:2]
         x, y = self._reduced(xy)
@@ -115,7 +122,7 @@ class EdgeMap(NamedTuple):
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3), as of `Jumps.projected`.
+            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
             reach_px: Largest shift to each side, down and right, in pixels of the full image.
         """
         height, width = self.strength.shape[:2]
@@ -154,6 +161,7 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
     scale = min(1.0, _LONGEST_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.GaussianBlur(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
+    # Sobel's weights sum to 8.
     across_x = cv2.Sobel(small, cv2.CV_32F, 1, 0, scale=0.125)
     across_y = cv2.Sobel(small, cv2.CV_32F, 0, 1, scale=0.125)
     # The products of the gradient with itself, summed over the colours: x·x, y·y, 2·x·y.
@@ -164,8 +172,9 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
             2 * (across_x * across_y).sum(axis=2),
         ]
     )
-    # The strength of edges is relative to their surroundings.
-    squared = products[:, :, 0] + products[:, :, 1] + 1e-12  # so that it can be divided by
+    # The strength of edges is relative to their surroundings; the square root lets
+    # a strong edge count less than in proportion.
+    squared = products[:, :, 0] + products[:, :, 1] + _LEAST_SQUARE
     strength = np.sqrt(squared)
     relative = np.sqrt(strength / (_widely_blurred(strength, _SURROUNDINGS) + _DARK))
     # Each direction has its part: times the weights of `Jumps.projected`, the sum is the strength
@@ -190,8 +199,9 @@ def _widely_blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.f
 def jumps_of(
     scan: NDArray[np.floating], camera: Camera, scanner: Extrinsics, size: Size
 ) -> Jumps | None:
-    """Returns where depth jumps in a scan, in the camera's coordinates; None where few jumps are.
+    """Returns where depth jumps in a scan, in the camera's coordinates.
 
+    None if fewer than `_LEAST_JUMPS` points are beside a clear jump, one by a ratio of `_JUMP`.
     Points are neighbours if they are so for the scanner: from elsewhere, near and far beams mix,
     and where the camera is taken to be must not change what a jump is.
 
@@ -210,7 +220,8 @@ def jumps_of(
     focal_px = float(camera.intrinsics[0, 0])
     depth = seen[:, 2]
     xy = focal_px * seen[:, :2] / seen[:, 2:]
-    # A point's weight is that of the largest jump to a farther neighbour.
+    # A point's weight is that of the largest jump to a farther neighbour. `clear` counts the jumps
+    # of full weight.
     tree = cKDTree(xy, compact_nodes=False, balanced_tree=False)
     distances, neighbours = tree.query(xy, k=_NEIGHBOURS)
     ratios = depth[neighbours] / depth[:, None]
@@ -226,8 +237,9 @@ def jumps_of(
     # is before the nearest of them.
     weights[weights < largest[:, None] / 2] = 0
     steps = xy[neighbours] - xy[is_jump][:, None]
-    directions = (steps * (weights / np.maximum(distances, 1e-6))[:, :, None]).sum(axis=1)
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    per_px = weights / np.maximum(distances, _LEAST_DISTANCE_PX)  # makes unit vectors of the steps
+    directions = (steps * per_px[:, :, None]).sum(axis=1)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), _LEAST_LENGTH)
     nearest_far = np.where(weights > 0, distances, np.inf).argmin(axis=1)
     step = steps[np.arange(len(steps)), nearest_far]
     # Two points at the depth of the nearer beam: on the edge, and a pixel beyond it.
@@ -239,6 +251,6 @@ def jumps_of(
     return Jumps(
         xyz=on_edge + scanner.translation,
         beyond=beyond + scanner.translation,
-        weights=largest / np.linalg.norm(largest),
+        weights=largest / np.linalg.norm(largest),  # their squares add up to 1
         clear=clear,
     )

@@ -149,18 +149,24 @@ def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
 
 
 def largest_radius(lens: str, coefficients: Coefficients) -> float:
-    """Returns the distance from the axis on the plane z = 1 up to which a lens shows rays in order.
+    """Returns the radius on the plane z = 1 up to which a lens shows farther rays farther out.
 
-    Farther out its distortion turns back, and shows rays nearer to the axis again. Infinite if it
-    does not turn back within the widest angle that is looked at.
+    Beyond that radius √(x² + y²) of a ray (x, y, 1) its distortion turns back, and shows rays
+    nearer to the axis again. Infinite if it does not turn back within the angles that
+    `_radial_curve` samples.
+
+    Args:
+        lens: Name of `choices.LENSES`.
+        coefficients: Coefficients of the lens.
     """
     radius, shown_radius = _radial_curve(lens, coefficients)
+    # It turns back where what is shown rises no more, or is not finite.
     turning = np.flatnonzero(~(np.diff(shown_radius) > 0))
     return float(radius[turning[0]]) if turning.size else np.inf
 
 
 def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """(N, 2) the step of Newton's method, which is subtracted from directions.
+    """The step of Newton's method for `undistort`, (N, 2), which is subtracted from directions.
 
     Args:
         plane: (N, 2) directions so far, on the plane z = 1.
@@ -210,7 +216,9 @@ def _radial_curve(lens: str, coefficients: Coefficients) -> tuple[Floats, Floats
 
 
 def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> Floats:
-    """(N, 2) where a lens model shows directions on the image plane, also where it turns back.
+    """Where on the image plane, z = 1, a lens model shows directions, (N, 2).
+
+    Also beyond `largest_radius`, where its distortion turns back.
 
     Args:
         plane: (N, 2) x / z and y / z of the directions.
@@ -225,7 +233,7 @@ def _distort_anywhere(plane: Floats, lens: str, coefficients: Coefficients) -> F
 
 
 def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
-    """(N, 2) where a radial-tangential lens shows directions on the image plane.
+    """Where on the image plane, z = 1, a radial-tangential lens shows directions, (N, 2).
 
     Args:
         plane: (N, 2) x / z and y / z of the directions.
@@ -251,7 +259,7 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
 
 
 def _fisheye(plane: Floats, coefficients: Coefficients) -> Floats:
-    """(N, 2) where a fisheye lens shows directions on the image plane.
+    """Where on the image plane, z = 1, a fisheye lens shows directions, (N, 2).
 
     Args:
         plane: (N, 2) x / z and y / z of the directions.

@@ -143,10 +143,10 @@ def points_of_depth(depth: NDArray[np.float32], camera: Camera) -> Floats:
 
 
 def _points(depth: NDArray[np.float32], is_known: Mask, rays: Floats) -> Floats:
-    """(H, W, 3) points in the camera's coordinates, 0 where depth is unknown.
+    """(H, W, 3) points in the camera's coordinates, in the unit of the depth; 0 where unknown.
 
     Args:
-        depth: (H, W).
+        depth: (H, W) z; it is not read where it is unknown.
         is_known: (H, W) true where it is known.
         rays: (H, W, 2) x / z and y / z of the directions of the pixels.
     """
@@ -229,11 +229,13 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
 
 
 def neighbouring_views(poses: Floats, index: int) -> list[int]:
-    """Returns the numbers of the views nearest to one that look about the same way.
+    """Returns the numbers of the views nearest to a view that look about the same way.
+
+    They are at most `_NEIGHBOURS`, the nearest first.
 
     Args:
-        poses: (N, 3, 4) poses of the views' cameras in the world.
-        index: Number of the one, which is not among them.
+        poses: (N, 3, 4) poses of the views' cameras in the world, camera to world.
+        index: Number 0 … N − 1 of the view, which is not among those returned.
     """
     distance = np.linalg.norm(poses[:, :, 3] - poses[index, :, 3], axis=1)
     # The third column of a pose is the direction in which its camera looks.

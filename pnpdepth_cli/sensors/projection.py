@@ -211,6 +211,10 @@ def hidden_points(
 ) -> Mask:
     """Returns (N,) true for the points that are occluded by something nearer.
 
+    Where a beam passes the foreground's depth, the camera sees it at another pixel than at its end.
+    A point is hidden if foreground was measured near the middle of the segment between these
+    pixels.
+
     Args:
         xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
         depth: (N,) z in metres.
@@ -230,12 +234,14 @@ def hidden_points(
     nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)  # the least in the window
     limit = depth * (1 - NEARER)
     suspects = np.flatnonzero(nearest < limit)
-    # Pairs of a suspect and a nearer point, no farther apart than its parallax allows. `beam` leads
-    # from the suspect to where its beam passed the depth of the foreground.
-    beam = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
-    farthest_px = margin_px + 0.5 * (1 + _STRETCH) * np.hypot(*beam.T)
-    sides = np.minimum(np.ceil(farthest_px), reach_px)
-    around = cKDTree(cells).query_ball_point(cells[suspects], sides, p=np.inf)
+    # Pairs of a suspect and a nearer point, no farther apart than the last test allows: that is
+    # half the segment to its middle, and the distance from there. `segment` leads from the suspect
+    # to where its beam passed the depth of the foreground.
+    segment = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
+    half_px = 0.5 * np.hypot(*segment.T)
+    farthest_px = half_px + margin_px + _STRETCH * half_px
+    half_sides = np.minimum(np.ceil(farthest_px), reach_px)  # of a square around each suspect
+    around = cKDTree(cells).query_ball_point(cells[suspects], half_sides, p=np.inf)
     suspect = np.repeat(suspects, [len(neighbours) for neighbours in around])
     neighbour = np.fromiter(itertools.chain.from_iterable(around), np.intp, len(suspect))
     foreground = grid[rows[neighbour], columns[neighbour]].astype(np.float64)
@@ -243,10 +249,11 @@ def hidden_points(
     suspect = suspect[is_nearer]
     neighbour = neighbour[is_nearer]
     foreground = foreground[is_nearer]
-    # A suspect is hidden if the neighbour is near the middle of its parallax segment.
-    beam = _beam_at(foreground, xy[suspect], depth[suspect], scanner) - xy[suspect]
-    away_px = np.hypot(*(cells[neighbour] - cells[suspect] - 0.5 * beam).T)
-    hides = away_px <= margin_px + _STRETCH * 0.5 * np.hypot(*beam.T)
+    # A suspect is hidden if the neighbour is near the middle of its segment: the longer that is,
+    # the farther the neighbour may be.
+    segment = _beam_at(foreground, xy[suspect], depth[suspect], scanner) - xy[suspect]
+    away_px = np.hypot(*(cells[neighbour] - cells[suspect] - 0.5 * segment).T)
+    hides = away_px <= margin_px + _STRETCH * 0.5 * np.hypot(*segment.T)
     is_hidden = np.zeros(len(depth), bool)
     is_hidden[suspect[hides]] = True
     return is_hidden

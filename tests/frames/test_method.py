@@ -14,6 +14,7 @@ from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.errors import UsageError
 from pnpdepth_cli.frames.frame import Refined
 from pnpdepth_cli.frames.method import Method
+from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
 from pnpdepth_cli.models.network import load_network
 from pnpdepth_cli.settings import Settings
 from tests.frames.scenes import Brightness, Nearest, depth_of_scene, frame_in_memory, member
@@ -108,6 +109,19 @@ def test_stated_updates_that_do_harm_are_not_used_which_is_said() -> None:
     harmful = refined(Brightness, 100, method="alone", iterations=1, lr=0.8)
     assert any("updates of z are not used" in note for note in harmful.notes)
     assert "updated" in harmful.stages
+    assert np.array_equal(harmful.depth, plain.depth)
+
+
+def test_updates_of_the_included_network_that_do_harm_are_not_used_in_the_mirrored_frame() -> None:
+    frame = frame_in_memory(MIRRORED_BELOW - 100)
+
+    def refined_by_compact(**asked: Any) -> Refined:
+        with Method([load_network("compact", None, "cpu")], Settings(**asked), frame) as method:
+            return method.refine(frame)
+
+    plain = refined_by_compact(iterations=0)
+    harmful = refined_by_compact(iterations=1, lr=0.8)
+    assert any("updates of z are not used" in note for note in harmful.notes)
     assert np.array_equal(harmful.depth, plain.depth)
 
 

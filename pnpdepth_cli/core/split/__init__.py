@@ -81,9 +81,10 @@ class Split:
 
     @property
     def static_graph(self) -> bool:
-        """Whether the network is known to treat all arguments of these shapes alike.
+        """Whether all arguments of the recorded shapes are known to make the same calls.
 
-        It is if no value of a tensor reaches Python, or if it was promised.
+        It is known once a front and a rear were recorded, in which no value of a tensor reached
+        Python, where the network could branch on it; or if the caller promised it.
         """
         replay = self._replay
         return replay is not None and replay.complete and replay.static_graph
@@ -187,17 +188,21 @@ class Split:
         return self._replay.handle(module, inputs, run)
 
     def _run(self, replay: Replay, recorder: Recorder | None = None) -> object:
-        """What the network returns in one pass of its forward; with a recorder the pass is learnt.
+        """What the network returns in one pass of its forward.
+
+        Args:
+            replay: Decides what the calls of submodules return in the pass.
+            recorder: Watches the pass and notes its calls. None: all calls are recorded.
 
         Raises:
             ModelError: The network's forward fails.
         """
-        self._state.restore()
+        self._state.restore()  # the pass before may have changed buffers or parameters
         replay.calls.clear()
         replay.in_pass = True
         replay.recorder = recorder
         arguments = replay.arguments.fresh()
-        assert isinstance(arguments, tuple)
+        assert isinstance(arguments, tuple)  # as it was saved; for mypy
         try:
             with wrap_user_errors("the network's forward"):
                 if recorder is None:

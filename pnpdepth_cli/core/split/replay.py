@@ -132,7 +132,10 @@ class Replay:
         return PnpDepthError(f"layer {self._cut.layer!r} was reached, where the network is cut")
 
     def handle(self, module: nn.Module, inputs: object, run: Run) -> object:
-        """Returns the output of a call: the saved one, one with z in it, or the submodule's own.
+        """Returns the output of a call of a submodule.
+
+        It is the saved output for a recorded call, one with z in it for the cut, and what the
+        submodule itself returns for every other call.
 
         Args:
             module: The submodule that is called.

@@ -98,11 +98,11 @@ class Watch(TorchDispatchMode):
             self.protect(tensors)
 
     def note_injection(self, z: Tensor, original: Tensor | None) -> None:
-        """Notes that the network goes on with z.
+        """Notes that the cut layer gives z in place of its own output.
 
         Args:
-            z: What the cut layer gives.
-            original: Tensor of the network that z stands for; None if the layer did not run.
+            z: The tensor that it gives.
+            original: Its own output, for which z stands; None if the layer did not run.
         """
         self._touches += 1  # from here on the network reads z
         self._marked.add(storage_of(z))
@@ -121,8 +121,9 @@ class Watch(TorchDispatchMode):
     def can_stand_for(self, since: Moment, inputs: object, output: object) -> bool:
         """Returns whether giving `output` again does all that a call of a submodule did.
 
-        So the call did not depend on z, changed nothing older than itself in place, and its output
-        consists of tensors that it created, no two of them in the same memory.
+        It does if the call did not depend on z, which the cut layer gives; if it changed no tensor
+        in place that is older than the call; and if its output consists of tensors that it created,
+        no two of them in the same memory.
 
         If it may have depended on z, its output is noted to depend on z.
 
@@ -131,16 +132,17 @@ class Watch(TorchDispatchMode):
             inputs: Its inputs (args, kwargs).
             output: Its output.
         """
-        # An input that may hold z counts as read: a native extension reads its arguments unnoticed.
-        has_marked_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
-        if self._marked and (has_marked_input or not is_transparent(inputs)):
+        # An input that depends on z, or may hide a tensor that does, counts as read: a native
+        # extension reads its arguments unnoticed.
+        has_z_input = any(self._is_marked(tensor) for _, tensor in tensors_in(inputs))
+        if self._marked and (has_z_input or not is_transparent(inputs)):
             self._touches += 1
         # The tensors of its output that it created.
         storages = [storage_of(tensor) for _, tensor in tensors_in(output)]
         created_inside = {
             storage for storage in storages if self._created.get(storage, 0) > since.operations
         }
-        if self._touches > since.touches:
+        if self._touches > since.touches:  # it may have depended on z
             self._marked.update(created_inside)
             return False
         is_all_new = len(created_inside) == len(storages)  # one storage for each tensor
@@ -150,9 +152,12 @@ class Watch(TorchDispatchMode):
 
     @contextmanager
     def seeing_escapes_of(self, module: nn.Module) -> Iterator[None]:
-        """Inside this context, `Tensor.numpy` and the like are seen while the module runs.
+        """Inside this context, values that reach Python by `Tensor.numpy` and the like are noted.
 
-        They are not in torch's fused layers (`_FUSED`), nor where escapes are not noted at all.
+        They are not noted in torch's fused layers (`_FUSED`), nor if the watch notes no escapes.
+
+        Args:
+            module: The submodule that runs inside the context.
         """
         seen_outside = self._sees_escapes
         is_fused = getattr(type(module), "forward", None) in _FUSED
@@ -225,8 +230,9 @@ class Watch(TorchDispatchMode):
     def _before_write(self, tensor: Tensor) -> None:
         """Notes that a tensor is about to change in place, and clones what is saved of it."""
         storage = storage_of(tensor)
-        self._writes.append(self._created.get(storage, 0))
-        # The network changes z or the tensor it stands for: the other one is not what it would be.
+        self._writes.append(self._created.get(storage, 0))  # 0: it is older than the pass
+        # Without a cut, z and the tensor of the network that it stands for are one. So a change of
+        # one of the two makes the other stale.
         twins = {storage_of(twin) for twin in self._twins}
         if storage in twins:
             self._stale |= twins - {storage}

@@ -122,7 +122,7 @@ def full_range(call: Call, axis: int) -> AxisRange:
 
 
 def everywhere(call: Call) -> Spread:
-    """Returns the result's boxes where each of its elements may depend on each of the input's.
+    """Returns where a result depends on the feature map, each element on any of the input's.
 
     Each box is all of the result, but for those that were empty.
     """
@@ -133,18 +133,19 @@ def everywhere(call: Call) -> Spread:
 @rule("where", "masked_fill", "addcmul", "lerp", "prelu", "_prelu_kernel", "native_dropout")
 @rule("native_batch_norm", "_native_batch_norm_legit", "_native_batch_norm_legit_no_training")
 def pointwise(call: Call) -> Spread:
-    """Returns the result's boxes where each of its elements depends on the input's at its place.
+    """Returns where a result depends on the feature map, each element on its own of the input's.
 
-    They are the input's boxes, full along axes that are broadcast.
+    The boxes are the input's, full along axes that are broadcast.
     """
     if "batch_norm" in call.name:
-        # Argument 5 is `training`: with it, elements are normalised by all others.
+        # Argument 0 is what is normalised. Argument 5 is `training`: with it, elements are
+        # normalised by all others.
         is_training = call.args[5] is True
         if call.place != 0 or is_training:
             return everywhere(call)
     # Axes of the result that the input has not are in front of those that it has.
     new_axes = len(call.shape) - call.source.ndim
-    if new_axes < 0:  # no broadcasting
+    if new_axes < 0:  # an operation that drops axes does not broadcast
         return everywhere(call)
     axes = [full_range(call, axis) for axis in range(new_axes)]
     for axis, axis_range in enumerate(call.spread.axes(), start=new_axes):

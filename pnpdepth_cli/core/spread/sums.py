@@ -15,8 +15,9 @@ from pnpdepth_cli.core.spread.boxes import (
 
 @rule("mm", "bmm", "addmm", "baddbmm", "linear")
 def product(call: Call) -> Spread:
-    """Returns the boxes of a product of matrices, full along the axis that is summed over.
+    """Returns where a product of matrices depends on the feature map.
 
+    The boxes are the input's, full along the axis that is summed over.
     Rows of the left factor are rows of the product, and columns of the right one its columns.
     """
     left = 1 if call.name in ("addmm", "baddbmm") else 0  # number of the left factor
@@ -35,9 +36,9 @@ def product(call: Call) -> Spread:
 
 @rule("mean", "sum", "amax", "amin", "logsumexp", "prod", "var", "std")
 def reduction(call: Call) -> Spread:
-    """Returns the boxes of a sum, mean or the like along some axes.
+    """Returns where a sum, mean or the like along some axes depends on the feature map.
 
-    They are the input's boxes. Axes that are reduced are gone, or full where the operation keeps
+    The boxes are the input's. Axes that are reduced are gone, or full where the operation keeps
     them.
     """
     stated_axes = call.args[1] if len(call.args) > 1 else None
@@ -60,7 +61,10 @@ def reduction(call: Call) -> Spread:
 
 @rule("_softmax", "_log_softmax", "_safe_softmax", "cumsum")
 def along_axis(call: Call) -> Spread:
-    """Returns the boxes of a softmax or a cumulative sum: the input's, full along its axis."""
+    """Returns where a softmax or a cumulative sum depends on the feature map.
+
+    The boxes are the input's, full along the axis of the operation.
+    """
     axes = call.spread.axes()
     axis = call.args[1] % call.source.ndim
     axes[axis] = full_range(call, axis)
@@ -69,9 +73,10 @@ def along_axis(call: Call) -> Spread:
 
 @rule("native_layer_norm")
 def layer_norm(call: Call) -> Spread:
-    """Returns the boxes of a layer norm: the input's, full along the axes normalised together.
+    """Returns where a layer norm depends on the feature map.
 
-    These are the last ones, as many as argument 1 has sizes.
+    The boxes are the input's, full along the axes normalised together. These are the last ones, as
+    many as argument 1 has sizes.
     """
     if call.place != 0:  # weight or bias
         return everywhere(call)

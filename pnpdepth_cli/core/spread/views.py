@@ -23,7 +23,7 @@ PARTITIONS = ("split", "split_with_sizes", "unbind", "unsafe_split")
 
 
 def part_of(call: Call, number: int) -> Spread:
-    """Returns the boxes of one of the tensors that an operation of `PARTITIONS` makes of one.
+    """Returns where one result of an operation of `PARTITIONS` depends on the feature map.
 
     Args:
         call: The operation; its `shape` is that of this part.
@@ -40,9 +40,10 @@ def part_of(call: Call, number: int) -> Spread:
 
 @rule("cat")
 def concatenate(call: Call) -> Spread:
-    """Returns the boxes of `torch.cat`: the input's, shifted to where it lies in the result.
+    """Returns where `torch.cat` depends on the feature map: the input's boxes, shifted.
 
-    They reach over all its places if it is given several times.
+    They are shifted to where the input lies in the result. If it is given several times, they reach
+    over all its places.
     """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
     offset = 0  # elements along the axis in front of the tensor at hand
@@ -61,10 +62,10 @@ def concatenate(call: Call) -> Spread:
 
 @rule("stack")
 def stack(call: Call) -> Spread:
-    """Returns the boxes of `torch.stack`: the input's, with a new axis.
+    """Returns where `torch.stack` depends on the feature map: the input's boxes, with a new axis.
 
-    Along it they reach from the first to the last place of the input, which may be given several
-    times.
+    Along it the boxes reach from the first to the last place of the input, which may be given
+    several times.
     """
     axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
     places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
@@ -103,7 +104,10 @@ def _crop(call: Call, axis: int, start: int, step: int, count: int) -> list[Axis
 
 @rule("slice")
 def slice_(call: Call) -> Spread:
-    """Returns the boxes of `tensor[start:end:step]` along an axis: what it keeps of the input's."""
+    """Returns where `tensor[start:end:step]`, along an axis, depends on the feature map.
+
+    The boxes are what the slice keeps of the input's.
+    """
     # aten's arguments behind the input, of which the last ones may be left to their defaults. The
     # end is not needed: the result has its size.
     defaults = (0, None, None, 1)
@@ -121,7 +125,10 @@ def slice_(call: Call) -> Spread:
 
 @rule("select")
 def select(call: Call) -> Spread:
-    """Returns the boxes of `tensor[index]` along an axis, which the result has no more."""
+    """Returns where `tensor[index]`, along an axis, depends on the feature map.
+
+    The boxes are the input's without that axis, and empty where they do not contain the index.
+    """
     axis = call.args[1] % call.source.ndim
     index = call.args[2] % call.source.shape[axis]
     axes = _crop(call, axis, index, step=1, count=1)
@@ -136,14 +143,20 @@ def select(call: Call) -> Spread:
 
 @rule("permute")
 def permute(call: Call) -> Spread:
-    """Returns the boxes of `tensor.permute(order)`: the input's, with axes in that order."""
+    """Returns where `tensor.permute(order)` depends on the feature map.
+
+    The boxes are the input's, with axes in that order.
+    """
     axes = call.spread.axes()
     return Spread.from_axes([axes[axis % call.source.ndim] for axis in call.args[1]])
 
 
 @rule("transpose")
 def transpose(call: Call) -> Spread:
-    """Returns the boxes of `tensor.transpose(first, second)`: with these two axes exchanged."""
+    """Returns where `tensor.transpose(first, second)` depends on the feature map.
+
+    The boxes are the input's, with these two axes exchanged.
+    """
     axes = call.spread.axes()
     first, second = (axis % call.source.ndim for axis in call.args[1:3])
     axes[first], axes[second] = axes[second], axes[first]
@@ -152,13 +165,16 @@ def transpose(call: Call) -> Spread:
 
 @rule("t", "numpy_T")
 def reverse_axes(call: Call) -> Spread:
-    """Returns the boxes of `tensor.T`: the input's, with axes in reverse order."""
+    """Returns where `tensor.T` depends on the feature map: the input's boxes, axes reversed."""
     return Spread.from_axes(call.spread.axes()[::-1])
 
 
 @rule("flip")
 def flip(call: Call) -> Spread:
-    """Returns the boxes of `tensor.flip(axes)`: the input's, mirrored along these axes."""
+    """Returns where `tensor.flip(axes)` depends on the feature map.
+
+    The boxes are the input's, mirrored along these axes.
+    """
     axes = call.spread.axes()
     empty = call.spread.empty()
     for stated_axis in call.args[1]:
@@ -174,7 +190,10 @@ def flip(call: Call) -> Spread:
 
 @rule("repeat")
 def repeat(call: Call) -> Spread:
-    """Returns the boxes of `tensor.repeat(repeats)`: full along axes that are repeated or new."""
+    """Returns where `tensor.repeat(repeats)` depends on the feature map.
+
+    The boxes are the input's, full along axes that are repeated or new.
+    """
     repeats = call.args[1]
     source_axes = call.spread.axes()
     new_axes = len(repeats) - len(source_axes)
@@ -186,10 +205,11 @@ def repeat(call: Call) -> Spread:
 
 @rule("view", "_unsafe_view", "reshape", "_reshape_alias", "squeeze", "unsqueeze", "flatten")
 def reshape(call: Call) -> Spread:
-    """Returns the boxes of the same elements in other axes, as (2, 3, 4) becomes (6, 4) or (2, 12).
+    """Returns where a tensor of another shape depends on the feature map.
 
-    Both shapes fall into groups of neighbouring axes with equally many elements, such as (2, 3) and
-    (6). Each group is moved by itself.
+    Its elements and their order are the input's, as where (2, 3, 4) becomes (6, 4) or (2, 12). Both
+    shapes fall into groups of neighbouring axes with equally many elements, such as (2, 3) and (6).
+    Each group is moved by itself.
     """
     old_sizes = list(call.source.shape)
     new_sizes = list(call.shape)

@@ -24,7 +24,7 @@ They are along one axis. An index that reaches nothing has `NOWHERE` and −1.""
 def move_along(
     call: Call, responses: dict[int, Response], *, mixes_channels: bool = False
 ) -> Spread:
-    """Returns the boxes of an operation that works along each of some axes by itself.
+    """Returns where an operation that works along each of some axes by itself depends on the map.
 
     Args:
         call: The operation.
@@ -85,10 +85,10 @@ def _response_of_convolution(
 
 @rule("convolution", "_convolution", "cudnn_convolution", "mkldnn_convolution")
 def convolution(call: Call) -> Spread:
-    """Returns the boxes of a convolution: the input's, widened by the kernel, in all channels.
+    """Returns where a convolution depends on the feature map.
 
-    They are all of the result if the input is weight or bias, or the operation one of a device's
-    own, whose arguments are others.
+    The boxes are the input's, widened by the kernel, in all channels. They are all of the result if
+    the input is weight or bias, or the operation one of a device's own, whose arguments are others.
     """
     if call.place != 0 or call.name not in ("convolution", "_convolution"):
         return everywhere(call)
@@ -111,7 +111,10 @@ def convolution(call: Call) -> Spread:
 
 @rule("max_pool2d_with_indices", "avg_pool2d", "max_pool2d")
 def pool(call: Call) -> Spread:
-    """Returns the boxes of a pooling: the input's, widened by its windows of rows and columns."""
+    """Returns where a pooling depends on the feature map.
+
+    The boxes are the input's, widened by the windows of rows and columns.
+    """
     options = _options(call)
     kernels = options["kernel_size"]
     strides = options.get("stride") or kernels
@@ -137,7 +140,10 @@ def pool(call: Call) -> Spread:
 
 @rule("_adaptive_avg_pool2d", "adaptive_max_pool2d", "mkldnn_adaptive_avg_pool2d")
 def adaptive_pool(call: Call) -> Spread:
-    """Returns the boxes of a pooling to a stated size: the input's, widened by its windows."""
+    """Returns where a pooling to a stated size depends on the feature map.
+
+    The boxes are the input's, widened by the windows.
+    """
     responses: dict[int, Response] = {}
     # Windows are the same for a mean and a maximum.
     for axis in (len(call.shape) - 2, len(call.shape) - 1):
@@ -149,9 +155,10 @@ def adaptive_pool(call: Call) -> Spread:
 @rule("upsample_bilinear2d", "upsample_nearest2d", "upsample_bicubic2d")
 @rule("_upsample_bilinear2d_aa", "_upsample_nearest_exact2d", "_upsample_bicubic2d_aa")
 def resize(call: Call) -> Spread:
-    """Returns the boxes of a resized map: the input's, widened by the interpolation.
+    """Returns where a resized image depends on the feature map.
 
-    How far it reaches is asked of the operation itself, with the options of the call.
+    The boxes are the input's, widened by the interpolation. How far it reaches is asked of the
+    operation itself, with the options of the call.
     """
     options = _options(call)
     corners = [options["align_corners"]] if "align_corners" in options else []  # nearest has none
@@ -183,7 +190,10 @@ _PADDING_MODES = {
 
 @rule(*_PADDING_MODES)
 def pad(call: Call) -> Spread:
-    """Returns the boxes of a padded map: the input's, shifted, and widened where it is repeated."""
+    """Returns where a padded image depends on the feature map.
+
+    The boxes are the input's, shifted, and widened where the padding repeats the image.
+    """
     padding = list(call.args[1])
     responses: dict[int, Response] = {}
     # Pairs of how many elements are added before and behind, those of the last axis first.
@@ -196,7 +206,10 @@ def pad(call: Call) -> Spread:
 
 @rule("pixel_shuffle")
 def pixel_shuffle(call: Call) -> Spread:
-    """Returns the boxes where `factor²` channels of a cell become factor × factor pixels."""
+    """Returns where `torch.pixel_shuffle` depends on the feature map.
+
+    It makes factor × factor pixels of `factor²` channels of one pixel.
+    """
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -207,7 +220,10 @@ def pixel_shuffle(call: Call) -> Spread:
 
 @rule("pixel_unshuffle")
 def pixel_unshuffle(call: Call) -> Spread:
-    """Returns the boxes where factor × factor pixels become `factor²` channels of a cell."""
+    """Returns where `torch.pixel_unshuffle` depends on the feature map.
+
+    It makes `factor²` channels of one pixel, the cell, of factor × factor pixels.
+    """
     factor = call.args[1]
     responses: dict[int, Response] = {}
     for axis in (2, 3):
@@ -218,9 +234,10 @@ def pixel_unshuffle(call: Call) -> Spread:
 
 @rule("gather")
 def gather(call: Call) -> Spread:
-    """Returns the boxes of `torch.gather`: all places that its indices fill from the input's boxes.
+    """Returns where `torch.gather` depends on the feature map.
 
-    They are all of the result if the indices have no values, as on the device "meta".
+    The boxes are all places that its indices fill from the input's boxes. They are all of the
+    result if the indices have no values, as on the device "meta".
     """
     indices = call.args[2]
     if call.place != 0 or indices.is_meta:
