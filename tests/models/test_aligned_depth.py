@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pnpdepth_cli.choices import OutputKind, OutputScale
-from pnpdepth_cli.models.aligned_depth import AlignedDepth
+from pnpdepth_cli.models.aligned_depth import AlignedDepth, align_output
 from pnpdepth_cli.points import SparsePoints
 from tests.models.definitions import network
 
@@ -143,8 +143,13 @@ def test_another_reading_that_explains_few_points_as_well_is_said_unless_one_is_
     noise = torch.randn(10, generator=torch.Generator().manual_seed(2))
     xy = torch.stack([torch.arange(14.0, 24.0), torch.zeros(10)], dim=1)
     points = SparsePoints(xy=xy, depth=depth[0, 14:24] * (0.02 * noise).exp(), size=(1, 80))
-    reader = AlignedDepth(network(output_kind=stated, output_scale="affine"), points, asked)
-    reader((1 / depth)[None, None])
+    predicting = network(output_kind=stated, output_scale="affine")
+    reader = AlignedDepth(predicting, points, asked)
+    output = (1 / depth)[None, None]
+    reader(output)
+    assert reader.alignment is not None
+    fits = align_output(predicting.definition, points.sample(output), points, asked)
+    assert reader.alignment.reading == fits[0].reading
     notes = [note for note in reader.notes if "explained as well" in note]
     assert bool(notes) == is_said
     assert all("10 points" in note and "--align" in note for note in notes)
