@@ -150,8 +150,8 @@ def run(arguments: list[str]) -> int:
         if error.filename is not None:
             reason = f"{os.fsdecode(error.filename)}: {reason}"
         is_of_output = error.errno in _OUTPUT_ERRORS
-        ours = errors.OutputError if is_of_output else errors.InputError
-        return _end(reason, ours.exit_code)
+        error_class = errors.OutputError if is_of_output else errors.InputError
+        return _end(reason, error_class.exit_code)
     except Exception as error:
         if errors.is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)

@@ -103,9 +103,9 @@ def _refine_missing(
 
     listener.begin(len(to_do))
     # Settings with which a frame was refined work, so that an error is of its frame alone.
-    worked = len(to_do) < len(batch.chosen)
+    has_worked = len(to_do) < len(batch.chosen)
     # Closed at the end, also of an exception, so that threads and workers stop at once.
-    with closing(refine_all(to_do, batch.frames, of_frame, worked, listener)) as records:
+    with closing(refine_all(to_do, batch.frames, of_frame, has_worked, listener)) as records:
         _follow(records, listener)
 
 

@@ -130,7 +130,8 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
             motion = Extrinsics(matrix[:, :3], matrix[:, 3])
             ties[here].append((there, motion))
             ties[there].append((here, motion.inverse()))
-    # The frames that are tied to the first, those with the fewest motions between first.
+    # The poses of the frames that are tied to the first, by their index; those with the fewest
+    # motions between come first.
     poses = {0: SAME_PLACE}
     waiting = deque([0])
     while waiting:
@@ -142,7 +143,7 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
     if len(poses) < len(frames):
         return [None] * len(frames)
     notes.append("poses: the motions that `batch --accumulate` estimated, one after the other")
-    return [poses[index].square()[:3] for index in range(len(frames))]
+    return [poses[index].square()[:3] for index in range(len(frames))]  # (3, 4) each
 
 
 def _points_file(frame: ResultFrame) -> str:

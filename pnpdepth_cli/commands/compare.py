@@ -252,9 +252,11 @@ def _notes_on_unshared(
 
 
 def _notes_on_power(comparison: Comparison) -> Iterator[str]:
-    """Yields a line if frames are not independent, and one if they are too few to conclude."""
+    """Yields a line if frames are not independent, and one if too few of them are for any test."""
     yield from comparison.clusters.notes()
-    # p is a fraction of 2^G swaps of G clusters, of which two, none and all, change no difference.
+    # p is the fraction of the 2^G swaps of G clusters after which the runs differ as much as they
+    # do. That are at least two of them: no cluster swapped, and all of them. Holm's correction
+    # multiplies the smallest p by the number of tests.
     smallest = 2.0 ** (1 - comparison.clusters.count)
     tests = len(comparison.measures) * (len(comparison.runs) - 1)
     if len(comparison.frames) > 1 and tests * smallest >= ALPHA:

@@ -163,8 +163,12 @@ def _means_of(
     """
     # The values of each frame (frames, measures), NaN where it has none.
     scores = [scores_of(record) for record in scored]
-    measures = tuple(m for m in all_measures if any(m.key in of_frame for of_frame in scores))
-    measured = [{m.key: of_frame.get(m.key) for m in measures} for of_frame in scores]
+    measures = tuple(
+        measure for measure in all_measures if any(measure.key in of_frame for of_frame in scores)
+    )
+    measured = [
+        {measure.key: of_frame.get(measure.key) for measure in measures} for of_frame in scores
+    ]
     values = np.array([[*of_frame.values()] for of_frame in measured], float)
     # Their means; the development kit's own ones round as it does.
     mean = frame_means(measured)

@@ -45,6 +45,8 @@ class Run:
     def rows(self, names: Sequence[str], keys: Sequence[str], stage: str = AFTER) -> Rows:
         """Returns the scores of these frames, in this order: a row a frame, a column a key.
 
+        A score that a frame lacks is None.
+
         Args:
             names: Names of frames of the run.
             keys: Keys of measures, or of the counts beside them.
@@ -90,7 +92,11 @@ def read_run(text: str) -> Run:
         return Run(
             name=name,
             path=text,
-            measures=[m for m in measures if all(m.key in of_frame for of_frame in scores)],
+            measures=[
+                measure
+                for measure in measures
+                if all(measure.key in of_frame for of_frame in scores)
+            ],
             scoring=dict(content.get("scoring") or _RULES_OF_BATCHES),
             frames={
                 frame.name: replace(frame, errors={GT: frame.errors[GT] | {AFTER: of_frame}})

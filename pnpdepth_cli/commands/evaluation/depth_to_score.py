@@ -105,8 +105,10 @@ def _depth_of_distances(
         whole: (H, W) of the whole frame, to which a calibration belongs.
 
     Raises:
-        InputError: Neither has a camera.
+        InputError: Neither has a camera, or the record's is of another size.
     """
+    # A calibration is of the whole frame. A record's camera is of the prediction's pixels, so it
+    # fits only ground truth of that size.
     size = (distances.shape[0], distances.shape[1])
     camera = None
     if files.calib is not None:

@@ -131,7 +131,10 @@ def write_batch_report(
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
-    """What the report is made of, by which it is known later: the batch, seen from the folder."""
+    """The batch that the report is of, by which a later run knows the report as its own.
+
+    It is the path of the batch's output, seen from the report's folder.
+    """
     output = os.path.relpath(os.path.realpath(request.output), os.path.realpath(folder))
     return {"command": "batch", "output": output}
 

@@ -217,7 +217,7 @@ def _code_of(request: RefineRequest) -> dict[str, object]:
 def _identity(spec: str) -> tuple[str, str | None]:
     """The name and the SHA-256 of a file; the spec and None if it names no file.
 
-    The name has no folder, so that a batch may be moved, but the part of FILE:PART.
+    The name has no folder, so that a batch may be moved. Of FILE:PART it keeps the part.
 
     Args:
         spec: FILE, FILE:PART, or another name, such as that of a network.

@@ -171,10 +171,10 @@ class BatchRequest:
 
     @property
     def reading(self) -> ReadOptions:
-        """How the files of every frame are read, with the points that the protocol has.
+        """How the files of every frame are read: as the user says, and as the protocol says.
 
-        Points that the user asks for go before those of the protocol. Which LiDAR points of a
-        background behind others are removed is the protocol's alone.
+        Both may say which points are sampled from the ground truth; then the user's pattern counts.
+        The filter of LiDAR points behind the foreground is the protocol's alone.
         """
         options = self.refine.reading
         if self.protocol is None:

@@ -155,7 +155,8 @@ def short_names(names: Sequence[str]) -> list[str]:
     What is shared ends at a separator, so that numbers stay whole. All names are in full where that
     would save little.
     """
-    # Parts that all names have at the start; of what is behind the next one, those at the end.
+    # How many parts all names share at the start, and how many at the end of what follows the
+    # first part that differs.
     parts_of_names = [_SEPARATOR.split(name) for name in names]
     start = _shared_parts(parts_of_names)
     ends_reversed = [parts[start + 1 :][::-1] for parts in parts_of_names]
@@ -255,7 +256,7 @@ def _errors_table(
     result = by_stage[AFTER]
     linear = by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
-    measures = [m for m in chosen if m.key in result and (keys or m.main)]
+    measures = [measure for measure in chosen if measure.key in result and (keys or measure.main)]
     rows = []
     for stage in [stage for stage in titles if stage in by_stage]:
         scores = by_stage[stage]
@@ -263,7 +264,10 @@ def _errors_table(
         # A stage that not all frames have is a mean over others than the result.
         if scores.get("frames") != result.get("frames"):
             title += f" (over {scores['frames']:,} frames)"
-        texts = [m.text(scores.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
+        texts = [
+            measure.text(scores.get(measure.key), unit if measure.unit == "m" else measure.unit)
+            for measure in measures
+        ]
         style: Style = "bold" if stage == AFTER else ""
         row: list[Cell] = [(text, style) for text in (title, *texts)]
         if stage == LINEAR:
