@@ -242,7 +242,7 @@ def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _C
         varied: Texts NAME=VALUE,VALUE,… of one option each.
 
     Raises:
-        UsageError: An option cannot be varied, a value is none of it, or one comes twice.
+        UsageError: An option cannot be varied, the option refuses a value, or one comes twice.
     """
     # The options, and the values of each.
     varying = [_option(context, text.partition("=")[0]) for text in varied]

@@ -170,7 +170,8 @@ def _means_of(
         {measure.key: of_frame.get(measure.key) for measure in measures} for of_frame in scores
     ]
     values = np.array([[*of_frame.values()] for of_frame in measured], float)
-    # Their means; the development kit's own ones round as it does.
+    # Their means. The measures of KITTI's development kit come first; their means round as the kit
+    # does.
     mean = frame_means(measured)
     if request.is_devkit:
         count = len(request.measures)
@@ -245,7 +246,7 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
                 text += f" ({count:,} of {len(records):,})"
             texts.append(text)
         yield f"{side}: {some_names(texts)}"
-    # Frames that are in no mean, and what was made of ground truth that is none.
+    # Frames that are in no mean, then notes on single frames; a few lines of either.
     failed = [
         f"warning: frame {one_line(record.name)} was not scored: {record.message}"
         for record in records
@@ -256,12 +257,13 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
     ]
     for lines in (failed, noted):
         yield from lines[:_LISTED]
-        if (more := len(lines) - _LISTED) > 0:
+        more = len(lines) - _LISTED
+        if more > 0:
             yield f"{count_of(more, 'more frame')} like that; --csv or --json has all"
 
 
 def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Yields lines on pixels without prediction or given to the network, and on scales.
+    """Yields lines on pixels without prediction, on pixels given to the network, and on scales.
 
     Args:
         scored: Records of the frames with scores.
@@ -281,17 +283,18 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
             " --exclude-sparse leaves them out"
         )
     # How predictions were scaled, or that they should be.
-    not_in_metres = [record.unit for record in scored if record.unit != METRES]
-    if factors := _numbers(scored, "factor"):
+    other_units = [record.unit for record in scored if record.unit != METRES]
+    factors = _numbers(scored, "factor")
+    if factors:
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
         yield (
             f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,} images),"
             f" standard deviation / median {spread:.3f}"
         )
-    elif not_in_metres:
+    elif other_units:
         yield (
-            f"warning: {count_of(len(not_in_metres), 'prediction')} in {not_in_metres[0]}, not in"
+            f"warning: {count_of(len(other_units), 'prediction')} in {other_units[0]}, not in"
             " metres, so errors against the ground truth show nothing; --scale-by median scales"
             " each image"
         )
@@ -322,7 +325,8 @@ def _notes_on_order(scored: Sequence[FrameRecord], request: EvalRequest) -> Iter
         )
     # The way in which most files were read, by the option that changes it.
     by_option = {option: _readings(scored, side)[0][0] for side, option in _OPTIONS.items()}
-    if warning := unit_warning("predictions", agreement, by_option, fitted=True):
+    warning = unit_warning("predictions", agreement, by_option, fitted=True)
+    if warning:
         yield warning
 
 

@@ -140,12 +140,14 @@ def _depth_camera(
     of_images, of_depth = (
         None if calibration is None else calibration[0].camera for calibration in calibrations
     )
-    # Depth has no camera of its own: there is none, or the only camera_info of the bag is of both.
+    # Depth without a camera_info is taken for that of the images' pixels.
     if of_depth is None:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None
+    # Only depth has a camera_info.
     if of_images is None:
         return of_depth
+    # Both have one and the same camera_info, so depth has none of its own.
     if of_images.source == of_depth.source:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None

@@ -18,7 +18,7 @@ from pnpdepth_cli.io.bags import Bag, messages
 from pnpdepth_cli.io.calibration import Calibration
 
 _LONGEST_GAP_S = 0.5
-"""Longest time between two poses that one is interpolated from."""
+"""Longest time between two poses between which a pose is interpolated."""
 
 ImageAndScan = tuple[NDArray[np.float32], NDArray[np.floating]]
 """An image (H, W, 3) in 0…1, and the points (N, 3) of its scan in the scanner's coordinates."""

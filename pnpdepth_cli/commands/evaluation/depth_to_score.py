@@ -206,12 +206,13 @@ def pixels_with_points(frame: FrameFiles, result: ResultFrame, gt: Depth) -> Mas
     size = (gt.shape[0], gt.shape[1])
     sparse = result.record.inputs.get("sparse")
     pattern = None if sparse is None else sparse.sampled
-    # Points that were drawn from the ground truth are drawn again.
+    # Points that were drawn from ground truth of this size are drawn again, with the same seed.
     if pattern is not None and result.size == size:
         image = None
         if pattern.kind == "features" and frame.image is not None:
             image = frame.part.apply(read_image(frame.image))
         xy = sample_points(gt, pattern, pattern.seed or 0, image=image).xy
+    # Else they are in a file; one of the whole frame is cut to the part of it that is scored.
     elif frame.sparse is not None:
         points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
         size_of_file = points.size

@@ -152,7 +152,7 @@ def _pair(files: FrameFiles, prediction: Path | None) -> tuple[FrameFiles, Resul
 
     Args:
         files: The files of the frame.
-        prediction: The depth file. None: there is none, which is returned.
+        prediction: The depth file. None: there is none, and None is returned for it.
     """
     if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
         files = replace(files, sparse=None)  # a scan, whose pixels are not known without a camera
@@ -189,7 +189,8 @@ def _depth_files(path: Path) -> dict[str, Path]:
     files, ambiguous = one_of_each(
         (_frame_name(stem), file) for stem, file in (marked or by_stem).items()
     )
-    if lost := [*problems, *ambiguous]:
+    lost = [*problems, *ambiguous]
+    if lost:
         file, why = lost[0]
         raise InputError(f"{file} {why}")
     if not files:

@@ -98,7 +98,8 @@ def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequ
         scored = _score(files, result, request)
     except PnpDepthError as error:
         return replace(record, message=str(error))
-    # How the files were read, and the scores where a batch's record has those of its result.
+    # How the files were read, and the errors against ground truth: of the depth after refinement,
+    # for `compare`, which reads records of batches alike.
     inputs_as_read = {
         name: replace(
             inputs[name], read_as=reading.source, scale=reading.scale, assumed=reading.assumed
@@ -131,7 +132,7 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     notes = [*gt.notes]
     try:
         has_point = pixels_with_points(files, result, gt.values)
-    # Where these pixels are scored, too, they are only counted, and no count is no error.
+    # Unless these pixels are excluded, they are only counted, and may be unknown.
     except PnpDepthError:
         if rules.exclude_sparse:
             raise
@@ -168,7 +169,8 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     if fit is not None:
         factor, shift = fit
         scores["factor"] = factor
-        scores["shift"] = shift + factor * prediction.added  # of the numbers in the file
+        # Depth is factor · (number in the file + added) + shift; the score leaves `added` to shift.
+        scores["shift"] = shift + factor * prediction.added
     return _Scored(scores, {"prediction": prediction.reading, "gt": gt.reading}, notes)
 
 

@@ -316,7 +316,7 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
             seed=int(seed),
             holdout=float(holdout),
         )
-    # PnpDepthError: a file is gone or damaged. ValueError: a number in the record is none.
+    # PnpDepthError: a file is gone or damaged. ValueError: a setting in the record is no number.
     except (PnpDepthError, ValueError) as error:
         notes.append(f"warning: {frame.result.name}: its points are left out: {error}")
         return None

@@ -223,7 +223,7 @@ def _columns(basis: str, unit: str) -> list[Measure]:
         basis: What the errors are measured on, a key of `measures.BASES`.
         unit: Unit of the depths.
     """
-    keys = ("mae",) if basis == VALIDATION else ("rmse", "mae")  # what each basis has
+    keys = ("mae",) if basis == VALIDATION else ("rmse", "mae")  # validation points have no RMSE
     columns = []
     for measure in choose_measures(MEASURES, keys):
         change, before, after = (

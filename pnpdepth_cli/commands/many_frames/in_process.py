@@ -137,13 +137,17 @@ class _Steps:
         return work
 
     def refine(self, reading: Iterable[_Work]) -> Iterator[_Work]:
-        """Yields the frames that were read, refined or with an error. The calling thread runs it.
+        """Yields each frame that was read, with its refined depth or its error.
+
+        The calling thread runs it.
 
         Raises:
             StorageError: Nothing more can be written.
             ModelError, UsageError: An error of the network or the settings, before any frame was
                 refined: it may be one of all frames.
         """
+        # Once a frame was refined, an error of another one is of that frame alone. Without a method
+        # no frame can be refined, and each of them gets a record that says so.
         is_proven = self.has_worked or self.method is None
         for work in reading:
             if self.stopped():
@@ -152,8 +156,10 @@ class _Steps:
                 with work.step("refine"):
                     if self.method is None:
                         raise InputError("no frame could be read when the batch began; try again")
+                    # Ground truth scores the depth after each step as well.
                     with_stages = work.frame.gt is not None
                     work.refined = self.method.refine(work.frame, with_stages=with_stages)
+            # An error that may concern all frames ends the batch; any other is this frame's.
             is_proven |= work.refined is not None
             of_all_frames: tuple[type[Exception], ...] = (StorageError,)
             if not is_proven:

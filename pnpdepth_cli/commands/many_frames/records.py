@@ -116,7 +116,7 @@ class Records:
         It is done if it has a result with its present settings and files.
         """
         record = self.find(frame)
-        if isinstance(record, str):  # why there is none
+        if isinstance(record, str):  # why there is no record
             return record
         if record.batch is None or record.status == "failed":
             return "failed before"

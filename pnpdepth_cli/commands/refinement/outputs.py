@@ -56,7 +56,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     Without -o, the folder is named after the image, or the first other input.
 
     Raises:
-        OutputError: One exists and may not be replaced, or is one of the inputs.
+        OutputError: One exists and may not be replaced, or is one of the inputs; or -o names
+            another file than a depth file.
         UsageError: A standard deviation is asked for, and a file is named and no folder.
     """
     # Where results go without -o.
@@ -66,12 +67,12 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     output = request.output or Path(f"{inputs[0].stem}_refined")
     suffix = output.suffix.lower()
     formats = " ".join(DEPTH_SUFFIXES)
-    # A depth file alone, or all files in a folder.
+    # A depth file alone, or all files in a folder. A name that ends in a dot and letters is taken
+    # for another file, unless there is such a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.uncertainty:
             raise UsageError(f"--uncertainty writes a second file; name a folder, not {output}")
         outputs: Outputs = {"depth": output}
-    # Another file, or a name that ends in letters behind a dot, as that of a file does.
     elif output.is_file() or (suffix[1:].isalpha() and not output.is_dir()):
         raise OutputError(f"{output} is no folder; name one, or a depth file ({formats})")
     else:
@@ -180,8 +181,8 @@ def write_outputs(
 def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     """The held-out points, else the validation points, with the depths there; None without any.
 
-    Held-out points have no part in the result; validation points choose and weigh its experts, but
-    the depths that are compared there were made without them.
+    Held-out points have no part in the result; validation points choose and weigh what is fused,
+    but the depths that are compared there were made without them.
     """
     held_out = inputs.held_out
     validation = frame.validation

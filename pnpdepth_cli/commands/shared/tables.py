@@ -60,7 +60,7 @@ _LEAST_SAVED = 8
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 """A comma between groups of three digits, which LaTeX's columns of numbers do not have."""
 _LEAST_WEIGHT = 0.005
-"""Weight of an expert below which its text would be 0 %."""
+"""Weight of a fused depth below which its text would be 0 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,7 +297,7 @@ def _count_text(scores: Scores) -> str:
 def stage_titles(result: ResultRecord) -> dict[str, str]:
     """Returns what each stage of a frame is, in words, by stage in the order of the refinement.
 
-    The result is no stage of its own where it is the network's last stage: then that one is named.
+    Where the result is the depth of the network's last step, that step has no title of its own.
     """
     method = result.method
     name = method.networks[0].name
@@ -310,8 +310,8 @@ def stage_titles(result: ResultRecord) -> dict[str, str]:
         titles[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
     if method.propagation != "none":
         titles[PROPAGATED] = f"{name}, residual propagated"
-    # The result: the last of these steps, if no other expert has a weight; else what is fused.
-    weighted = [expert for expert, weight in result.weights.items() if weight > 0]
+    # The result: the last of these steps, unless other depth is fused with it; then what is fused.
+    weighted = [fused for fused, weight in result.weights.items() if weight > 0]
     if not weighted or weighted == [name]:
         _, titles[AFTER] = titles.popitem()
     else:
