@@ -61,9 +61,11 @@ class _Commands(click.Group):
     """Imports a subcommand only when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Returns the names of the subcommands, in the order of the help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Returns the subcommand of this name, imported; None if there is none."""
         if cmd_name not in COMMANDS:
             return None
         command = importlib.import_module(f"pnpdepth_cli.cli.{cmd_name}").command

@@ -51,6 +51,7 @@ def write_depth_cloud(
         )
     # The cloud, part by part.
     is_coloured = all(request.image or frame.image for frame in frames)
+    # Without poses, every camera lies at the world's origin.
     known_poses = [np.eye(3, 4) if pose is None else pose for pose in poses]
     clouds: Iterable[PointCloud] = _clouds(
         request, frames, known_poses, is_coloured=is_coloured, notes=notes, show=show
@@ -147,7 +148,10 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
 
 
 def _points_file(frame: ResultFrame) -> str:
-    """The file that the frame's points are from, as records of its neighbours name it."""
+    """The file that the frame's points are from, as records of its neighbours name it.
+
+    It is the frame's name where its record has no such file.
+    """
     source = frame.record.inputs.get("sparse")
     return frame.name if source is None else source.path
 

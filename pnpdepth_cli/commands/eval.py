@@ -386,7 +386,7 @@ def frames_table(evaluation: Evaluation) -> Table:
         row += [scores.get(measure.key) for measure in evaluation.shown]
         row.append(frame.message)
         rows.append(row)
-    # Keys are headings, too; but coverage is a measure, whose heading a table knows.
+    # Counts are headed by their keys. Coverage is given as the measure that it is.
     counts = [COVERAGE if key == COVERAGE.key else key for key in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)

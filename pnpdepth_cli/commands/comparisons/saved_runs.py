@@ -128,13 +128,14 @@ def _read_measure(entry: Mapping[str, Any]) -> Measure:
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Returns the runs without those that repeat an earlier one, and a note on each repeated one.
 
-    Studies of earlier versions have a run for each step size where z is not updated at all. Such
-    runs are one if their scores are the same as well. A run whose z is not updated is returned
-    without the varied options that have no effect on it.
+    Some options have no effect on a run without updates of z, but studies of earlier versions have
+    a run for each of their values. Such runs are returned without these options, and are one if
+    their scores are the same as well.
     """
     different = list[Run]()
     repeats = defaultdict[str, list[str]](list)  # paths of runs, by that of the run they repeat
     for run in runs:
+        # A run with updates of z repeats none.
         if run.varied.get("iterations") != "0":
             different.append(run)
             continue

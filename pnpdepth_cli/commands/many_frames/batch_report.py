@@ -112,7 +112,7 @@ def write_batch_report(
     }
     # What its script sorts and draws by: the first column is a change, unless there are none.
     keys = [measure.key for measure in columns]
-    data = {
+    script_data = {
         "columns": [measure.to_json() for measure in columns],
         "sort_by": keys.index(f"rmse_{AFTER}") if basis == USED else 0,
         "signed": [key for key in keys if key.endswith(_CHANGE)],
@@ -127,7 +127,7 @@ def write_batch_report(
             yield _entry(frame, basis, columns) | views
 
     source = _source(request, folder)
-    report.write_report(folder, source, page, data, entries, viewer=request.html_3d)
+    report.write_report(folder, source, page, script_data, entries, viewer=request.html_3d)
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:

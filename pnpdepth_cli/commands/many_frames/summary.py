@@ -189,6 +189,7 @@ def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
         frames_of_notes[note] = names
 
     def is_no_warning(entry: tuple[str, list[str]]) -> bool:
+        """Whether the note of an entry (note, names of frames) is none that begins with warning."""
         return not entry[0].startswith("warning")
 
     return dict(sorted(frames_of_notes.items(), key=is_no_warning))  # False comes first

@@ -152,6 +152,7 @@ class BatchRequest:
     """Options that a study varies, and their values here, as the user wrote them."""
 
     def __post_init__(self) -> None:
+        """Raises UsageError for options that do not go together, or an unknown measure."""
         if self.adapt and self.shard is not None:
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
