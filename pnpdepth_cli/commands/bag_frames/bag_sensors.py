@@ -136,10 +136,15 @@ def _depth_camera(
         has_same_frame_id: Whether both have one frame_id.
         say: Receives a warning if nothing tells that depth and images belong together.
     """
-    calibrations = [messages.camera_of_bag(bag, topic) for topic in (images, points)]
-    of_images, of_depth = (
-        None if calibration is None else calibration[0].camera for calibration in calibrations
-    )
+    cameras: list[Camera | None] = []
+    for topic in (images, points):
+        calibration_and_frame = messages.camera_of_bag(bag, topic)
+        if calibration_and_frame is None:
+            cameras.append(None)
+        else:
+            calibration, _ = calibration_and_frame
+            cameras.append(calibration.camera)
+    of_images, of_depth = cameras
     # Depth without a camera_info is taken for that of the images' pixels.
     if of_depth is None:
         _warn_of_unregistered(points, has_same_frame_id, say)

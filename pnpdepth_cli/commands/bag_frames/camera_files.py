@@ -65,7 +65,7 @@ def write_calibration(
         )
     else:
         say(f"calibration: {source}")
-    # Whether the images are rectified.
+    # Whether the images are rectified, which edges tell only with scans.
     if calibration.rectified:
         compared = () if sensors.is_map else frames
         calibration, note = choose_camera(calibration, compared, sensors.images)

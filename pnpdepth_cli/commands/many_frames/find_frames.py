@@ -350,7 +350,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
             sources[f"sparse of {points.stem}"] = points
             if neighbour.motion is None:
                 sources[f"image of {points.stem}"] = neighbour.files.image
-    # Masks, and what calibrates the camera.
+    # Masks, and what calibrates the camera, by the user or else by the data set.
     if files.gt is not None:
         sources |= {f"mask {number}": path for number, path in enumerate(files.masks)}
     sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}

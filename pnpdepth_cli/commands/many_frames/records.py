@@ -175,7 +175,9 @@ class Records:
         pose = request.files.pose
         if pose is not None:
             # + 0.0 makes 0 of −0, which JSON tells apart.
-            settings["pose"] = [[round(x, _POSE_DECIMALS) + 0.0 for x in row] for row in pose]
+            settings["pose"] = [
+                [round(number, _POSE_DECIMALS) + 0.0 for number in row] for row in pose
+            ]
         text = json.dumps(settings, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 

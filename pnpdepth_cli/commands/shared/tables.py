@@ -324,6 +324,7 @@ def stage_titles(result: ResultRecord) -> dict[str, str]:
 def names_of_depths(result: ResultRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a result are of, in a few words."""
     titles = stage_titles(result)
+    # Where nothing changed the prediction, it is the result, which then has the only title.
     return titles.get(BEFORE, titles[AFTER]), titles[AFTER]
 
 
