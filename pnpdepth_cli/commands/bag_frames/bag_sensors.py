@@ -232,8 +232,8 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         rows, columns = np.nonzero(depth)
         xy = np.column_stack([columns, rows]).astype(np.float64)
         cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
-    # Depth images are in metres already. Clouds stay as they are stored unless their scale is
-    # stated; their unit is then left to what reads the frames.
+    # Depth images are in metres already. A cloud whose scale nobody states stays as it is stored,
+    # and its unit is left to what reads the frames.
     scale = 1.0
     if is_cloud and sensors.scale is not None:
         scale = sensors.scale
