@@ -178,20 +178,20 @@ def _request_of(values: dict[str, Any], folder: str, varied: dict[str, str]) -> 
 def _run(
     request: BatchRequest, is_interrupted: Callable[[], bool], printed: set[str]
 ) -> tuple[BatchSummary, bool]:
-    """Returns the batch's summary, which it prints, and whether frames are left, as it was stopped.
+    """Refines a batch and prints its summary; returns that, and whether a stop left frames to do.
 
     Args:
         request: The batch.
         is_interrupted: Function that is asked before each frame whether the batch is to stop.
-        printed: Notes that earlier runs of the study printed, and that are not printed again;
-            gets those of this run.
+        printed: Notes that are not printed again, as earlier batches of the command printed them;
+            gets those of this batch. `--vary` makes several batches.
     """
     from pnpdepth_cli.cli.printing import print_batch
     from pnpdepth_cli.commands.batch import run_batch
     from pnpdepth_cli.commands.shared.tables import count_of
 
     def say_once(line: str) -> None:
-        """Prints a note, unless an earlier run printed it."""
+        """Prints a note, unless this or an earlier batch of the command printed it."""
         if line not in printed:
             say_above_bar(line)
         printed.add(line)
@@ -242,7 +242,7 @@ def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _C
         varied: Texts NAME=VALUE,VALUE,… of one option each.
 
     Raises:
-        UsageError: An option cannot be varied, a value is none of it, or one comes twice.
+        UsageError: An option cannot be varied, the option refuses a value, or one comes twice.
     """
     # The options, and the values of each.
     varying = [_option(context, text.partition("=")[0]) for text in varied]

@@ -61,9 +61,11 @@ class _Commands(click.Group):
     """Imports a subcommand only when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Returns the names of the subcommands, in the order of the help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Returns the subcommand of this name, imported; None if there is none."""
         if cmd_name not in COMMANDS:
             return None
         command = importlib.import_module(f"pnpdepth_cli.cli.{cmd_name}").command
@@ -150,8 +152,8 @@ def run(arguments: list[str]) -> int:
         if error.filename is not None:
             reason = f"{os.fsdecode(error.filename)}: {reason}"
         is_of_output = error.errno in _OUTPUT_ERRORS
-        ours = errors.OutputError if is_of_output else errors.InputError
-        return _end(reason, ours.exit_code)
+        error_class = errors.OutputError if is_of_output else errors.InputError
+        return _end(reason, error_class.exit_code)
     except Exception as error:
         if errors.is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)

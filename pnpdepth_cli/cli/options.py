@@ -100,6 +100,7 @@ def options_of_groups(*groups: type, without: Collection[str] = ()) -> Decorator
     """
 
     def decorate(command: Command) -> Command:
+        """Returns the command with the options."""
         declared = [field for group in groups for field in options_of(group)]
         for field in reversed(declared):  # the option of a decorator above comes first in the help
             if field.name not in without:
@@ -118,6 +119,7 @@ def refinement(*, without: Collection[str] = ()) -> Decorator:
     groups = (ScanOptions, ReadOptions, Settings, RefineRequest)
 
     def decorate(command: Command) -> Command:
+        """Returns the command with all options of a refinement."""
         # --model may be given several times here, for which it has an option of its own.
         return models(options_of_groups(*groups, without=["model", *without])(command))
 

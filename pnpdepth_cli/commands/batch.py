@@ -55,8 +55,11 @@ def run_batch(request: BatchRequest, listener: Listener) -> BatchSummary:
         records.check_new(batch.chosen)
     make_folder(request.output)
     with lock_folder(request.output, request.shard):
-        if request.shard is None and (leftovers := remove_leftovers(request.output)):
-            listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
+        # A half-written file in a folder of shards may be one that another shard writes.
+        if request.shard is None:
+            leftovers = remove_leftovers(request.output)
+            if leftovers:
+                listener.say(f"removed {leftovers:,} half-written files of a run that was killed")
         # The frames of a sequence may have adapted weights, and then records of their own.
         of_frame = dict.fromkeys([frame.name for frame in batch.frames], records)
         if request.adapt:
@@ -103,9 +106,9 @@ def _refine_missing(
 
     listener.begin(len(to_do))
     # Settings with which a frame was refined work, so that an error is of its frame alone.
-    worked = len(to_do) < len(batch.chosen)
+    has_worked = len(to_do) < len(batch.chosen)
     # Closed at the end, also of an exception, so that threads and workers stop at once.
-    with closing(refine_all(to_do, batch.frames, of_frame, worked, listener)) as records:
+    with closing(refine_all(to_do, batch.frames, of_frame, has_worked, listener)) as records:
         _follow(records, listener)
 
 
@@ -130,8 +133,11 @@ def _notes(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
     count = count_of(len(frames), "frame")
     yield f"layout: {batch.layout}{guessed}: {count}, {with_gt:,} with ground truth"
     parts = sorted({str(frame.part) for frame in frames if frame.part != WHOLE})
-    if request.protocol is not None and (note := find_protocol(request.protocol).note):
-        yield f"protocol {request.protocol}: {note}"
+    protocol_note = ""
+    if request.protocol is not None:
+        protocol_note = find_protocol(request.protocol).note
+    if protocol_note:
+        yield f"protocol {request.protocol}: {protocol_note}"
     elif parts and request.protocol is None:
         yield f"frames: {', '.join(parts)}; --protocol whole keeps all of them"
     if batch.poses is not None:
@@ -141,7 +147,8 @@ def _notes(request: BatchRequest, batch: BatchFrames) -> Iterator[str]:
         yield f"chosen: {count_of(len(batch.chosen), 'frame')} of them"
     for line in batch.unmatched[:_MAX_LISTED]:
         yield f"warning: {line}"
-    if (more := len(batch.unmatched) - _MAX_LISTED) > 0:
+    more = len(batch.unmatched) - _MAX_LISTED
+    if more > 0:
         yield f"warning: {more:,} more files are in no frame; summary.json lists them"
 
 

@@ -51,6 +51,7 @@ def write_depth_cloud(
         )
     # The cloud, part by part.
     is_coloured = all(request.image or frame.image for frame in frames)
+    # Without poses, every camera lies at the world's origin.
     known_poses = [np.eye(3, 4) if pose is None else pose for pose in poses]
     clouds: Iterable[PointCloud] = _clouds(
         request, frames, known_poses, is_coloured=is_coloured, notes=notes, show=show
@@ -130,7 +131,8 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
             motion = Extrinsics(matrix[:, :3], matrix[:, 3])
             ties[here].append((there, motion))
             ties[there].append((here, motion.inverse()))
-    # The frames that are tied to the first, those with the fewest motions between first.
+    # The poses of the frames that are tied to the first, by their index; those with the fewest
+    # motions between come first.
     poses = {0: SAME_PLACE}
     waiting = deque([0])
     while waiting:
@@ -142,11 +144,14 @@ def _estimated_poses(frames: list[ResultFrame], notes: list[str]) -> list[Pose |
     if len(poses) < len(frames):
         return [None] * len(frames)
     notes.append("poses: the motions that `batch --accumulate` estimated, one after the other")
-    return [poses[index].square()[:3] for index in range(len(frames))]
+    return [poses[index].square()[:3] for index in range(len(frames))]  # (3, 4) each
 
 
 def _points_file(frame: ResultFrame) -> str:
-    """The file that the frame's points are from, as records of its neighbours name it."""
+    """The file that the frame's points are from, as records of its neighbours name it.
+
+    It is the frame's name where its record has no such file.
+    """
     source = frame.record.inputs.get("sparse")
     return frame.name if source is None else source.path
 

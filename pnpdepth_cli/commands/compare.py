@@ -228,14 +228,18 @@ def _notes_on_unshared(
         in_all_runs: (frames, measures) where all runs have a value.
     """
     for run in runs:
-        if unshared := [name for name in run.frames if name not in comparison.frames]:
+        unshared = [name for name in run.frames if name not in comparison.frames]
+        if unshared:
             yield (
                 f"warning: {count_of(len(unshared), 'frame')} of {run.path} not scored in all runs,"
                 f" left out: {some_names(unshared)}"
             )
-    # For each frame, its number of scored pixels in each run, as a row of one.
-    pixels = zip(*(run.rows(comparison.frames, ["pixels"]) for run in runs), strict=True)
-    unequal = sum(any(count != counts[0] for count in counts) for counts in pixels)
+    # How many frames have other numbers of scored pixels in one run than in another.
+    pixels_of_runs = []
+    for run in runs:
+        rows = run.rows(comparison.frames, ["pixels"])
+        pixels_of_runs.append([count for (count,) in rows])
+    unequal = sum(len({*counts}) > 1 for counts in zip(*pixels_of_runs, strict=True))
     if unequal:
         shares = ", ".join(COVERAGE.text(run.coverage) for run in comparison.runs)
         yield (
@@ -252,9 +256,11 @@ def _notes_on_unshared(
 
 
 def _notes_on_power(comparison: Comparison) -> Iterator[str]:
-    """Yields a line if frames are not independent, and one if they are too few to conclude."""
+    """Yields a line if frames are not independent, and one if too few of them are for any test."""
     yield from comparison.clusters.notes()
-    # p is a fraction of 2^G swaps of G clusters, of which two, none and all, change no difference.
+    # p is the fraction of the 2^G swaps of G clusters after which the runs differ as much as they
+    # do. That are at least two of them: no cluster swapped, and all of them. Holm's correction
+    # multiplies the smallest p by the number of tests.
     smallest = 2.0 ** (1 - comparison.clusters.count)
     tests = len(comparison.measures) * (len(comparison.runs) - 1)
     if len(comparison.frames) > 1 and tests * smallest >= ALPHA:

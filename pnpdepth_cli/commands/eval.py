@@ -163,10 +163,15 @@ def _means_of(
     """
     # The values of each frame (frames, measures), NaN where it has none.
     scores = [scores_of(record) for record in scored]
-    measures = tuple(m for m in all_measures if any(m.key in of_frame for of_frame in scores))
-    measured = [{m.key: of_frame.get(m.key) for m in measures} for of_frame in scores]
+    measures = tuple(
+        measure for measure in all_measures if any(measure.key in of_frame for of_frame in scores)
+    )
+    measured = [
+        {measure.key: of_frame.get(measure.key) for measure in measures} for of_frame in scores
+    ]
     values = np.array([[*of_frame.values()] for of_frame in measured], float)
-    # Their means; the development kit's own ones round as it does.
+    # Their means. The measures of KITTI's development kit come first; their means round as the kit
+    # does.
     mean = frame_means(measured)
     if request.is_devkit:
         count = len(request.measures)
@@ -241,7 +246,7 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
                 text += f" ({count:,} of {len(records):,})"
             texts.append(text)
         yield f"{side}: {some_names(texts)}"
-    # Frames that are in no mean, and what was made of ground truth that is none.
+    # Frames that are in no mean, then notes on single frames; a few lines of either.
     failed = [
         f"warning: frame {one_line(record.name)} was not scored: {record.message}"
         for record in records
@@ -252,12 +257,13 @@ def _notes_on_files(records: Sequence[FrameRecord]) -> Iterator[str]:
     ]
     for lines in (failed, noted):
         yield from lines[:_LISTED]
-        if (more := len(lines) - _LISTED) > 0:
+        more = len(lines) - _LISTED
+        if more > 0:
             yield f"{count_of(more, 'more frame')} like that; --csv or --json has all"
 
 
 def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Iterator[str]:
-    """Yields lines on pixels without prediction or given to the network, and on scales.
+    """Yields lines on pixels without prediction, on pixels given to the network, and on scales.
 
     Args:
         scored: Records of the frames with scores.
@@ -277,17 +283,18 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
             " --exclude-sparse leaves them out"
         )
     # How predictions were scaled, or that they should be.
-    not_in_metres = [record.unit for record in scored if record.unit != METRES]
-    if factors := _numbers(scored, "factor"):
+    other_units = [record.unit for record in scored if record.unit != METRES]
+    factors = _numbers(scored, "factor")
+    if factors:
         median = float(np.median(factors))
         spread = float(np.std(np.array(factors) / median)) if median else math.nan
         yield (
             f"scale-by {request.scale_by}: factor {median:.4g} (median of {len(factors):,} images),"
             f" standard deviation / median {spread:.3f}"
         )
-    elif not_in_metres:
+    elif other_units:
         yield (
-            f"warning: {count_of(len(not_in_metres), 'prediction')} in {not_in_metres[0]}, not in"
+            f"warning: {count_of(len(other_units), 'prediction')} in {other_units[0]}, not in"
             " metres, so errors against the ground truth show nothing; --scale-by median scales"
             " each image"
         )
@@ -318,7 +325,8 @@ def _notes_on_order(scored: Sequence[FrameRecord], request: EvalRequest) -> Iter
         )
     # The way in which most files were read, by the option that changes it.
     by_option = {option: _readings(scored, side)[0][0] for side, option in _OPTIONS.items()}
-    if warning := unit_warning("predictions", agreement, by_option, fitted=True):
+    warning = unit_warning("predictions", agreement, by_option, fitted=True)
+    if warning:
         yield warning
 
 
@@ -378,7 +386,7 @@ def frames_table(evaluation: Evaluation) -> Table:
         row += [scores.get(measure.key) for measure in evaluation.shown]
         row.append(frame.message)
         rows.append(row)
-    # Keys are headings, too; but coverage is a measure, whose heading a table knows.
+    # Counts are headed by their keys. Coverage is given as the measure that it is.
     counts = [COVERAGE if key == COVERAGE.key else key for key in _COUNTS]
     columns = ["name", "group", *FILES, *counts, *evaluation.shown, "error"]
     return Table(columns=columns, rows=rows)

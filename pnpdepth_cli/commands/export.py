@@ -117,18 +117,20 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         raise InputError(f"{result.depth} lacks its image: {result.lost_image}")
     if export.needs_pose and pose is None:
         raise InputError(f"{result.depth} lacks a pose in its record; `batch --poses` gives it")
-    # The scale and the name of the record must be usable.
+    # Where the points are a COLMAP model's, the record has its unit and its name of the image.
+    # Both must be usable.
     sparse = result.record.inputs.get("sparse")
-    scale = 1.0
+    unit_scale = 1.0
     name = _image_name(result, image)
     if sparse is not None:
-        scale = sparse.unit_scale or scale
-        name = sparse.image or name  # as the COLMAP model has it
-    is_scale_usable = _LEAST_SCALE < scale < _LARGEST_SCALE
+        unit_scale = sparse.unit_scale or unit_scale
+        name = sparse.image or name
+    is_scale_usable = _LEAST_SCALE < unit_scale < _LARGEST_SCALE
     is_name_usable = name_problem(name) is None and name.isprintable()
     if not is_scale_usable or not is_name_usable:
         raise InputError(f"{result.depth}: the record beside it is damaged; refine it again")
-    # The depth must be of the whole image.
+    # The depth must be of the whole image, whose size only a file tells without being read. A
+    # record with a camera has a size.
     size = result.size or (0, 0)
     if isinstance(image, Path) and size not in sizes_of(image):
         raise InputError(
@@ -143,7 +145,7 @@ def _frame(result: ResultFrame, export: Export, output: Path) -> ExportFrame:
         size=size,
         camera=camera,
         pose=pose,
-        unit_scale=scale,
+        unit_scale=unit_scale,
     )
 
 

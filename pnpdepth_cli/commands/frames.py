@@ -132,7 +132,9 @@ def unpack(request: BatchRequest, say: Say) -> BatchRequest:
         say: Receives what was guessed, and warnings.
 
     Raises:
-        As `write_frames`.
+        InputError: The bag cannot be read, or has no frame.
+        UsageError: Topics are ambiguous.
+        OutputError: The folder holds files that may not be replaced.
     """
     folder = request.output.with_name(f"{request.output.name}_frames")
     # A batch of the first frames needs no others, unless it chooses by names, which come later.

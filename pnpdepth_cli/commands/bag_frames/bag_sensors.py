@@ -136,16 +136,23 @@ def _depth_camera(
         has_same_frame_id: Whether both have one frame_id.
         say: Receives a warning if nothing tells that depth and images belong together.
     """
-    calibrations = [messages.camera_of_bag(bag, topic) for topic in (images, points)]
-    of_images, of_depth = (
-        None if calibration is None else calibration[0].camera for calibration in calibrations
-    )
-    # Depth has no camera of its own: there is none, or the only camera_info of the bag is of both.
+    cameras: list[Camera | None] = []
+    for topic in (images, points):
+        calibration_and_frame = messages.camera_of_bag(bag, topic)
+        if calibration_and_frame is None:
+            cameras.append(None)
+        else:
+            calibration, _ = calibration_and_frame
+            cameras.append(calibration.camera)
+    of_images, of_depth = cameras
+    # Depth without a camera_info is taken for that of the images' pixels.
     if of_depth is None:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None
+    # Only depth has a camera_info.
     if of_images is None:
         return of_depth
+    # Both have one and the same camera_info, so depth has none of its own.
     if of_images.source == of_depth.source:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None
@@ -202,17 +209,18 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
         message: A depth image or a cloud.
 
     Returns:
-        Depth (H, W) in metres of the images' camera, 0 where unknown, if `is_map`. Else points
-        (N, 3) in the coordinates of the scanner or the depth camera: in metres, or as stored in a
-        cloud whose scale nobody states. Beside either the numbers of points that were dropped, by
-        the reason; none of depth.
+        What was measured, and the numbers of points that were dropped, by the reason. If the points
+        are depth images of the images' own camera, it is depth (H, W) in metres, 0 where unknown,
+        and nothing is dropped. Else it is points (N, 3) in the coordinates of the scanner or of the
+        depth camera: in metres, or as stored in a cloud whose scale nobody states.
 
     Raises:
         NoPointsError: Nothing was measured.
         InputError: The message is damaged.
     """
     topic = sensors.points
-    if not sensors.is_map and sensors.depth_camera is None:
+    is_cloud = not sensors.is_map and sensors.depth_camera is None
+    if is_cloud:
         cloud = messages.cloud_points(message, topic)
     else:
         depth = messages.depth_image(message, topic, sensors.scale)
@@ -220,15 +228,19 @@ def measurement(sensors: Sensors, message: Message) -> tuple[NDArray[np.float32]
             raise NoPointsError(f"{topic}: a depth image without depth")
         if sensors.depth_camera is None:
             return depth, {}
+        # Depth of a camera of its own becomes points in that camera's coordinates.
         rows, columns = np.nonzero(depth)
         xy = np.column_stack([columns, rows]).astype(np.float64)
         cloud = unproject(sensors.depth_camera, xy, depth[rows, columns]).astype(np.float32)
-    # The unit of clouds is left to what reads the frames, unless the user states it. Depth images
-    # are in metres already.
-    is_cloud = not sensors.is_map and sensors.depth_camera is None
-    scale = sensors.scale if is_cloud else None
-    points, counts, _ = scan_returns(topic, cloud, scale=scale or 1.0, of_integers="")
-    return points, counts
+    # Depth images are in metres already. A cloud whose scale nobody states stays as it is stored,
+    # and its unit is left to what reads the frames.
+    scale = 1.0
+    if is_cloud and sensors.scale is not None:
+        scale = sensors.scale
+    # Empty: the scale is stated of these very numbers, and not of the integers of another file.
+    of_integers = ""
+    returns = scan_returns(topic, cloud, scale=scale, of_integers=of_integers)
+    return returns.points, returns.dropped
 
 
 def stream(bag: Bag, sensors: Sensors, offset_s: float) -> Iterator[tuple[bool, float, Message]]:

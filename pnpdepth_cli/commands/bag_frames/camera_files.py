@@ -18,7 +18,7 @@ from pnpdepth_cli.io.bags import Bag, messages
 from pnpdepth_cli.io.calibration import Calibration
 
 _LONGEST_GAP_S = 0.5
-"""Longest time between two poses that one is interpolated from."""
+"""Longest time between two poses between which a pose is interpolated."""
 
 ImageAndScan = tuple[NDArray[np.float32], NDArray[np.floating]]
 """An image (H, W, 3) in 0…1, and the points (N, 3) of its scan in the scanner's coordinates."""
@@ -37,13 +37,15 @@ def write_calibration(
         say: Receives what was found, and warnings.
 
     Returns:
-        The frame_id of the camera, and whether the file was written.
+        The frame_id of the camera's coordinates, and whether the file was written.
     """
-    # The camera, from camera_info.
-    camera, points = (
-        messages.frame_of(next(bag.messages([topic]))[2])
-        for topic in (sensors.images, sensors.points)
-    )
+    # The frame_ids of both sensors, as their first messages have them.
+    frame_ids = []
+    for topic in (sensors.images, sensors.points):
+        _, _, first_message = next(bag.messages([topic]))
+        frame_ids.append(messages.frame_of(first_message))
+    camera, points = frame_ids
+    # The camera, from camera_info, which may name its frame.
     calibration_and_frame = messages.camera_of_bag(bag, sensors.images)
     if calibration_and_frame is None:
         say(f"warning: {bag.path} has no camera_info of {sensors.images}; refine with --calib")
@@ -63,7 +65,7 @@ def write_calibration(
         )
     else:
         say(f"calibration: {source}")
-    # Whether the images are rectified.
+    # Whether the images are rectified, which edges tell only with scans.
     if calibration.rectified:
         compared = () if sensors.is_map else frames
         calibration, note = choose_camera(calibration, compared, sensors.images)

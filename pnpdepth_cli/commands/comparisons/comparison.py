@@ -76,7 +76,7 @@ class Comparison:
 
     def to_json(self) -> dict[str, object]:
         """Returns what `compare --json` prints; NaN and infinity are None."""
-        # Fields that say themselves what JSON has of them; all others are plain values.
+        # Clusters and measures convert themselves; all other fields are plain values.
         converted = {
             "clusters": self.clusters.to_json(),
             "measures": [measure.to_json() for measure in self.measures],

@@ -151,6 +151,8 @@ def _choose_axis(runs: Sequence[ComparedRun]) -> _Axis:
 def _lines(runs: Sequence[ComparedRun], axis: _Axis) -> dict[str, Line]:
     """The lines of a plot by their label: one for each combination of values of other options.
 
+    A line holds its runs by their position on the axis; several at one differ in their seed.
+
     Args:
         runs: The runs of a study.
         axis: The option along the axis, which all runs have.
@@ -168,7 +170,8 @@ def _lines(runs: Sequence[ComparedRun], axis: _Axis) -> dict[str, Line]:
     lines = defaultdict[str, Line](dict)
     for run in sorted(runs, key=position):
         for combination in complete:
-            if {*_other_values(run, axis)} <= {*combination}:
+            is_on_line = {*_other_values(run, axis)} <= {*combination}
+            if is_on_line:
                 line = lines[", ".join(combination)]
                 line.setdefault(position(run), []).append(run)
     return lines

@@ -56,7 +56,10 @@ def _number_text(number: float, form: str) -> str:
 
 
 def comparison_values(comparison: Comparison) -> Table:
-    """Returns `comparison_table` for programs: keys, numbers in full, nothing for what is none."""
+    """Returns a row for each measure and run for programs: keys, and numbers in full.
+
+    A value that a run lacks is None or NaN.
+    """
     options = [*dict.fromkeys(name for run in comparison.runs for name in run.varied)]
     rows: list[list[object]] = []
     for measure in comparison.measures:

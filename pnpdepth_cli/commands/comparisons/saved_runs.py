@@ -45,6 +45,8 @@ class Run:
     def rows(self, names: Sequence[str], keys: Sequence[str], stage: str = AFTER) -> Rows:
         """Returns the scores of these frames, in this order: a row a frame, a column a key.
 
+        A score that a frame lacks is None.
+
         Args:
             names: Names of frames of the run.
             keys: Keys of measures, or of the counts beside them.
@@ -90,7 +92,11 @@ def read_run(text: str) -> Run:
         return Run(
             name=name,
             path=text,
-            measures=[m for m in measures if all(m.key in of_frame for of_frame in scores)],
+            measures=[
+                measure
+                for measure in measures
+                if all(measure.key in of_frame for of_frame in scores)
+            ],
             scoring=dict(content.get("scoring") or _RULES_OF_BATCHES),
             frames={
                 frame.name: replace(frame, errors={GT: frame.errors[GT] | {AFTER: of_frame}})
@@ -122,13 +128,14 @@ def _read_measure(entry: Mapping[str, Any]) -> Measure:
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Returns the runs without those that repeat an earlier one, and a note on each repeated one.
 
-    Studies of earlier versions have a run for each step size where z is not updated at all. Such
-    runs are one if their scores are the same as well. A run whose z is not updated is returned
-    without the varied options that have no effect on it.
+    Some options have no effect on a run without updates of z, but studies of earlier versions have
+    a run for each of their values. Such runs are returned without these options, and are one if
+    their scores are the same as well.
     """
     different = list[Run]()
     repeats = defaultdict[str, list[str]](list)  # paths of runs, by that of the run they repeat
     for run in runs:
+        # A run with updates of z repeats none.
         if run.varied.get("iterations") != "0":
             different.append(run)
             continue

@@ -37,7 +37,7 @@ Mask = NDArray[np.bool_]
 Size = tuple[int, ...]
 """(H, W)."""
 
-_MOST = 0.5
+_LEAST_WEIGHT = 0.5
 """Weight of known pixels in a resized pixel above which that one is known: more than half."""
 
 
@@ -64,9 +64,12 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
     """
     if frame.gt is None:
         raise InputError(f"frame {frame.name} has no ground truth to score against; add it")
-    # Its numbers, which a user, a data set or the file say are depth or its inverse.
+    # Its numbers: of a file without a header, which its length tells, or of any other format.
     scale = frame.gt_scale if request.gt_scale is None else request.gt_scale
-    file = raw_depth(frame.gt, frame.image) or _read_depth(frame.gt, scale, request)
+    file = raw_depth(frame.gt, frame.image)
+    if file is None:
+        file = _read_depth(frame.gt, scale, request)
+    # Disparity or 1/depth, if the user or the data set says so, becomes metres without a scale.
     kind = request.gt_kind or frame.kind_of_gt
     factor = inverse_factor("--gt-kind", kind)
     if factor is not None:
@@ -75,6 +78,7 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
     # Depth in metres, as all numbers of sensors pass one gate; then the part that is used.
     reading = file.reading
     masked = apply_masks(file.values, frame.masks)
+    # A scale that only the layout knows may not be of these very numbers.
     is_scale_of_layout = request.gt_scale is None and not frame.scales_stated
     depth, notes = plausible_map(
         masked,
@@ -105,8 +109,10 @@ def _depth_of_distances(
         whole: (H, W) of the whole frame, to which a calibration belongs.
 
     Raises:
-        InputError: Neither has a camera.
+        InputError: Neither has a camera, or the record's is of another size.
     """
+    # A calibration is of the whole frame. A record's camera is of the prediction's pixels, so it
+    # fits only ground truth of that size.
     size = (distances.shape[0], distances.shape[1])
     camera = None
     if files.calib is not None:
@@ -167,7 +173,9 @@ def read_prediction(path: Path, size: Size, request: EvalRequest) -> DepthToScor
         # Of known pixels alone: their interpolated sum over their interpolated weight.
         is_known = (values > 0).astype(np.float32)
         total, weight = (cv2.resize(image, (size[1], size[0])) for image in (values, is_known))
-        values = np.where(weight > _MOST, total / np.maximum(weight, _MOST), np.float32(0))
+        values = np.where(
+            weight > _LEAST_WEIGHT, total / np.maximum(weight, _LEAST_WEIGHT), np.float32(0)
+        )
     return DepthToScore(values, file.reading, notes, added)
 
 
@@ -204,12 +212,13 @@ def pixels_with_points(frame: FrameFiles, result: ResultFrame, gt: Depth) -> Mas
     size = (gt.shape[0], gt.shape[1])
     sparse = result.record.inputs.get("sparse")
     pattern = None if sparse is None else sparse.sampled
-    # Points that were drawn from the ground truth are drawn again.
+    # Points that were drawn from ground truth of this size are drawn again, with the same seed.
     if pattern is not None and result.size == size:
         image = None
         if pattern.kind == "features" and frame.image is not None:
             image = frame.part.apply(read_image(frame.image))
         xy = sample_points(gt, pattern, pattern.seed or 0, image=image).xy
+    # Else they are in a file; one of the whole frame is cut to the part of it that is scored.
     elif frame.sparse is not None:
         points, _ = read_sparse(frame.sparse, size=size, scale=frame.sparse_scale)
         size_of_file = points.size

@@ -39,13 +39,13 @@ def pair_frames(
         InputError: A path is not there, or no name is common to both.
         UsageError: One is a file and the other a folder.
     """
-    # Two files, two folders, or a folder and a data set.
+    # One prediction goes with one file of ground truth; a folder goes with a folder or a data set.
     for path in (prediction, ground_truth):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder; check the path")
     layout, frames = _data_set(prediction, ground_truth)
-    are_many_true = layout is not None or ground_truth.is_dir()
-    if prediction.is_dir() != are_many_true:
+    has_many_truths = layout is not None or ground_truth.is_dir()
+    if prediction.is_dir() != has_many_truths:
         raise UsageError(
             "give two files, two folders, or a folder and a data set, not"
             f" {prediction} and {ground_truth}"
@@ -63,6 +63,7 @@ def pair_frames(
     # At least one name must be common to both.
     names = [frame.name for frame in frames]
     notes += _notes_on_names(predictions, names)
+    # Each frame with its sequence, of which the frames are not independent.
     groups = groups_of(names, [frame.group for frame in frames])
     pairs = [
         _pair(replace(frame, group=group), predictions.get(frame.name))
@@ -151,7 +152,7 @@ def _pair(files: FrameFiles, prediction: Path | None) -> tuple[FrameFiles, Resul
 
     Args:
         files: The files of the frame.
-        prediction: The depth file. None: there is none, which is returned.
+        prediction: The depth file. None: there is none, and None is returned for it.
     """
     if files.sparse is not None and files.sparse.suffix.lower() not in DEPTH_SUFFIXES:
         files = replace(files, sparse=None)  # a scan, whose pixels are not known without a camera
@@ -188,7 +189,8 @@ def _depth_files(path: Path) -> dict[str, Path]:
     files, ambiguous = one_of_each(
         (_frame_name(stem), file) for stem, file in (marked or by_stem).items()
     )
-    if lost := [*problems, *ambiguous]:
+    lost = [*problems, *ambiguous]
+    if lost:
         file, why = lost[0]
         raise InputError(f"{file} {why}")
     if not files:

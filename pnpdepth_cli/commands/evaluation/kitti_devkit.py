@@ -23,9 +23,10 @@ Floats = NDArray[np.float32]
 def fill_background(depth: Floats) -> Floats:
     """Returns (H, W) metres in which unknown depths are filled in from their row, or other rows.
 
-    In a row, a gap between two known depths takes the nearer of both, and what is outside the
-    outermost known depth takes that one. Empty rows above and below all filled rows take the
-    nearest of these; an empty row between filled ones becomes −1, which the kit scores as a depth.
+    This is how KITTI's development kit fills in a prediction. In a row, a gap between two known
+    depths takes the smaller of both, and what is outside the outermost known depth takes that one.
+    Rows without a known depth that lie above or below all filled rows take the nearest of these.
+    Such a row between filled ones becomes −1, which the kit scores as a depth.
 
     Args:
         depth: (H, W) metres, 0 where unknown.
@@ -34,13 +35,14 @@ def fill_background(depth: Floats) -> Floats:
     column = np.arange(depth.shape[1])
     rows = np.flatnonzero((depth > 0).any(axis=1))
     for row in rows:
-        # Of each column the known ones at its left and right, itself if it is known; outside of the
-        # outermost one both are that.
+        # The columns with a known depth that are next to each column, at its left and its right.
+        # Both are the column itself if it is known. Beyond the outermost, both are the outermost.
         known = np.flatnonzero(depth[row] > 0)
         left = np.searchsorted(known, column, side="right") - 1
         right = np.searchsorted(known, column)
-        ends = known[np.clip([left, right], 0, len(known) - 1)]
+        ends = known[np.clip([left, right], 0, len(known) - 1)]  # (2, columns)
         filled[row] = depth[row, ends].min(axis=0)
+    # Rows above the first filled one, and below the last.
     if len(rows):
         filled[: rows[0]] = filled[rows[0]]
         filled[rows[-1] + 1 :] = filled[rows[-1]]
@@ -57,7 +59,7 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
     Returns:
         Values by the keys of `measures.DEVKIT_MEASURES`.
     """
-    # The scored pixels (N,), down each column as the kit walks, which transposing gives.
+    # The scored pixels (N,). The kit adds up down each column, an order that transposing gives.
     is_scored = gt.T > 0
     depth = fill_background(predicted).T[is_scored]
     truth = gt.T[is_scored]
@@ -84,7 +86,9 @@ def devkit_errors(predicted: Floats, gt: Floats) -> dict[str, float]:
             _sum(error / truth) / count,  # abs relative
             _sum(error * error / (truth * truth)) / count,  # squared relative
         )
-    return {m.key: float(value) for m, value in zip(DEVKIT_MEASURES, values, strict=True)}
+    return {
+        measure.key: float(value) for measure, value in zip(DEVKIT_MEASURES, values, strict=True)
+    }
 
 
 def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -93,6 +97,9 @@ def devkit_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _sum(values: NDArray[np.floating]) -> Floats:
-    """The sum over the first axis, in single precision and in order, as the kit adds up."""
-    # cumsum adds one after the other; sum would add in pairs
+    """The sum over the first axis in single precision, one number after the other.
+
+    So adds KITTI's development kit, whose rounding this repeats.
+    """
+    # NumPy's sum would add in pairs, which rounds otherwise.
     return np.asarray(np.cumsum(values, axis=0, dtype=np.float32)[-1])

@@ -66,12 +66,16 @@ class _Scored(NamedTuple):
 def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequest) -> FrameRecord:
     """Returns the record of a scored frame, with its scores, or why it has none.
 
-    Beside the measures, the scores have numbers of pixels: "pixels" are scored, "known" have ground
-    truth, "predicted" have a prediction in the file as well, and "given" are scored pixels at which
-    the network was given a point. "coverage" is predicted over known. "median_ratio" is that of
-    prediction over ground truth, "ratio_spread" half of the range of the middle 68 % of its log.
-    "rank_correlation" is Spearman's, of the prediction as it is stored. One that was scaled has
-    "factor" and "shift".
+    Beside the measures, the scores have numbers of pixels:
+    - "known" have ground truth that the protocol scores,
+    - "predicted" have a prediction in the file as well,
+    - "pixels" are scored, as they have a depth after the prediction was scaled and clipped,
+    - "given" are scored pixels at which the network was given a point.
+
+    "coverage" is predicted over known. "median_ratio" is that of prediction over ground truth,
+    "ratio_spread" half of the range of the middle 68 % of its log. "rank_correlation" is
+    Spearman's, of the prediction as it is stored. "factor" and "shift" are those by which the
+    prediction was scaled.
 
     Args:
         files: The frame's ground truth, and its sparse depth, image and camera where there are any.
@@ -94,11 +98,21 @@ def score_frame(files: FrameFiles, result: ResultFrame | None, request: EvalRequ
         scored = _score(files, result, request)
     except PnpDepthError as error:
         return replace(record, message=str(error))
-    for name, reading in scored.readings.items():
-        inputs[name] = replace(
+    # How the files were read, and the errors against ground truth: of the depth after refinement,
+    # for `compare`, which reads records of batches alike.
+    inputs_as_read = {
+        name: replace(
             inputs[name], read_as=reading.source, scale=reading.scale, assumed=reading.assumed
         )
-    return replace(record, status="done", notes=scored.notes, errors={GT: {AFTER: scored.scores}})
+        for name, reading in scored.readings.items()
+    }
+    return replace(
+        record,
+        inputs=inputs | inputs_as_read,
+        status="done",
+        notes=scored.notes,
+        errors={GT: {AFTER: scored.scores}},
+    )
 
 
 def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Scored:
@@ -118,7 +132,7 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     notes = [*gt.notes]
     try:
         has_point = pixels_with_points(files, result, gt.values)
-    # Where these pixels are scored, too, they are only counted, and no count is no error.
+    # Unless these pixels are excluded, they are only counted, and may be unknown.
     except PnpDepthError:
         if rules.exclude_sparse:
             raise
@@ -144,14 +158,19 @@ def _score(files: FrameFiles, result: ResultFrame, request: EvalRequest) -> _Sco
     scores = _measure(depth, truth, request)
     if result.sigma is not None and fit is None:
         sigma = result.read_beside(result.sigma, depth)
-        scores |= {m.key: m.formula(depth, truth, sigma) for m in OF_SIGMA if m.formula}
+        scores |= {
+            measure.key: measure.formula(depth, truth, sigma)
+            for measure in OF_SIGMA
+            if measure.formula is not None
+        }
     scores |= _counts_and_agreement(prediction.values, depth, truth, has_point)
     scores["factor"] = None
     scores["shift"] = None
     if fit is not None:
         factor, shift = fit
         scores["factor"] = factor
-        scores["shift"] = shift + factor * prediction.added  # of the numbers in the file
+        # Depth is factor · (number in the file + added) + shift; the score leaves `added` to shift.
+        scores["shift"] = shift + factor * prediction.added
     return _Scored(scores, {"prediction": prediction.reading, "gt": gt.reading}, notes)
 
 
@@ -188,12 +207,20 @@ def scores_of(record: FrameRecord) -> Scores:
 
 
 def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
-    """The request's measures, by key, of depth (H, W) against the scored ground truth (H, W)."""
+    """The request's measures, by key, of depth (H, W) against ground truth (H, W) in metres.
+
+    Ground truth is 0 where it is not scored.
+    """
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}
-    of_pixels = score(torch.from_numpy(depth), torch.from_numpy(truth), request.measures)
-    of_images = {m.key: m.formula(depth, truth) for m in request.measures if m.formula}
-    return {**of_pixels, **of_images}
+    # A measure has a formula of the scored pixels, or one of both images.
+    scores = score(torch.from_numpy(depth), torch.from_numpy(truth), request.measures)
+    scores_of_images = {
+        measure.key: measure.formula(depth, truth)
+        for measure in request.measures
+        if measure.formula is not None
+    }
+    return {**scores, **scores_of_images}
 
 
 def _where_scored(gt: Depth, has_point: Mask | None, rules: Protocol) -> Mask:

@@ -18,38 +18,41 @@ from pnpdepth_cli.io.atomic import atomic_path
 from pnpdepth_cli.sensors.point_cloud import depth_normals
 
 
-def _map(folder: Path, frame: ExportFrame, kind: str) -> Path:
+def _map_file(folder: Path, frame: ExportFrame, kind: str) -> Path:
     """The file of a frame's map in COLMAP's workspace; its kind is "depth" or "normal"."""
     return folder / "stereo" / f"{kind}_maps" / f"{frame.image_name}.geometric.bin"
 
 
 def _files(folder: Path, frames: Sequence[ExportFrame]) -> list[Path]:
     """The maps of all frames, and COLMAP's list of images unless there is one already."""
-    maps = [_map(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
-    image_list = _image_list(folder)
+    maps = [_map_file(folder, frame, kind) for frame in frames for kind in ("depth", "normal")]
+    image_list = _image_list_file(folder)
     return maps if image_list.exists() else [*maps, image_list]
 
 
-def _image_list(folder: Path) -> Path:
+def _image_list_file(folder: Path) -> Path:
     """The list of the images that COLMAP fuses; its image_undistorter writes one as well."""
     return folder / "stereo" / "fusion.cfg"
 
 
 def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]) -> list[str]:
-    """Writes the depth and normal maps, in units of the model; returns lines for a person.
+    """Writes depth and normal maps and the list of images; returns warnings for a person.
 
     Args:
         folder: Output folder, in which the folders of the files are.
         frames: The frames.
         done: Callback after each frame.
     """
+    # The maps (H, W, C); depth in units of the COLMAP model, whatever the unit of the result.
     for frame in frames:
         depth = frame.valid_depth()
-        _write_map(_map(folder, frame, "normal"), depth_normals(depth, frame.camera))
-        _write_map(_map(folder, frame, "depth"), depth[..., None] / frame.unit_scale)
+        depth_in_model_units = depth[..., None] / frame.unit_scale
+        _write_map(_map_file(folder, frame, "normal"), depth_normals(depth, frame.camera))
+        _write_map(_map_file(folder, frame, "depth"), depth_in_model_units)
         done()
-    image_list = _image_list(folder)
-    if image_list in _files(folder, frames):
+    # The images that COLMAP is to fuse. A list that is there already stays.
+    image_list = _image_list_file(folder)
+    if not image_list.exists():
         write_text(image_list, "".join(f"{frame.image_name}\n" for frame in frames))
     return distortion_note(frames, "COLMAP's fusion")
 

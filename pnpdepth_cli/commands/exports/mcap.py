@@ -121,6 +121,7 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
     header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": _CAMERA}
 
     def message(topic: str, kind: str, fields: Mapping[str, Any]) -> OutgoingMessage:
+        """The message of a topic: fields of a ROS type `kind`, with the header of the frame."""
         return OutgoingMessage(topic, kind, time_ns, {"header": header, **fields})
 
     # The pose comes first, so that viewers can place what follows.
@@ -130,15 +131,15 @@ def _messages(frame: ExportFrame, time_ns: int, notes: list[str]) -> Iterator[Ou
         yield OutgoingMessage("/tf", kind, time_ns, {"transforms": [transform]})
     # The image, and the camera of both it and the depth.
     rgb = image_of_size(frame.image, frame.size)
-    info = _camera_info(frame.camera, frame.size)
+    camera_info = _camera_info(frame.camera, frame.size)
     pixels = np.rint(255 * rgb).astype(np.uint8)
-    yield message("/camera/camera_info", "sensor_msgs/msg/CameraInfo", info)
+    yield message("/camera/camera_info", "sensor_msgs/msg/CameraInfo", camera_info)
     yield message("/camera/image", "sensor_msgs/msg/Image", _image(pixels, "rgb8"))
     # Depth and its standard deviation.
     depth = frame.valid_depth()
     nan_where_unknown = np.where(depth > 0, depth, np.float32(np.nan))
     depth_image = _image(nan_where_unknown, "32FC1")
-    yield message("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", info)
+    yield message("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo", camera_info)
     yield message("/camera/depth/image", "sensor_msgs/msg/Image", depth_image)
     if frame.result.sigma is not None:
         sigma = frame.result.read_beside(frame.result.sigma, depth).astype(np.float32)
@@ -316,7 +317,7 @@ def _points_used(frame: ExportFrame, notes: list[str]) -> NDArray[np.float32] | 
             seed=int(seed),
             holdout=float(holdout),
         )
-    # PnpDepthError: a file is gone or damaged. ValueError: a number in the record is none.
+    # PnpDepthError: a file is gone or damaged. ValueError: a setting in the record is no number.
     except (PnpDepthError, ValueError) as error:
         notes.append(f"warning: {frame.result.name}: its points are left out: {error}")
         return None

@@ -79,9 +79,12 @@ def _learn_once(
         listener: Receives what was learnt, and may stop the batch.
 
     Raises:
-        As `_learn`.
+        UsageError: The network takes no points.
+        InputError: A frame cannot be read.
+        DivergedError: The weights diverged.
+        KeyboardInterrupt: The listener stops the batch.
     """
-    # They are there if they were learnt with these settings, from these files.
+    # A digest of the settings and the files. What was decided for the same digest holds still.
     files = [
         {name: fingerprint(path).sha256 for name, path in input_files(lesson)} for lesson in lessons
     ]
@@ -111,27 +114,31 @@ def _learn(lessons: Sequence[RefineRequest], path: Path, listener: Listener) -> 
         DivergedError: The weights diverged.
         KeyboardInterrupt: The listener stops the batch.
     """
-    from safetensors.torch import save_file  # these import torch
+    # Imported where they are used, as they import torch.
+    from safetensors.torch import save_file
 
     from pnpdepth_cli.commands.refinement.requested import read_requested
     from pnpdepth_cli.frames.adapt import learn, reason_not_to_learn, weights_in_place
     from pnpdepth_cli.frames.resolve import resolve_definition
     from pnpdepth_cli.models.network import load_network
 
-    def check() -> None:
+    def stop_if_asked() -> None:
+        """Raises KeyboardInterrupt if the listener stops the batch."""
         if listener.stopped():
             raise KeyboardInterrupt
 
     # The network learns from the frames, if they are enough.
     request = lessons[0]  # all are refined alike
     first = read_requested(request)
-    if why_not := reason_not_to_learn(len(lessons), first):
+    why_not = reason_not_to_learn(len(lessons), first)
+    if why_not is not None:
         return why_not
+    # What the network's definition leaves open is found on the first frame.
     network = load_network(request.model, request.checkpoint, request.device)
     network = resolve_definition(network, first.registered())
     frames = ((lesson.files.name, read_requested(lesson)) for lesson in lessons)
     try:
-        learnt = learn(network, frames, seed=request.method.seed, on_step=check)
+        learnt = learn(network, frames, seed=request.method.seed, on_step=stop_if_asked)
     # The Python API's error does not know of the options.
     except UsageError as error:
         raise UsageError(

@@ -112,7 +112,7 @@ def write_batch_report(
     }
     # What its script sorts and draws by: the first column is a change, unless there are none.
     keys = [measure.key for measure in columns]
-    data = {
+    script_data = {
         "columns": [measure.to_json() for measure in columns],
         "sort_by": keys.index(f"rmse_{AFTER}") if basis == USED else 0,
         "signed": [key for key in keys if key.endswith(_CHANGE)],
@@ -127,11 +127,14 @@ def write_batch_report(
             yield _entry(frame, basis, columns) | views
 
     source = _source(request, folder)
-    report.write_report(folder, source, page, data, entries, viewer=request.html_3d)
+    report.write_report(folder, source, page, script_data, entries, viewer=request.html_3d)
 
 
 def _source(request: BatchRequest, folder: Path) -> dict[str, object]:
-    """What the report is made of, by which it is known later: the batch, seen from the folder."""
+    """The batch that the report is of, by which a later run knows the report as its own.
+
+    It is the path of the batch's output, seen from the report's folder.
+    """
     output = os.path.relpath(os.path.realpath(request.output), os.path.realpath(folder))
     return {"command": "batch", "output": output}
 
@@ -220,7 +223,7 @@ def _columns(basis: str, unit: str) -> list[Measure]:
         basis: What the errors are measured on, a key of `measures.BASES`.
         unit: Unit of the depths.
     """
-    keys = ("mae",) if basis == VALIDATION else ("rmse", "mae")  # what each basis has
+    keys = ("mae",) if basis == VALIDATION else ("rmse", "mae")  # validation points have no RMSE
     columns = []
     for measure in choose_measures(MEASURES, keys):
         change, before, after = (

@@ -252,14 +252,16 @@ def _with_neighbours(frames: list[FrameFiles], reach: int, source: str) -> list[
     """
     with_neighbours = [*frames]
     for indices in sequences_of(frames).values():
+        # A place counts the frames of the sequence, an index all frames.
         for place, index in enumerate(indices):
             first = max(0, place - reach)
             last = min(place + reach, len(indices) - 1)
-            neighbours = [
-                _neighbour(frames[index], frames[indices[near]], abs(near - place), source)
-                for near in range(first, last + 1)
-                if near != place
-            ]
+            neighbours = []
+            for near_place in range(first, last + 1):
+                if near_place != place:
+                    near = frames[indices[near_place]]
+                    apart = abs(near_place - place)
+                    neighbours.append(_neighbour(frames[index], near, apart, source))
             with_neighbours[index] = replace(frames[index], neighbours=tuple(neighbours))
     return with_neighbours
 
@@ -348,7 +350,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
             sources[f"sparse of {points.stem}"] = points
             if neighbour.motion is None:
                 sources[f"image of {points.stem}"] = neighbour.files.image
-    # Masks, and what calibrates the camera.
+    # Masks, and what calibrates the camera, by the user or else by the data set.
     if files.gt is not None:
         sources |= {f"mask {number}": path for number, path in enumerate(files.masks)}
     sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}

@@ -29,15 +29,14 @@ from pnpdepth_cli.frames.method import Method
 
 @contextmanager
 def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterator[Method | None]:
-    """Yields the method with which all frames are refined, open; None if no frame can be read.
-
-    What neither the user nor the network states, such as the layer or the range of the input, is
-    found on a few frames.
+    """Yields the open method that refines all frames; None if none of `deciding` can be read.
 
     Args:
         request: The batch.
-        deciding: These frames, in order. On the first that can be read all of that is found, on two
-            others the range of the input as well, and on all how images are moved to their points.
+        deciding: A few frames of the batch, in order. What neither the user nor the network states,
+            such as the layer, is found on the first that can be read. Two more help to find the
+            range of the network's input. All of them tell how an image must be moved to fit its
+            points.
 
     Raises:
         UsageError: The request combines what cannot be combined.
@@ -48,16 +47,16 @@ def open_method(request: BatchRequest, deciding: Sequence[FrameFiles]) -> Iterat
     if first is None:
         yield None
         return
-    # Where a network states no input range, two others decide as well: of the middle and the end.
+    # Where a network states no input range, two more frames decide: of the middle and the end.
     others = deciding[1:]
     middle_and_end = sorted({len(others) // 2, len(others) - 1}) if others else []
 
-    def more() -> list[ReadFrame]:
-        """The two others, which are read only if they are needed."""
+    def read_more() -> list[ReadFrame]:
+        """The two more frames, of which one or both may not be readable; read if needed."""
         return [*_readable(request, [others[place] for place in middle_and_end])]
 
-    method = load_method(request.refine, first, more)
-    # The images of one camera share a registration, which all of these frames decide.
+    method = load_method(request.refine, first, read_more)
+    # The images of one camera are moved alike, as all deciding frames that can be read tell.
     if first.register == "auto":
         method.share_registration(itertools.chain([first], frames))
     with method:
@@ -120,28 +119,36 @@ class _Steps:
     """None: no frame could be read when the batch began."""
     records: Records
     """Where the results and their records lie."""
-    worked: bool
+    has_worked: bool
     """Whether a frame was refined with these settings before."""
     stopped: Callable[[], bool]
     """Function that is asked before each frame; True ends the batch."""
 
     def read(self, files: FrameFiles) -> _Work:
-        """Reads a frame, with what identifies its files. Runs in one of the reading threads."""
+        """Returns a frame as it was read, or with the error that a file of it raised.
+
+        Runs in one of the reading threads.
+        """
         work = _Work(request=request_of(self.records.request, files))
         with work.step("read"):
+            # First, so that a file that changes while it is read counts as changed in the next run.
             work.state = self.records.state(work.request)
             work.frame = read_requested(work.request)
         return work
 
     def refine(self, reading: Iterable[_Work]) -> Iterator[_Work]:
-        """Yields the frames that were read, refined or with an error. The calling thread runs it.
+        """Yields each frame that was read, with its refined depth or its error.
+
+        The calling thread runs it.
 
         Raises:
             StorageError: Nothing more can be written.
             ModelError, UsageError: An error of the network or the settings, before any frame was
                 refined: it may be one of all frames.
         """
-        is_proven = self.worked or self.method is None
+        # Once a frame was refined, an error of another one is of that frame alone. Without a method
+        # no frame can be refined, and each of them gets a record that says so.
+        is_proven = self.has_worked or self.method is None
         for work in reading:
             if self.stopped():
                 return
@@ -149,8 +156,10 @@ class _Steps:
                 with work.step("refine"):
                     if self.method is None:
                         raise InputError("no frame could be read when the batch began; try again")
+                    # Ground truth scores the depth after each step as well.
                     with_stages = work.frame.gt is not None
                     work.refined = self.method.refine(work.frame, with_stages=with_stages)
+            # An error that may concern all frames ends the batch; any other is this frame's.
             is_proven |= work.refined is not None
             of_all_frames: tuple[type[Exception], ...] = (StorageError,)
             if not is_proven:
@@ -188,7 +197,7 @@ def refine_frames(
     frames: Iterable[FrameFiles],
     method: Method | None,
     records: Records,
-    worked: bool,
+    has_worked: bool,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameRecord, None, None]:
     """Refines and writes each frame; yields the record of each, in their order.
@@ -200,13 +209,13 @@ def refine_frames(
         frames: The frames to refine.
         method: The method, open. None: no frame could be read when the batch began.
         records: Where the results and their records lie.
-        worked: Whether a frame was refined with these settings before.
+        has_worked: Whether a frame was refined with these settings before.
         stopped: Function that is asked before each frame; True ends the batch.
 
     Raises:
         StorageError, ModelError, UsageError: An error of all frames.
     """
-    steps = _Steps(method=method, records=records, worked=worked, stopped=stopped)
+    steps = _Steps(method=method, records=records, has_worked=has_worked, stopped=stopped)
     with (
         closing(in_order(steps.read, frames, THREADS)) as reading,
         closing(in_order(steps.write, steps.refine(reading), THREADS)) as done,

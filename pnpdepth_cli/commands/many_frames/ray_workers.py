@@ -57,18 +57,18 @@ class Worker:
     stack: ExitStack = field(default_factory=ExitStack)
     """Holds the method open until the process ends."""
 
-    def refine(self, frames: Sequence[FrameFiles], worked: bool) -> list[FrameRecord]:
+    def refine(self, frames: Sequence[FrameFiles], has_worked: bool) -> list[FrameRecord]:
         """Refines and writes frames; returns their records.
 
         Args:
             frames: The frames to refine.
-            worked: Whether a frame was refined with these settings before.
+            has_worked: Whether a frame was refined with these settings before.
 
         Raises:
             DeviceError: The process does not see the files.
             StorageError, ModelError, UsageError: An error of all frames.
         """
-        return list(refine_frames(frames, self.method, self.records, worked))
+        return list(refine_frames(frames, self.method, self.records, has_worked))
 
     @functools.cached_property
     def method(self) -> Method | None:
@@ -108,7 +108,7 @@ def refine_on_workers(
     deciding: Sequence[FrameFiles],
     to_do: Sequence[FrameFiles],
     records: Records,
-    worked: bool,
+    has_worked: bool,
     listener: Listener,
 ) -> Iterator[FrameRecord]:
     """Refines and writes frames on Ray workers; yields each record when its frame is done.
@@ -119,7 +119,7 @@ def refine_on_workers(
         deciding: A few frames on which every worker finds what neither user nor network states.
         to_do: The frames to refine.
         records: Where the results and their records lie.
-        worked: Whether a frame was refined with these settings before.
+        has_worked: Whether a frame was refined with these settings before.
         listener: Receives notes, and may stop the batch.
 
     Raises:
@@ -136,7 +136,7 @@ def refine_on_workers(
             start=start,
             records=records,
             listener=listener,
-            worked=worked,
+            has_worked=has_worked,
             waiting=deque(_calls(to_do, count)),
             idle=[start() for _ in range(count)],
         )
@@ -156,7 +156,7 @@ class _Workers:
     """Where the results and their records lie."""
     listener: Listener
     """Receives notes, and may stop the batch."""
-    worked: bool
+    has_worked: bool
     """Whether a frame was refined, so that no error of another is of all."""
     waiting: deque[_Call]
     """Calls that no worker has yet."""
@@ -168,18 +168,21 @@ class _Workers:
     """How many workers died."""
 
     def hand_out(self) -> bool:
-        """Gives calls to the workers. Returns whether any runs; if none does, all is done."""
-        # Until a frame is refined, only one worker has a call, as its error may be of all.
-        while self.idle and self.waiting and (self.worked or not self.running):
+        """Gives calls that wait to idle workers. Returns whether any worker has a call.
+
+        If none has, the batch is done or stopped.
+        """
+        # Until a frame is refined, an error may concern all frames, so only one worker has a call.
+        while self.idle and self.waiting and (self.has_worked or not self.running):
             if self.listener.stopped():
                 break
             worker = self.idle.pop()
             call = self.waiting.popleft()
-            self.running[worker.refine.remote(call.frames, self.worked)] = worker, call
+            self.running[worker.refine.remote(call.frames, self.has_worked)] = worker, call
         if not self.running:
             return False
         # Workers without a call end, and leave their device to those that have one.
-        while self.idle and self.worked:
+        while self.idle and self.has_worked:
             self.ray.kill(self.idle.pop())
         return True
 
@@ -202,14 +205,14 @@ class _Workers:
         except self.ray.exceptions.RayError as error:
             reason = one_line(error)
             self.deaths += 1
-            if self.deaths == _DEATHS and not self.worked:
+            if self.deaths == _DEATHS and not self.has_worked:
                 raise DeviceError(f"Ray workers die: {reason}") from None
             self.listener.say(f"warning: a worker died ({reason})")
             worker = self.start()
             again, done = _after_death(call, self.records, reason)
             self.waiting.extend(again)
         self.idle.append(worker)
-        self.worked |= any(record.status != "failed" for record in done)
+        self.has_worked |= any(record.status != "failed" for record in done)
         return done
 
 

@@ -116,7 +116,7 @@ class Records:
         It is done if it has a result with its present settings and files.
         """
         record = self.find(frame)
-        if isinstance(record, str):  # why there is none
+        if isinstance(record, str):  # why there is no record
             return record
         if record.batch is None or record.status == "failed":
             return "failed before"
@@ -175,7 +175,9 @@ class Records:
         pose = request.files.pose
         if pose is not None:
             # + 0.0 makes 0 of −0, which JSON tells apart.
-            settings["pose"] = [[round(x, _POSE_DECIMALS) + 0.0 for x in row] for row in pose]
+            settings["pose"] = [
+                [round(number, _POSE_DECIMALS) + 0.0 for number in row] for row in pose
+            ]
         text = json.dumps(settings, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -217,7 +219,7 @@ def _code_of(request: RefineRequest) -> dict[str, object]:
 def _identity(spec: str) -> tuple[str, str | None]:
     """The name and the SHA-256 of a file; the spec and None if it names no file.
 
-    The name has no folder, so that a batch may be moved, but the part of FILE:PART.
+    The name has no folder, so that a batch may be moved. Of FILE:PART it keeps the part.
 
     Args:
         spec: FILE, FILE:PART, or another name, such as that of a network.

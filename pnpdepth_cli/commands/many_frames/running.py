@@ -19,7 +19,7 @@ def refine_all(
     to_do: Sequence[FrameFiles],
     frames: Sequence[FrameFiles],
     of_frame: Mapping[str, Records],
-    worked: bool,
+    has_worked: bool,
     listener: Listener,
 ) -> Generator[FrameRecord, None, None]:
     """Refines and writes frames; yields the record of each.
@@ -30,7 +30,7 @@ def refine_all(
             them, so that it is the same in every run and shard.
         of_frame: The records that each frame belongs to, by its name. Frames with the same records
             are refined with the same weights.
-        worked: Whether a frame was refined with these settings before.
+        has_worked: Whether a frame was refined with these settings before.
         listener: Receives notes, and may stop the batch.
 
     Raises:
@@ -45,10 +45,10 @@ def refine_all(
         all_alike = [frame for frame in frames if of_frame[frame.name] is records]
         deciding = [all_alike[place] for place in spread(len(all_alike))]
         if records.request.ray is not None:
-            yield from refine_on_workers(deciding, to_do_alike, records, worked, listener)
+            yield from refine_on_workers(deciding, to_do_alike, records, has_worked, listener)
         else:
             with open_method(records.request, deciding) as method:
-                yield from refine_frames(to_do_alike, method, records, worked, listener.stopped)
+                yield from refine_frames(to_do_alike, method, records, has_worked, listener.stopped)
         if listener.stopped():
             return
 

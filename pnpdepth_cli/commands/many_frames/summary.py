@@ -53,7 +53,7 @@ class BatchSummary:
     titles: dict[str, str]
     """What each stage is, in words."""
     weights: dict[str, dict[str, float]]
-    """Mean, least and largest weight of each expert of the default method, by name."""
+    """Mean, least and largest weight of each depth that the default method fuses, by name."""
     frame_notes: dict[str, list[str]]
     """Warnings, notes and unsure guesses, each once, with the names of the frames that have it."""
     unmatched: list[str]
@@ -134,11 +134,10 @@ def _counts(batch: BatchFrames, records: Sequence[FrameRecord]) -> dict[str, int
 
 
 def _weights_of(results: Sequence[ResultRecord]) -> dict[str, dict[str, float]]:
-    """Mean, least and largest weight of each expert over the frames, by the expert's name.
+    """Mean, least and largest weight over the frames of each depth that is fused, by its name.
 
-    The experts are what is fused to the result: the depth of each network, and linear
-    interpolation. One that a frame lacks has weight 0 there; frames without weights, as of other
-    methods, are left out.
+    These are the depth of each network, and linear interpolation. One that a frame lacks has weight
+    0 there; frames without weights, as of other methods, are left out.
     """
     of_frames = [result.weights for result in results if result.weights]
     weights = dict[str, dict[str, float]]()
@@ -155,11 +154,12 @@ def _weights_of(results: Sequence[ResultRecord]) -> dict[str, dict[str, float]]:
 def _titles(
     results: Sequence[ResultRecord], weights: Mapping[str, Mapping[str, float]]
 ) -> dict[str, str]:
-    """What each stage of a frame is, in words, by stage; empty without any result.
+    """What each stage of the refinement is, in words, by stage; empty without any result.
 
     Args:
         results: The results of the batch, which are all made alike.
-        weights: Weights of experts, of `_weights_of`, whose means the titles have.
+        weights: Weights of what is fused to the results, as `_weights_of` returns them. The titles
+            show the means.
     """
     if not results:
         return {}
@@ -189,6 +189,7 @@ def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
         frames_of_notes[note] = names
 
     def is_no_warning(entry: tuple[str, list[str]]) -> bool:
+        """Whether the note of an entry (note, names of frames) is none that begins with warning."""
         return not entry[0].startswith("warning")
 
     return dict(sorted(frames_of_notes.items(), key=is_no_warning))  # False comes first

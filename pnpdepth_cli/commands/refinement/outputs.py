@@ -37,7 +37,7 @@ from pnpdepth_cli.scan_pattern import scan_pattern
 from pnpdepth_cli.sensors.lens import rays_of
 from pnpdepth_cli.sensors.point_cloud import kept_pixels
 
-_MUCH = 0.1
+_LEAST_NOTED = 0.1
 """Fraction of an image outside of the points above which a note says so."""
 
 LARGEST_VIEW = 200_000
@@ -56,7 +56,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     Without -o, the folder is named after the image, or the first other input.
 
     Raises:
-        OutputError: One exists and may not be replaced, or is one of the inputs.
+        OutputError: One exists and may not be replaced, or is one of the inputs; or -o names
+            another file than a depth file.
         UsageError: A standard deviation is asked for, and a file is named and no folder.
     """
     # Where results go without -o.
@@ -66,7 +67,8 @@ def plan_outputs(request: RefineRequest) -> Outputs:
     output = request.output or Path(f"{inputs[0].stem}_refined")
     suffix = output.suffix.lower()
     formats = " ".join(DEPTH_SUFFIXES)
-    # A depth file alone, or all files in a folder.
+    # A depth file alone, or all files in a folder. A name that ends in a dot and letters is taken
+    # for another file, unless there is such a folder.
     if suffix in DEPTH_SUFFIXES:
         if request.uncertainty:
             raise UsageError(f"--uncertainty writes a second file; name a folder, not {output}")
@@ -84,12 +86,17 @@ def remove_outdated(outputs: Outputs) -> None:
     """Removes the record of an earlier result, and its files that are not written again.
 
     The record goes first, so that none names files of two runs.
+
+    Args:
+        outputs: The files of the new result, by kind. Without a record, nothing is removed.
     """
     record = outputs.get("record")
     if record is None:
         return
+    # An earlier result may have another format, so files with the endings of every format go.
     endings = {end for suffix in DEPTH_SUFFIXES for end in endings_of(suffix).values()}
-    written = {path for kind, path in outputs.items() if kind != "improvement"}  # not of each frame
+    # An improvement map may not be written this time, so an earlier one goes as well.
+    written = {path for kind, path in outputs.items() if kind != "improvement"}
     outdated = {record.with_name(record.stem + end) for end in endings} - written
     for path in (record, *sorted(outdated)):
         remove_file(path)
@@ -108,17 +115,18 @@ def without_unknown(request: RefineRequest, inputs: ReadFrame, frame: Refined) -
     # Depth is supported where it is valid; that is known if it was asked for.
     if request.unknown == "zero" and frame.valid is not None:
         return replace(frame, depth=np.where(frame.valid, frame.depth, np.float32(0)))
-    # A mask says it already, and points of other sensors leave no large part of an image out.
+    # A frame with a mask of valid depth needs no note. Nor do points of other sensors, which leave
+    # no large part of an image out.
     source = inputs.sources["sparse"]
     is_scan = source.kind == "scan" or scan_pattern(frame.used.xy, frame.used.size)
     if frame.valid is not None or not is_scan:
         return frame
-    outside = 1 - float(in_hull(frame.used).double().mean())
-    if outside <= _MUCH:
+    fraction_outside = 1 - float(in_hull(frame.used).double().mean())
+    if fraction_outside <= _LEAST_NOTED:
         return frame
     note = (
-        f"note: {100 * outside:.0f} % of the pixels lie outside of the scan's points, and their"
-        " depth is a guess; --unknown zero writes 0 where points do not support it"
+        f"note: {100 * fraction_outside:.0f} % of the pixels lie outside of the scan's points, and"
+        " their depth is a guess; --unknown zero writes 0 where points do not support it"
     )
     return replace(frame, notes=(*frame.notes, note))
 
@@ -173,8 +181,8 @@ def write_outputs(
 def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
     """The held-out points, else the validation points, with the depths there; None without any.
 
-    Held-out points have no part in the result; validation points choose and weigh its experts, but
-    the depths that are compared there were made without them.
+    Held-out points have no part in the result; validation points choose and weigh what is fused,
+    but the depths that are compared there were made without them.
     """
     held_out = inputs.held_out
     validation = frame.validation
@@ -273,10 +281,13 @@ def _rays(camera: Camera, size: tuple[int, int]) -> NDArray[np.float64]:
         camera: The camera in pixels of the image.
         size: (H, W) of the image.
     """
-    # As many nodes a pixel along both sides, both ends among them.
-    rows, columns = (
-        np.linspace(0, side - 1, 2 + _RAY_NODES * (side - 1) // max(size)) for side in size
-    )
+    # Nodes along each side: both end pixels, and between them as many as its length asks for.
+    longer_side = max(size)
+    positions = []
+    for side in size:
+        inner_nodes = _RAY_NODES * (side - 1) // longer_side
+        positions.append(np.linspace(0, side - 1, 2 + inner_nodes))
+    rows, columns = positions
     xy = np.stack(np.meshgrid(columns, rows), axis=-1)
     return rays_of(camera, xy.reshape(-1, 2)).reshape(xy.shape)
 

@@ -152,6 +152,7 @@ class BatchRequest:
     """Options that a study varies, and their values here, as the user wrote them."""
 
     def __post_init__(self) -> None:
+        """Raises UsageError for options that do not go together, or an unknown measure."""
         if self.adapt and self.shard is not None:
             raise UsageError("--adapt does not go with --shard; weights are learnt in one process")
         if self.html_3d and self.html is None:
@@ -171,10 +172,10 @@ class BatchRequest:
 
     @property
     def reading(self) -> ReadOptions:
-        """How the files of every frame are read, with the points that the protocol has.
+        """How the files of every frame are read: as the user says, and as the protocol says.
 
-        Points that the user asks for go before those of the protocol. Which LiDAR points of a
-        background behind others are removed is the protocol's alone.
+        Both may say which points are sampled from the ground truth; then the user's pattern counts.
+        The filter of LiDAR points behind the foreground is the protocol's alone.
         """
         options = self.refine.reading
         if self.protocol is None:

@@ -47,6 +47,7 @@ class CloudRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        """Raises UsageError or OutputError for options that cannot be used."""
         if self.output.suffix.lower() != ".ply":
             raise OutputError(f"{self.output}: a cloud is written as PLY; name it NAME.ply")
         if self.pose_kind is not None and self.poses is None:

@@ -84,6 +84,7 @@ class EvalRequest:
     )
 
     def __post_init__(self) -> None:
+        """Raises UsageError for an unknown protocol or measure, or a setting out of its range."""
         for flag, value, bound in (
             ("--pred-scale", self.pred_scale, 0.0),
             ("--gt-scale", self.gt_scale, 0.0),

@@ -35,6 +35,7 @@ class FramesRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        """Raises UsageError for frame numbers or a time that cannot be."""
         if self.between is not None and not 0 <= self.between[0] <= self.between[1]:
             first, last = self.between
             raise UsageError(f"--between {first} {last} has no frame; give FIRST LAST, from 0")

@@ -171,8 +171,9 @@ def interval(
     sample (Hall 1992, equation 5), whichever is farther out. NaN for fewer than MIN_CLUSTERS.
 
     Args:
-        statistic: Function of the mean of each run, or of as many means (G,), which it keeps apart.
-        values: (N,) of each run, of the same frames.
+        statistic: Function of one mean a run. The means are numbers, or arrays (G,) of which it
+            returns the statistic element by element.
+        values: (N,) values of each run, of the same frames, NaN where a frame has none.
         clusters: Clusters of the frames.
     """
     from scipy import stats
@@ -187,18 +188,21 @@ def interval(
     value = float(statistic(*(totals / frames)))
     without_one = statistic(*((totals[:, None] - sums) / (frames - counts)))
     pseudo_values = size * value - (size - 1) * without_one
-    # Their standard error and the skewness of their mean; none of what is equal but for rounding.
-    error = float(stats.sem(pseudo_values))
+    # Their standard error, and the skewness of their mean. Values that are equal but for rounding
+    # have none.
+    standard_error = float(stats.sem(pseudo_values))
     skew = 0.0
-    if error > _LEAST_SPREAD * max(abs(value), 1.0):
+    if standard_error > _LEAST_SPREAD * max(abs(value), 1.0):
         skew = float(stats.skew(pseudo_values, bias=False)) / math.sqrt(size)
-    # How many standard errors each end lies away: the low one by `reach`, the high one by −`reach`.
+    # Each end is value − t · standard error. By Student's distribution, t is `reach` at the low end
+    # and −`reach` at the high one.
     reach = float(stats.t.ppf((1 + LEVEL) / 2, size - 1))
     t = np.array([reach, -reach])
     if abs(skew) >= _LEAST_SKEW:
         t = 3 / skew * (np.cbrt(1 + skew * (t - skew / 6)) - 1)
+    # Corrected, neither end comes nearer than `reach`, or moves out beyond _WIDEST times that.
     below, above = np.clip([t[0], -t[1]], reach, _WIDEST * reach).tolist()
-    return value - below * error, value + above * error
+    return value - below * standard_error, value + above * standard_error
 
 
 def swap_p_value(first: Floats, other: Floats, clusters: Clusters) -> float:

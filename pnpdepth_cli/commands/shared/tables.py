@@ -60,7 +60,7 @@ _LEAST_SAVED = 8
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 """A comma between groups of three digits, which LaTeX's columns of numbers do not have."""
 _LEAST_WEIGHT = 0.005
-"""Weight of an expert below which its text would be 0 %."""
+"""Weight of a fused depth below which its text would be 0 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,8 @@ def short_names(names: Sequence[str]) -> list[str]:
     What is shared ends at a separator, so that numbers stay whole. All names are in full where that
     would save little.
     """
-    # Parts that all names have at the start; of what is behind the next one, those at the end.
+    # How many parts all names share at the start, and how many at the end of what follows the
+    # first part that differs.
     parts_of_names = [_SEPARATOR.split(name) for name in names]
     start = _shared_parts(parts_of_names)
     ends_reversed = [parts[start + 1 :][::-1] for parts in parts_of_names]
@@ -255,7 +256,7 @@ def _errors_table(
     result = by_stage[AFTER]
     linear = by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
-    measures = [m for m in chosen if m.key in result and (keys or m.main)]
+    measures = [measure for measure in chosen if measure.key in result and (keys or measure.main)]
     rows = []
     for stage in [stage for stage in titles if stage in by_stage]:
         scores = by_stage[stage]
@@ -263,7 +264,10 @@ def _errors_table(
         # A stage that not all frames have is a mean over others than the result.
         if scores.get("frames") != result.get("frames"):
             title += f" (over {scores['frames']:,} frames)"
-        texts = [m.text(scores.get(m.key), unit if m.unit == "m" else m.unit) for m in measures]
+        texts = [
+            measure.text(scores.get(measure.key), unit if measure.unit == "m" else measure.unit)
+            for measure in measures
+        ]
         style: Style = "bold" if stage == AFTER else ""
         row: list[Cell] = [(text, style) for text in (title, *texts)]
         if stage == LINEAR:
@@ -293,7 +297,7 @@ def _count_text(scores: Scores) -> str:
 def stage_titles(result: ResultRecord) -> dict[str, str]:
     """Returns what each stage of a frame is, in words, by stage in the order of the refinement.
 
-    The result is no stage of its own where it is the network's last stage: then that one is named.
+    Where the result is the depth of the network's last step, that step has no title of its own.
     """
     method = result.method
     name = method.networks[0].name
@@ -306,8 +310,8 @@ def stage_titles(result: ResultRecord) -> dict[str, str]:
         titles[UPDATED] = f"{name}, {count_of(updates, 'update')} of z"
     if method.propagation != "none":
         titles[PROPAGATED] = f"{name}, residual propagated"
-    # The result: the last of these steps, if no other expert has a weight; else what is fused.
-    weighted = [expert for expert, weight in result.weights.items() if weight > 0]
+    # The result: the last of these steps, unless other depth is fused with it; then what is fused.
+    weighted = [fused for fused, weight in result.weights.items() if weight > 0]
     if not weighted or weighted == [name]:
         _, titles[AFTER] = titles.popitem()
     else:
@@ -320,6 +324,7 @@ def stage_titles(result: ResultRecord) -> dict[str, str]:
 def names_of_depths(result: ResultRecord) -> tuple[str, str]:
     """Returns what the depth before and the depth after of a result are of, in a few words."""
     titles = stage_titles(result)
+    # Where nothing changed the prediction, it is the result, which then has the only title.
     return titles.get(BEFORE, titles[AFTER]), titles[AFTER]
 
 
