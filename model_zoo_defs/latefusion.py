@@ -113,7 +113,12 @@ class NormalCell(nn.Module):
         self.earlier3_too = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        """Returns (B, 6·width, h, w) from the last two features, the later (B, later, h, w)."""
+        """Returns (B, 6·width, h, w) from the last two features.
+
+        Args:
+            earlier: The features before the last (B, earlier, h, w), or of twice the size.
+            later: The last features (B, later, h, w).
+        """
         earlier = self.earlier(earlier)
         later = self.later(later)
         # The earlier features and five sums of two.
@@ -151,10 +156,15 @@ class ReductionCell(nn.Module):
         self.first3 = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        """Returns (B, 4·width, h/2, w/2) from the last two features, the later (B, later, h, w)."""
+        """Returns (B, 4·width, h/2, w/2) from the last two features.
+
+        Args:
+            earlier: The features before the last (B, earlier, h, w), or of twice the size.
+            later: The last features (B, later, h, w).
+        """
         earlier = self.earlier(earlier)
         later = self.later(later)
-        # Sums of two at half the size; the first goes into two of those that are concatenated.
+        # The cell's five sums of two, at half the size. The first goes into the fourth and fifth.
         first = self.later5(later) + self.earlier7(earlier)
         largest = F.max_pool2d(later, 3, 2, 1)
         second = largest + self.earlier7_too(earlier)

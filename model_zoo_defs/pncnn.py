@@ -36,7 +36,10 @@ def named(**layers: nn.Module) -> nn.Sequential:
 
 
 def two_convolutions(channels: int, out: int) -> nn.Sequential:
-    """Returns 3×3 convolution, batch norm, ReLU, twice: `channels` → `out` channels."""
+    """Returns 3×3 convolution, batch norm, ReLU, twice: `channels` → `out` channels.
+
+    They are within a layer `conv`, as in the published weights.
+    """
     layers: list[nn.Module] = []
     for count in (channels, out):
         layers += [nn.Conv2d(count, out, 3, padding=1), nn.BatchNorm2d(out), nn.ReLU(inplace=True)]

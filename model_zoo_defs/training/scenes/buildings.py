@@ -8,6 +8,11 @@ from model_zoo_defs.training.rendering.shapes import Group, box, cylinder, prism
 from model_zoo_defs.training.scenes.kit import Kit
 from model_zoo_defs.training.scenes.walls import Hole, wall
 
+_ROW_END_M = 95.0
+"""Distance along the street at which a row of houses ends."""
+_OWN_HOUSES_END_M = 40.0
+"""Distance along the street beyond which every house is one of the three that repeat."""
+
 
 def building(kit: Kit, width: float) -> Group:
     """Returns a house whose front lies along x at y = 0 and looks toward -y."""
@@ -104,7 +109,7 @@ def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
 
 
 def _balcony(kit: Kit, group: Group, x: float, z: float, width: float) -> None:
-    """Adds a balcony of a door `w` wide, in the middle of its floor's edge at (x, z)."""
+    """Adds a balcony of a door of this width, in the middle of its floor's edge at (x, z)."""
     wide = width + 0.8
     group.add(box(wide, 1.0, 0.12), kit.palette.new("plain", (0.6, 0.6, 0.58)), (x, -0.5, z))
     steel = kit.metal()
@@ -152,13 +157,22 @@ def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin:
 
 
 def row(kit: Kit, group: Group, side: float, x: float) -> None:
-    """Adds a row of houses, garden walls and gaps along one side of the road."""
-    style = kit.rng.random()
+    """Adds a row of houses, garden walls and gaps along one side of the road.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        side: 1 for the right side of the road, which runs along +y; -1 for the left one.
+        x: Distance of the row from the middle of the road in metres.
+    """
+    # A closed row has few gaps, an open one many. Most houses are copies of three.
+    is_closed = kit.rng.random() < 0.6
     y = kit.size(-12, 5)
-    gaps = 0.1 if style < 0.6 else 0.6
+    gap_chance = 0.1 if is_closed else 0.6
     kinds = [building(kit, kit.size(6, 16)) for _ in range(3)]
-    while y < 95:
-        if kit.chance(gaps):
+    while y < _ROW_END_M:
+        # A gap, mostly behind a garden wall.
+        if kit.chance(gap_chance):
             length = kit.size(3, 15)
             if kit.chance(0.6):
                 material = kit.surface("brick", "plaster", "paving", tile_m=1.5, vivid=0.1)
@@ -167,9 +181,10 @@ def row(kit: Kit, group: Group, side: float, x: float) -> None:
                 )
             y += length
             continue
+        # A house; its front, which looks toward -y, is turned to the road.
         house = (
             building(kit, kit.size(6, 16))
-            if kit.chance(0.3) and y < 40
+            if kit.chance(0.3) and y < _OWN_HOUSES_END_M
             else kinds[int(kit.rng.integers(3))]
         )
         lower, upper = house.bounds()

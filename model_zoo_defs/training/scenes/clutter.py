@@ -35,7 +35,7 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 
 def gadget(kit: Kit) -> Group:
-    """Returns a toy-like pile of rounded bodies."""
+    """Returns a toy-like pile of rounded bodies on z = 0."""
     group = Group()
     z = 0.0
     for _ in range(int(kit.rng.integers(1, 4))):
@@ -50,11 +50,12 @@ def gadget(kit: Kit) -> Group:
 
 
 def ring(kit: Kit) -> Group:
-    """Returns a ring, flat or leaning."""
+    """Returns a ring on z = 0, flat or leaning."""
     group = Group()
     radius = kit.size(0.03, 0.1)
     thick = radius * kit.size(0.1, 0.5)
     pitch = kit.size(0, 1.4)
+    # So high that the lowest point of the leaning ring touches the ground.
     group.add(
         torus(radius, thick),
         kit.any_surface(),

@@ -90,10 +90,10 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
 
 
 def desk(kit: Kit) -> Group:
-    """Returns a writing desk with a screen and clutter."""
+    """Returns a writing desk with a screen and clutter; one in five is a mere table."""
     group = table(kit, width=kit.size(1.1, 1.8))
-    top = 0.0
     if kit.chance(0.8):
+        # As wide as the table, but a plain board on two sides, at a desk's height.
         lower, upper = group.bounds()
         top = 0.74
         group = Group()
@@ -102,6 +102,7 @@ def desk(kit: Kit) -> Group:
         group.add(box(width, 0.7, 0.03), wood, (0, -0.35, top - 0.03))
         for side in (-1, 1):
             group.add(box(0.03, 0.65, top - 0.03), wood, (side * (width / 2 - 0.02), -0.35, 0))
+        # Screen, keyboard and small things in front of it.
         group.insert(monitor(kit), (kit.size(-0.2, 0.2), -0.2, top), yaw=kit.size(-0.3, 0.3))
         group.add(box(0.42, 0.14, 0.02), kit.dark(), (0, -0.5, top))
         scatter(
@@ -184,8 +185,15 @@ def _fill_shelf(
 
 
 def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
-    """Returns a closed cupboard with door panels, joints and handles."""
+    """Returns a closed cupboard with door panels, joints and handles.
+
+    Args:
+        kit: Random numbers and materials.
+        hang: Height of its bottom on the wall in metres. 0: it stands on the floor, may be taller
+            and deeper, and may have things on its top.
+    """
     group = Group()
+    # The body, lower and less deep if it hangs, and its doors.
     front = (
         kit.wood()
         if kit.chance(0.5)
@@ -199,6 +207,7 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
         height = kit.size(0.5, 0.8)
     group.add(box(width, depth, height), front, (0, -depth / 2, hang))
     _doors(kit, group, (width, depth, height), hang, front)
+    # Things on its top, where one is seen from above.
     if height < 1.3 and not hang:
         scatter(
             kit,
@@ -211,14 +220,22 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
 
 
 def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, front: int) -> None:
-    """Adds doors with handles to the front of a body of this width, depth and height at z."""
+    """Adds doors or drawers with handles to the front of a body, whose back is on y = 0.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        size: Width, depth and height of the body in metres.
+        z: Height of its bottom in metres.
+        front: Material of the doors.
+    """
     width, depth, height = size
     steel = kit.metal()
     # Rows and columns of doors or drawers, with handles of one style.
     columns = max(1, round(width / kit.size(0.4, 0.6)))
     rows = int(kit.rng.integers(1, 5)) if height > 0.6 else 1
     style = int(kit.rng.integers(3))
-    gap = 0.006
+    gap = 0.006  # metres, on each side of a door
     for column in range(columns):
         for row in range(rows):
             wide = width / columns

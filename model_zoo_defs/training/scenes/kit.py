@@ -17,7 +17,7 @@ class Kit:
     palette: Palette
 
     def size(self, low: float, high: float) -> float:
-        """Returns a length between the two, in metres."""
+        """Returns a random number between the two: a length in metres, an angle, a fraction."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:

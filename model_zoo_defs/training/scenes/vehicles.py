@@ -57,6 +57,15 @@ def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Me
 
 
 def _wheels(kit: Kit, group: Group, track: float, axles: tuple[float, ...], radius: float) -> None:
+    """Adds a wheel on both sides of each axle, standing on z = 0.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        track: Distance of the wheels' middle planes from x = 0 in metres.
+        axles: Each axle's y in metres.
+        radius: Radius of the wheels in metres.
+    """
     tyre = kit.dark()
     hub = kit.metal()
     for y in axles:
