@@ -169,6 +169,7 @@ def case_of(
 
 
 def _drawn(known: NDArray[np.bool_], rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """Returns rows and columns of up to `PIXELS` known pixels of a mask (H, W), at random."""
     rows, columns = np.nonzero(known)
     chosen = rng.choice(len(rows), min(PIXELS, len(rows)), replace=False)
     return rows[chosen], columns[chosen]
@@ -227,12 +228,17 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
 
 
 def ratios(
-    of: Sequence[Case], counts: Iterable[int], draws: int, outliers: str | None
+    all_cases: Sequence[Case], counts: Iterable[int], draws: int, outliers: str | None
 ) -> dict[tuple[int, int, int, str], float]:
-    """log(MAE / MAE of least squares) by case, count, draw and what is stated."""
-    found = {}
-    for number, case in enumerate(of):
+    """Returns log(MAE / MAE of least squares) by index of the case, count, seed and definition.
+
+    The definition is "stated", which says what the numbers are, or "open", which does not. An
+    alignment that is refused counts as least squares.
+    """
+    log_ratios = {}
+    for number, case in enumerate(all_cases):
         for count in counts:
+            # A frame with too few pixels for so many points.
             if count > 0.8 * len(case.x):
                 continue
             for seed in range(draws):
@@ -244,18 +250,18 @@ def ratios(
                     except PnpDepthError:
                         mae = plain
                     if not math.isnan(mae):
-                        found[number, count, seed, name] = math.log(mae / plain)
-    return found
+                        log_ratios[number, count, seed, name] = math.log(mae / plain)
+    return log_ratios
 
 
-def table(of: Sequence[Case], outliers: str | None) -> None:
+def table(all_cases: Sequence[Case], outliers: str | None) -> None:
     """Prints the ratios of every set and network."""
-    found = ratios(of, COUNTS, DRAWS, outliers)
+    found = ratios(all_cases, COUNTS, DRAWS, outliers)
     groups = defaultdict[tuple[str, str, str], dict[tuple[int, str], list[float]]](
         lambda: defaultdict(list)
     )
     for (number, count, _, name), value in found.items():
-        case = of[number]
+        case = all_cases[number]
         groups[case.set, case.network, case.output][count, name].append(value)
     heads = [f"{name}, {count}" for name in ("stated", "open") for count in COUNTS]
     print_row("set", "network", "its numbers", *heads, head=True)
@@ -318,9 +324,13 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
 """By constant: where it is, and the values that are tried."""
 
 
-def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str | None]) -> None:
+def trial(
+    all_cases: Sequence[Case], constants: Iterable[str], outliers: Sequence[str | None]
+) -> None:
     """Prints the value of each constant that is chosen with each set and network left out."""
-    of = [case for case in of if case.set != "strong" and not case.set.startswith("tum")]
+    all_cases = [
+        case for case in all_cases if case.set != "strong" and not case.set.startswith("tum")
+    ]
     print_row("constant", "value", "ratio to the shipped value, by left out", head=True)
     # The log ratios of every case with each value of the constant.
     for constant in constants:
@@ -331,13 +341,13 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
                 found[value_name] = {
                     (kind, *key): ratio
                     for kind in outliers
-                    for key, ratio in ratios(of, COUNTS[:-1], 1, kind).items()
+                    for key, ratio in ratios(all_cases, COUNTS[:-1], 1, kind).items()
                 }
         # Of each set and network: what the other ones choose, and what that costs on it.
         shipped = next(name for name, v in values.items() if v == getattr(module, attribute))
         for field in ("set", "network"):
-            for left_out in sorted({getattr(case, field) for case in of}):
-                inside = {n for n, case in enumerate(of) if getattr(case, field) == left_out}
+            for left_out in sorted({getattr(case, field) for case in all_cases}):
+                inside = {n for n, case in enumerate(all_cases) if getattr(case, field) == left_out}
                 mean = {
                     name: [
                         np.mean([v for key, v in logs.items() if (key[1] in inside) == is_inside])
@@ -364,11 +374,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="at most so many frames of each set")
     parser.add_argument("--every", type=int, default=1, help="only every nth case")
     args = parser.parse_args()
-    of = list(cases(args.data, args.rendered, args.frames))[:: args.every]
+    all_cases = list(cases(args.data, args.rendered, args.frames))[:: args.every]
     if args.trial:
-        trial(of, args.trial, (None, args.outliers) if args.outliers else (None,))
+        trial(all_cases, args.trial, (None, args.outliers) if args.outliers else (None,))
     else:
-        table(of, args.outliers)
+        table(all_cases, args.outliers)
 
 
 if __name__ == "__main__":

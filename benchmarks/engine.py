@@ -244,9 +244,11 @@ def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, li
 
 
 def main() -> None:
+    """Measures the networks in turn, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=15)
-    parser.add_argument("--only", nargs="+", default=[case.name for case in ZOO])
+    parser.add_argument("--runs", type=int, default=15, help="runs of each variant")
+    all_names = [case.name for case in ZOO]
+    parser.add_argument("--only", nargs="+", default=all_names, help="only these networks")
     args = parser.parse_args()
     results = []
     for case in ZOO:
@@ -259,9 +261,11 @@ def main() -> None:
         " of a forward pass unless noted\n"
     )
     for number, row in enumerate(results):
-        if not number:
+        # The head is the names of the first row's cells.
+        if number == 0:
             print_row(*row, head=True)
-        print_row(*(f"{v:.3g}" if isinstance(v, float) else v for v in row.values()))
+        cells = [f"{cell:.3g}" if isinstance(cell, float) else cell for cell in row.values()]
+        print_row(*cells)
 
 
 if __name__ == "__main__":

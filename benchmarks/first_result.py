@@ -270,6 +270,7 @@ def measure(case: Case, folder: Path, runs: int) -> dict[str, list[Spent]]:
 
 
 def main() -> None:
+    """Measures the networks in turn, and prints a table as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fastdepth", type=Path, help="ONNX file of FastDepth")
     parser.add_argument("--runs", type=int, default=3)

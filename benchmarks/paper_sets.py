@@ -26,7 +26,7 @@ VIEWS = 4  # of one scene; frames are rendered a scene at a time
 
 
 def cut_by(frame: EvalFrame, part: FramePart) -> EvalFrame:
-    """What a protocol leaves of the frame."""
+    """Returns the frame with all of its images cut to the part that a protocol scores."""
     images = {name: getattr(frame, name) for name in ("rgb", "gt", "sensor", "pool")}
     left = {name: part.apply(image) for name, image in images.items() if image is not None}
     return replace(frame, **{name: np.ascontiguousarray(image) for name, image in left.items()})
@@ -78,6 +78,7 @@ def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
 
 
 def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
+    """Renders so many frames into shards in a folder. Raises UsageError without the renderer."""
     try:
         from model_zoo_defs.training.rendering.render import Job, render_all
     except ImportError as error:
@@ -96,6 +97,7 @@ def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
 
 
 def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator[EvalFrame]:
+    """Yields the first `count` frames of the shards, those of streets with a LiDAR scan."""
     for first, path in zip(range(0, count, VIEWS), shards, strict=True):
         with np.load(path) as shard:
             views = list(zip(shard["rgb"], shard["depth"], shard["intrinsics"], strict=True))
@@ -136,6 +138,10 @@ def shared(root: Path, most: int) -> list[FrameSet]:
 
 
 def _shared_frame(frame: EvalFrame) -> EvalFrame:
+    """Returns a real frame as its protocol scores it: near enough, and rooms without their border.
+
+    The points of a street are drawn from its scan.
+    """
     if frame.sensor is None:
         gt = within(frame.gt, ROOM_LIMIT)
         return cut_by(replace(frame, gt=gt), NYU_PART)

@@ -132,6 +132,7 @@ def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A network's line in the tables: means over the frames."""
 
     def mean(*path: str | int) -> float:
+        """Returns the mean over the frames of what these keys lead to, one in the other."""
         values: list[Any] = list(frames)
         for key in path:
             values = [value[key] for value in values]

@@ -112,10 +112,11 @@ class Passes:
         return split_frame
 
     def _refine(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Returns `OpenNetwork.refine` with its seconds summed up and its passes under a step.
+        """Returns `OpenNetwork.refine` with its seconds summed up and its passes counted.
 
-        Within no other step it is named by the points that it gets: all, or those that remain
-        beside the validation points.
+        They are counted under the step that calls it. Outside of `STEPS`, "validation points" is
+        the step that refines without the validation points, "all points" the one that refines with
+        them.
         """
 
         def run(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Any:
@@ -243,6 +244,7 @@ def report(title: str, network: Network, frame: Frame, settings: Settings) -> No
 
 
 def main() -> None:
+    """Counts the passes of each network, method and number of points, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
     parser.add_argument("--methods", nargs="+", default=["fused", "alone"])

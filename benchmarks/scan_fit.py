@@ -244,12 +244,14 @@ def _within_40_m(frame: ScanFrame) -> ScanFrame:
 
 
 def _jpeg(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns an image (H, W, 3) in 0…1 after JPEG of quality 25."""
     codes = np.rint(rgb * 255).astype(np.uint8)
     _, data = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, 25])
     return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(np.float32) / 255
 
 
 def main() -> None:
+    """Asks for the warning of every variant of every frame, and prints what was noticed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
     parser.add_argument("--part", choices=["choose", "report"], default="report")

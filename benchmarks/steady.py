@@ -463,6 +463,7 @@ def _depth(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Tenso
 
 
 def main() -> None:
+    """Measures every alignment on every sequence, and prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--sets", nargs="+", default=[*CHOOSING, *REPORTED])

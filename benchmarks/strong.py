@@ -149,6 +149,7 @@ def print_tables(runs: Sequence[Run]) -> None:
     last_of_row = {row: place for (row, _), place in places.items()}
 
     def place(case: tuple[str, str, Any]) -> tuple[float, float]:
+        """Returns the place of a line: as measured, a row's line of all frames behind its sets."""
         row, name, points = case
         at = last_of_row[row] + 0.5 if name == ALL else places[row, name]
         return at, order.get(points, points)

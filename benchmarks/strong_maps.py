@@ -181,6 +181,7 @@ def rendered(kind: str, count: int) -> list[EvalFrame]:
 
 
 def _simulated(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields networks of each error of `ERRORS`, with their rows."""
     for row, error in ERRORS.items():
         seed = zlib.crc32(f"{frame.name} {row}".encode())
         name = f"simulated-{100 * error:g}"
@@ -188,16 +189,19 @@ def _simulated(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
 
 
 def _fastdepth(_frame: EvalFrame, data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields FastDepth and its row, if its file is there."""
     if (data / "weights" / "fastdepth_nyu.onnx").is_file():
         yield "FastDepth", opened("fastdepth", data)
 
 
 def _tiny(_frame: EvalFrame, data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields the networks of `TINY`, each a row of its own."""
     for name in TINY:
         yield name, opened(name, data)
 
 
 def _random(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields the networks of `RANDOM` with weights that are drawn for the frame, in one row."""
     for name in RANDOM:
         torch.manual_seed(zlib.crc32(frame.name.encode()))
         definition = replace(find_definition(name), checkpoint=None, complete=True)

@@ -97,8 +97,9 @@ class Pncnn(nn.Module):
         self.nconv = NormalisedUNet(SoftplusNormalisedConv)
 
     def forward(self, sparse: Tensor) -> Tensor:
-        """Returns dense depth from sparse depth."""
-        depth: Tensor = self.nconv(sparse, self.conf_estimator(sparse))[0]
+        """Returns dense depth (1, 1, H, W) from sparse depth of this shape, 0 = unknown; metres."""
+        depth: Tensor
+        depth, _confidence = self.nconv(sparse, self.conf_estimator(sparse))
         return depth
 
 

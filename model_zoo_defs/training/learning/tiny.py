@@ -153,10 +153,18 @@ class TinyRun(Learner):
 
 
 def as_depth(output: Tensor, kind: str) -> Tensor:
-    """Depth from the output of a network of this output kind."""
+    """Returns depth (B, 1, h, w) from a network's output, by what its numbers are.
+
+    Args:
+        output: (B, 1, h, w).
+        kind: "inverse" for inverse depth, whose depth is at most 1000; "log" for log depth, whose
+            depth is limited to exp(±7); else depth itself, which is not limited.
+    """
     if kind == "inverse":
         return 1.0 / output.clamp(min=1e-3)
-    return output.clamp(-7.0, 7.0).exp() if kind == "log" else output
+    if kind == "log":
+        return output.clamp(-7.0, 7.0).exp()
+    return output
 
 
 def held_out(settings: Settings, definition: ModelDefinition, recipe: Recipe) -> list[Batch]:
