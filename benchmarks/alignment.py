@@ -83,7 +83,10 @@ class Case:
     depth: NDArray[np.float64]
 
     def points(self, count: int, seed: int, outliers: str | None) -> tuple[NDArray, SparsePoints]:
-        """The numbers at `count` pixels, and the points there."""
+        """Returns the numbers (count,) at random pixels, and the points there.
+
+        The points' positions mean nothing. `outliers` is a kind of `OUTLIERS`, or None.
+        """
         rng = np.random.default_rng([seed, count])
         chosen = rng.choice(len(self.x), count, replace=False)
         depth = torch.from_numpy(self.depth[chosen]).float()
@@ -97,7 +100,13 @@ class Case:
 
 
 def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> float:
-    """The MAE of plain least squares in the quantity that the network gives."""
+    """Returns the MAE in metres of plain least squares in the quantity that the network gives.
+
+    Args:
+        case: The frame's pixels, which are scored.
+        x: The network's numbers (N,) at the points.
+        points: The points.
+    """
     reading = alignment._READINGS[TRUE.get(case.output, case.output)]
     d = points.depth.double()
     low = float(d.min()) / 10
@@ -112,7 +121,14 @@ def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> f
 
 
 def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated: bool) -> float:
-    """The MAE of the alignment; NaN where no definition can state what the numbers are."""
+    """Returns the MAE in metres of the program's alignment.
+
+    Args:
+        case: The frame's pixels, which are scored.
+        x: The network's numbers (N,) at the points.
+        points: The points.
+        stated: Whether the network's definition says what its numbers are; NaN if none can.
+    """
     definition = STATED.get(case.network, STATED.get(case.output))
     if stated and definition is None:
         return math.nan
@@ -122,7 +138,13 @@ def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated:
 
 
 def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterator[Case]:
-    """All networks on all frames, on at most so many of each set."""
+    """Yields every network on every frame.
+
+    Args:
+        data: The folder of real frames.
+        rendered: A folder of rendered shards; None: no such frames.
+        most: Most frames of a set; None: those of `FRAMES`.
+    """
     frames = {
         name: frames_of(name, data, count if most is None else min(count, most))
         for name, count in FRAMES.items()
@@ -176,7 +198,7 @@ def _drawn(known: NDArray[np.bool_], rng: np.random.Generator) -> tuple[NDArray,
 
 
 def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
-    """Every second rendered frame."""
+    """Yields every second frame of a folder of rendered shards."""
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as shard:
             for rgb, depth in zip(shard["rgb"][::2], shard["depth"][::2], strict=True):
@@ -184,7 +206,7 @@ def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
 
 
 def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
-    """Stored predictions: the network, what its numbers are, the map, and the ground truth."""
+    """Yields stored predictions: network, what its numbers are, map (H, W), ground truth (H, W)."""
 
     def npy(name: str) -> NDArray:
         return np.load(root / name).astype(float)
@@ -275,7 +297,7 @@ SHIPPED_BIC = alignment._bic
 
 
 def _bic(price: float) -> Callable[[alignment.Alignment], float]:
-    """BIC with another price of a parameter."""
+    """Returns the criterion BIC with the price of a parameter multiplied by `price`."""
 
     def criterion(fit: alignment.Alignment) -> float:
         none = SHIPPED_BIC(replace(fit, kind="none"))
@@ -285,7 +307,7 @@ def _bic(price: float) -> Callable[[alignment.Alignment], float]:
 
 
 def _error_by_freedom(fit: alignment.Alignment) -> float:
-    """The error of a fit for each degree of freedom."""
+    """Returns the error of a fit over its degrees of freedom."""
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
     return max(fit.misfit, alignment._LEAST_ERROR) / (fit.points - parameters)
 

@@ -229,7 +229,7 @@ def measure(case: Case, runs: int) -> dict[str, float | str]:
 
 
 def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
-    """The seconds of every run of each function, after a first round that does not count.
+    """Returns the seconds of every run of each function, without those of a first round.
 
     They run in turn, so that other load on the machine slows all of them alike.
     """

@@ -68,7 +68,7 @@ class EvalFrame:
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
-    """Street frames with one LiDAR scan each and the accumulated ground truth."""
+    """Yields street frames with one LiDAR scan each and the accumulated ground truth."""
     folder = root / "kitti_dc"
     for path in sorted((folder / "image").glob("*.jpg")):
         gt, scan = (
@@ -79,7 +79,7 @@ def kitti_dc(root: Path) -> Iterator[EvalFrame]:
 
 
 def nyu(root: Path) -> Iterator[EvalFrame]:
-    """Two Kinect frames of 224×224 and 480×640 pixels."""
+    """Yields Kinect frames of 224×224 and 480×640 pixels."""
     ready = (np.load(root / "nyu" / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
     rgb, gt = (np.ascontiguousarray(values.astype(np.float32)) for values in ready)
     yield EvalFrame("nyu", rgb, gt)
@@ -195,7 +195,7 @@ WEIGHTS = {"pncnn": "pncnn/kitti_model_best.pth.tar", "nconv": "nconv/CNN_ep0003
 
 
 def opened(name: str, data: Path) -> Network:
-    """The network with its published or shipped weights."""
+    """Returns a network by its name, with its published or shipped weights."""
     if name == "fastdepth":
         network = load_network(str(data / "weights" / "fastdepth_nyu.onnx"), None)
         definition = replace(network.definition, normalisation=Normalisation())
@@ -204,7 +204,14 @@ def opened(name: str, data: Path) -> Network:
 
 
 def by_default(network: Network, inputs: Frame, seed: int = 0, method: str = "fused") -> Refined:
-    """The frame as `pnpdepth refine` gives it without other options."""
+    """Returns a frame as `pnpdepth refine` refines it by default, with its stages.
+
+    Args:
+        network: The network.
+        inputs: The frame.
+        seed: Random seed of the refinement.
+        method: What `--method` names.
+    """
     with Method([network], Settings(seed=seed, method=method), inputs) as opened_method:
         return opened_method.refine(inputs, with_stages=True)
 

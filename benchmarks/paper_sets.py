@@ -68,7 +68,10 @@ STREETS = Scenes(
 
 
 def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
-    """`count` frames of these scenes; what of them is not in the cache is rendered first."""
+    """Returns the set of the first `count` frames of these scenes.
+
+    They are rendered now, by so many processes, unless the cache has them.
+    """
     folder = cache / f"{scenes.kind}-{scenes.size[0]}x{scenes.size[1]}-seed{scenes.seed}"
     shards = [folder / f"shard_{number:05d}.npz" for number in range(-(-count // VIEWS))]
     if not all(shard.exists() for shard in shards):
@@ -113,14 +116,24 @@ def within(depth: Depth, limit: float) -> Depth:
 
 
 def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
-    """(H, W) one turn of 64 scan lines from the camera's place; lens: fx, fy, cx, cy in pixels."""
+    """Returns (H, W) one turn of 64 scan lines from the camera's place.
+
+    Args:
+        gt: Depth (H, W) in metres, 0 = unknown.
+        lens: fx, fy, cx, cy in pixels.
+        seed: Random seed of the scan.
+    """
     fx, fy, cx, cy = (float(value) for value in lens)
     camera = Camera(intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     return as_depth_image(simulate_lidar(gt, camera, HDL_64E, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:
-    """The real frames at hand, at most so many of each, evenly taken."""
+    """Returns the sets of real frames at hand, each of at most so many frames, evenly spaced.
+
+    Raises:
+        UsageError: There is none.
+    """
     sets = []
     for name, read in SETS.items():
         every = [_shared_frame(frame) for frame in read(root)]

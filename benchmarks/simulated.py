@@ -196,7 +196,7 @@ def error_aligned(depth: Depth, gt: Depth) -> float:
 
 
 def _fault(log_depth: Depth, rng: Generator) -> Depth:
-    """Errors of log depth (H, W), their standard deviation 1."""
+    """Returns errors of log depth (H, W), of standard deviation 1."""
     height, width = log_depth.shape
     centred = (log_depth - log_depth.mean()) / max(float(log_depth.std()), 1e-6)
     # A smooth field.
@@ -225,7 +225,7 @@ def _blurred(log_depth: Depth, blur_px: float) -> Depth:
 
 
 def as_outputs(depth: Depth, rng: Generator) -> dict[str, NDArray[np.float64]]:
-    """What networks of this depth (H, W) give, by what their numbers are.
+    """Returns maps (H, W) that networks of this depth give, by what their numbers are.
 
     Factors and shifts are drawn where such a network knows none.
     """

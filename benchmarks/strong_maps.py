@@ -144,7 +144,7 @@ def with_lines(frame: EvalFrame) -> EvalFrame:
 
 
 def stored_frames(folder: Path) -> Iterator[StrongFrame]:
-    """The frames of a folder, once for each network's map."""
+    """Yields the frames of a folder, once for each network's map."""
     stored = STORED[folder.name]
     for path in sorted(folder.glob("*_rgb.*")):
         number = path.stem.removesuffix("_rgb")
@@ -166,7 +166,7 @@ def stored_frames(folder: Path) -> Iterator[StrongFrame]:
 
 
 def rendered(kind: str, count: int) -> list[EvalFrame]:
-    """`count` rendered frames, each of a scene of its own."""
+    """Returns `count` rendered frames, each of a scene of its own."""
     from model_zoo_defs.training.scenes.scenes import scene_frames  # needs the extra `train`
 
     height, width = RENDERED_SIZE
@@ -218,7 +218,7 @@ MAKERS: dict[str, Networks] = {
 
 
 def _read_grey(path: Path) -> Map:
-    """The numbers (H, W) of a picture of one channel."""
+    """Returns the numbers (H, W) of a picture of one channel."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -252,7 +252,7 @@ class Encoder(nn.Module):
             self.channels.append(later)
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """Returns the features, the largest first."""
+        """Returns the features at 1/2, 1/4, 1/8, 1/16 and 1/32 of x (B, channels, H, W)."""
         later = self.stem(x)
         earlier = later
         features = [later]
@@ -307,7 +307,7 @@ class LateFusion(nn.Module):
         nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-        """Returns depth from image and sparse depth."""
+        """Returns depth (B, 1, H, W) from image (B, 3, H, W) and sparse depth; in metres."""
         rgb_skips = self.rgb(rgb)
         sparse_skips = self.sparse(sparse)
         x = self.fuse(torch.cat([rgb_skips.pop(), sparse_skips.pop()], dim=1))

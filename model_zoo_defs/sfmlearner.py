@@ -106,7 +106,7 @@ class DispNet(nn.Module):
                     nn.init.zeros_(layer.bias)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Returns disparity from the image."""
+        """Returns disparity (B, 1, H, W) from the image (B, 3, H, W) in -1…1."""
         return self.pyramid(rgb)[0]
 
     def pyramid(self, rgb: Tensor) -> list[Tensor]:
