@@ -83,7 +83,10 @@ class Case:
     depth: NDArray[np.float64]
 
     def points(self, count: int, seed: int, outliers: str | None) -> tuple[NDArray, SparsePoints]:
-        """The numbers at `count` pixels, and the points there."""
+        """Returns the numbers (count,) at random pixels, and the points there.
+
+        The points' positions mean nothing. `outliers` is a kind of `OUTLIERS`, or None.
+        """
         rng = np.random.default_rng([seed, count])
         chosen = rng.choice(len(self.x), count, replace=False)
         depth = torch.from_numpy(self.depth[chosen]).float()
@@ -97,7 +100,13 @@ class Case:
 
 
 def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> float:
-    """The MAE of plain least squares in the quantity that the network gives."""
+    """Returns the MAE in metres of plain least squares in the quantity that the network gives.
+
+    Args:
+        case: The frame's pixels, which are scored.
+        x: The network's numbers (N,) at the points.
+        points: The points.
+    """
     reading = alignment._READINGS[TRUE.get(case.output, case.output)]
     d = points.depth.double()
     low = float(d.min()) / 10
@@ -112,7 +121,14 @@ def least_squares(case: Case, x: NDArray[np.float64], points: SparsePoints) -> f
 
 
 def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated: bool) -> float:
-    """The MAE of the alignment; NaN where no definition can state what the numbers are."""
+    """Returns the MAE in metres of the program's alignment.
+
+    Args:
+        case: The frame's pixels, which are scored.
+        x: The network's numbers (N,) at the points.
+        points: The points.
+        stated: Whether the network's definition says what its numbers are; NaN if none can.
+    """
     definition = STATED.get(case.network, STATED.get(case.output))
     if stated and definition is None:
         return math.nan
@@ -122,7 +138,13 @@ def aligned(case: Case, x: NDArray[np.float64], points: SparsePoints, *, stated:
 
 
 def cases(data: Path, rendered: Path | None, most: int | None = None) -> Iterator[Case]:
-    """All networks on all frames, on at most so many of each set."""
+    """Yields every network on every frame.
+
+    Args:
+        data: The folder of real frames.
+        rendered: A folder of rendered shards; None: no such frames.
+        most: Most frames of a set; None: those of `FRAMES`.
+    """
     frames = {
         name: frames_of(name, data, count if most is None else min(count, most))
         for name, count in FRAMES.items()
@@ -169,13 +191,14 @@ def case_of(
 
 
 def _drawn(known: NDArray[np.bool_], rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """Returns rows and columns of up to `PIXELS` known pixels of a mask (H, W), at random."""
     rows, columns = np.nonzero(known)
     chosen = rng.choice(len(rows), min(PIXELS, len(rows)), replace=False)
     return rows[chosen], columns[chosen]
 
 
 def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
-    """Every second rendered frame."""
+    """Yields every second frame of a folder of rendered shards."""
     for path in sorted(folder.glob("*.npz")):
         with np.load(path) as shard:
             for rgb, depth in zip(shard["rgb"][::2], shard["depth"][::2], strict=True):
@@ -183,7 +206,7 @@ def frames_of_shards(folder: Path) -> Iterator[EvalFrame]:
 
 
 def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
-    """Stored predictions: the network, what its numbers are, the map, and the ground truth."""
+    """Yields stored predictions: network, what its numbers are, map (H, W), ground truth (H, W)."""
 
     def npy(name: str) -> NDArray:
         return np.load(root / name).astype(float)
@@ -227,12 +250,17 @@ def strong(root: Path) -> Iterator[tuple[str, str, NDArray, NDArray]]:
 
 
 def ratios(
-    of: Sequence[Case], counts: Iterable[int], draws: int, outliers: str | None
+    all_cases: Sequence[Case], counts: Iterable[int], draws: int, outliers: str | None
 ) -> dict[tuple[int, int, int, str], float]:
-    """log(MAE / MAE of least squares) by case, count, draw and what is stated."""
-    found = {}
-    for number, case in enumerate(of):
+    """Returns log(MAE / MAE of least squares) by index of the case, count, seed and definition.
+
+    The definition is "stated", which says what the numbers are, or "open", which does not. An
+    alignment that is refused counts as least squares.
+    """
+    log_ratios = {}
+    for number, case in enumerate(all_cases):
         for count in counts:
+            # A frame with too few pixels for so many points.
             if count > 0.8 * len(case.x):
                 continue
             for seed in range(draws):
@@ -244,18 +272,18 @@ def ratios(
                     except PnpDepthError:
                         mae = plain
                     if not math.isnan(mae):
-                        found[number, count, seed, name] = math.log(mae / plain)
-    return found
+                        log_ratios[number, count, seed, name] = math.log(mae / plain)
+    return log_ratios
 
 
-def table(of: Sequence[Case], outliers: str | None) -> None:
+def table(all_cases: Sequence[Case], outliers: str | None) -> None:
     """Prints the ratios of every set and network."""
-    found = ratios(of, COUNTS, DRAWS, outliers)
+    found = ratios(all_cases, COUNTS, DRAWS, outliers)
     groups = defaultdict[tuple[str, str, str], dict[tuple[int, str], list[float]]](
         lambda: defaultdict(list)
     )
     for (number, count, _, name), value in found.items():
-        case = of[number]
+        case = all_cases[number]
         groups[case.set, case.network, case.output][count, name].append(value)
     heads = [f"{name}, {count}" for name in ("stated", "open") for count in COUNTS]
     print_row("set", "network", "its numbers", *heads, head=True)
@@ -269,7 +297,7 @@ SHIPPED_BIC = alignment._bic
 
 
 def _bic(price: float) -> Callable[[alignment.Alignment], float]:
-    """BIC with another price of a parameter."""
+    """Returns the criterion BIC with the price of a parameter multiplied by `price`."""
 
     def criterion(fit: alignment.Alignment) -> float:
         none = SHIPPED_BIC(replace(fit, kind="none"))
@@ -279,7 +307,7 @@ def _bic(price: float) -> Callable[[alignment.Alignment], float]:
 
 
 def _error_by_freedom(fit: alignment.Alignment) -> float:
-    """The error of a fit for each degree of freedom."""
+    """Returns the error of a fit over its degrees of freedom."""
     parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
     return max(fit.misfit, alignment._LEAST_ERROR) / (fit.points - parameters)
 
@@ -318,9 +346,13 @@ TRIALS: dict[str, tuple[object, str, dict[str, object]]] = {
 """By constant: where it is, and the values that are tried."""
 
 
-def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str | None]) -> None:
+def trial(
+    all_cases: Sequence[Case], constants: Iterable[str], outliers: Sequence[str | None]
+) -> None:
     """Prints the value of each constant that is chosen with each set and network left out."""
-    of = [case for case in of if case.set != "strong" and not case.set.startswith("tum")]
+    all_cases = [
+        case for case in all_cases if case.set != "strong" and not case.set.startswith("tum")
+    ]
     print_row("constant", "value", "ratio to the shipped value, by left out", head=True)
     # The log ratios of every case with each value of the constant.
     for constant in constants:
@@ -331,13 +363,13 @@ def trial(of: Sequence[Case], constants: Iterable[str], outliers: Sequence[str |
                 found[value_name] = {
                     (kind, *key): ratio
                     for kind in outliers
-                    for key, ratio in ratios(of, COUNTS[:-1], 1, kind).items()
+                    for key, ratio in ratios(all_cases, COUNTS[:-1], 1, kind).items()
                 }
         # Of each set and network: what the other ones choose, and what that costs on it.
         shipped = next(name for name, v in values.items() if v == getattr(module, attribute))
         for field in ("set", "network"):
-            for left_out in sorted({getattr(case, field) for case in of}):
-                inside = {n for n, case in enumerate(of) if getattr(case, field) == left_out}
+            for left_out in sorted({getattr(case, field) for case in all_cases}):
+                inside = {n for n, case in enumerate(all_cases) if getattr(case, field) == left_out}
                 mean = {
                     name: [
                         np.mean([v for key, v in logs.items() if (key[1] in inside) == is_inside])
@@ -364,11 +396,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="at most so many frames of each set")
     parser.add_argument("--every", type=int, default=1, help="only every nth case")
     args = parser.parse_args()
-    of = list(cases(args.data, args.rendered, args.frames))[:: args.every]
+    all_cases = list(cases(args.data, args.rendered, args.frames))[:: args.every]
     if args.trial:
-        trial(of, args.trial, (None, args.outliers) if args.outliers else (None,))
+        trial(all_cases, args.trial, (None, args.outliers) if args.outliers else (None,))
     else:
-        table(of, args.outliers)
+        table(all_cases, args.outliers)
 
 
 if __name__ == "__main__":

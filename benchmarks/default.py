@@ -101,7 +101,10 @@ UNCERTAINTY_HEAD = (
 
 
 def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
-    """(network, set, points; None for a LiDAR's), those that are asked for."""
+    """Yields (network, set, number of points) of what the command line asks for.
+
+    The number is None where the points are a LiDAR's.
+    """
     for name, networks in NETWORKS.items():
         for count in (None,) if name == "kitti_dc" else COUNTS:
             for network in networks:
@@ -117,8 +120,20 @@ def cases(args: argparse.Namespace) -> Iterator[tuple[str, str, int | None]]:
 def measure(
     network: Network, frame: EvalFrame, count: int | None, seed: int, outliers: str | None = None
 ) -> dict[str, Any]:
-    """MAE and RMSE of every column on one frame, the choice, and its time."""
-    if count is None:  # as the commands read a projected scan
+    """Returns the figures of one frame: a run of the tables.
+
+    They are (MAE, RMSE) in metres by stage, seconds of the processor, the network's weight in the
+    result, whether there was a warning about the image, and the figures of `uncertainty`.
+
+    Args:
+        network: The network.
+        frame: The frame.
+        count: Number of points that are drawn; None: all points of its LiDAR.
+        seed: Random seed of the points, of the outliers and of the refinement.
+        outliers: Kind of the outliers that a fifth of the points become, of `OUTLIERS`; None: none.
+    """
+    # The commands drop the occluded points of a projected scan.
+    if count is None:
         frame = without_occluded(frame)
     inputs = drawn_inputs(frame, count, seed)
     if outliers is not None:
@@ -128,7 +143,7 @@ def measure(
     seconds = time.process_time() - start
     depths = {LINEAR: linear(inputs.points), AFTER: torch.from_numpy(refined.depth)}
     depths |= {name: torch.from_numpy(depth) for name, depth in refined.stages.items()}
-    # z of a network without trust is not updated by default, so its own steps are those of `alone`.
+    # By default z of some networks is not updated: the network's own steps are those of `alone`.
     if ALONE in depths:
         alone = by_default(network, inputs, seed, method="alone")
         for name in (UPDATED, PROPAGATED):
@@ -145,14 +160,27 @@ def measure(
 
 
 def weight_of(network: Network, refined: Refined) -> float:
-    """The weight of a network in the result, its depth as another one's prior included."""
+    """Returns the weight (0…1) of a network in the result.
+
+    It includes the weight of `compact` with the network's depth as its prior.
+    """
     name = network.definition.name
     experts = (name, f"compact with {name}")
     return sum(weight for expert, weight in refined.weights.items() if expert in experts)
 
 
 def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
-    """Fractions of the ground truth, and of large errors: `caught` by the mask, `ranked` by σ."""
+    """Returns how well the standard deviations and the mask of a result tell its errors.
+
+    All are fractions of the pixels with depth and ground truth, or of those of them with a large
+    error, above a quarter of the true depth:
+        within: Error within each of `MULTIPLES` standard deviations.
+        large: Large error.
+        caught: Of the large errors, those that the mask hides; None if there are none.
+        ranked: Of the large errors, those among the least certain twentieth of all pixels, by
+            σ / depth; None if there are none.
+        kept: Not hidden by the mask.
+    """
     assert refined.sigma is not None
     assert refined.valid is not None
     known = (gt > 0) & (refined.depth > 0)
@@ -172,21 +200,23 @@ def uncertainty(refined: Refined, gt: Depth) -> dict[str, Any]:
 
 
 def uncertainty_cells(rows: list[dict[str, Any]]) -> list[str]:
-    """The cells of a case in the second table."""
+    """Returns the cells of the second table, the means over the runs of `measure`."""
     of_frames = [row["uncertainty"] for row in rows]
     within = np.array([of_frame["within"] for of_frame in of_frames])
-    held = ((within[:, 0] >= 0.6) & (within[:, 1] >= 0.9)).mean()
+    # The frames whose σ says enough: 60 % of the pixels within one, 90 % within two.
+    covered = ((within[:, 0] >= 0.6) & (within[:, 1] >= 0.9)).mean()
 
     def mean(name: str) -> str:
-        values = [of_frame[name] for of_frame in of_frames if of_frame[name] is not None]
-        return f"{np.mean(values):.1%}" if values else ""
+        """Returns the mean over the frames that have this figure; empty if none has."""
+        fractions = [of_frame[name] for of_frame in of_frames if of_frame[name] is not None]
+        return f"{np.mean(fractions):.1%}" if fractions else ""
 
     masks = (mean(name) for name in ("large", "caught", "kept", "ranked"))
-    return [*(f"{value:.0%}" for value in within.mean(axis=0)), f"{held:.0%}", *masks]
+    return [*(f"{value:.0%}" for value in within.mean(axis=0)), f"{covered:.0%}", *masks]
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over the frames of a case."""
+    """Returns means over the runs of `measure`; of the seconds, the median."""
     errors = [row["errors"] for row in rows]
     # A stage that some frame lacks has no mean.
     stages = [stage for stage in errors[0] if all(stage in of_frame for of_frame in errors)]

@@ -53,7 +53,7 @@ class Prepared(NamedTuple):
 
 
 def setup(case: Case) -> Prepared:
-    """The network, its inputs, and points of them."""
+    """Returns the network, random inputs, and 500 points of random depth, 1 to 5 m."""
     torch.manual_seed(0)
     network = case.network()
     height, width = case.size
@@ -70,15 +70,24 @@ def setup(case: Case) -> Prepared:
     return Prepared(network, inputs, points)
 
 
-def output_points(case: Case, points: SparsePoints) -> Callable[[Tensor], Tensor]:
-    """The loss of equation 3 for an output of whatever size."""
+def loss_at(points: SparsePoints) -> Callable[[Tensor], Tensor]:
+    """Returns a function from the network's output to its mean |error| at the points, in metres.
+
+    The output may be of another size than the image.
+    """
     return lambda output: (points.sample(output) - points.depth).abs().mean()
 
 
 def loop(
     z: Tensor, rear: Callable[[Tensor], Tensor], loss_of: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """Equation 3 with sign steps, written out."""
+    """Returns the output after K sign steps that lower the loss, equation 3 of the paper.
+
+    Args:
+        z: Output of the cut layer, to start from.
+        rear: Function from z to the network's output.
+        loss_of: Function from the output to the loss.
+    """
     for _ in range(ITERATIONS):
         z = z.detach().requires_grad_(True)
         z = z.detach() - STEP * torch.autograd.grad(loss_of(rear(z)), z)[0].sign()
@@ -87,55 +96,65 @@ def loop(
 
 
 def by_hand(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
-    """Refinement with a front and a rear written for this network."""
+    """Returns the output, refined with a front and a rear that are written for this network."""
     with torch.no_grad():
         z, kept = case.front(network, *inputs)
-    return loop(z, lambda z: case.rear(network, z, kept), output_points(case, points))
+    return loop(z, lambda z: case.rear(network, z, kept), loss_at(points))
 
 
 def by_split(split: Split, inputs: Inputs, points: SparsePoints) -> Tensor:
-    """Refinement of a further frame of an open network."""
+    """Returns the output, refined with a cut network that stays open from frame to frame."""
     return refine(split, inputs, points, SETTINGS, depth_of=lambda output: output.float()).after
 
 
 def by_new_split(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
-    """Refinement of one frame, the network opened for it."""
+    """Returns the output, refined with a network that is cut for this frame alone."""
     with Split(network, case.layer) as split:
         return by_split(split, inputs, points)
 
 
 def by_hook(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
-    """Refinement by a hook that replaces the layer's output, re-running the whole network."""
+    """Returns the output, refined by a hook that replaces the layer's output by z.
+
+    Each step runs the whole network again.
+    """
+    # The hook is on the module; "[0]" names the first of the outputs that it returns.
     layer = network.get_submodule(case.layer.removesuffix("[0]"))
-    seen: list[object] = []
+    outputs: list[object] = []
 
     def replaced(output: object, z: Tensor) -> object:
+        """Returns z in the place of the output, or of the first of several."""
         return (z, *output[1:]) if isinstance(output, tuple) else z
 
     with torch.no_grad():
-        handle = layer.register_forward_hook(lambda *call: seen.append(call[2]))
+        # A hook is called with the module, its inputs and its output.
+        handle = layer.register_forward_hook(lambda *call: outputs.append(call[2]))
         network(*inputs)
         handle.remove()
 
     def rear(z: Tensor) -> Tensor:
+        """Returns what the network gives if its layer gives z."""
+        # A copy, as the network may change it in place.
         handle = layer.register_forward_hook(lambda *call: replaced(call[2], z.clone()))
         try:
             return network(*inputs)
         finally:
             handle.remove()
 
-    first = seen[0][0] if isinstance(seen[0], tuple) else seen[0]
-    assert isinstance(first, Tensor)
-    return loop(first, rear, output_points(case, points))
+    z0 = outputs[0][0] if isinstance(outputs[0], tuple) else outputs[0]
+    assert isinstance(z0, Tensor)
+    return loop(z0, rear, loss_at(points))
 
 
 def by_papers_code(case: Case, network: nn.Module, inputs: Inputs, points: SparsePoints) -> Tensor:
-    """The same updates as the authors' PyTorch code makes them, one more than it does by mistake.
+    """Returns the output, refined as the authors' PyTorch code does it.
+
+    That code makes one update less than it is told, by mistake; here all K are made.
 
     The network's parameters ask for gradients, the front's graph is built, and each gradient is
     taken with `create_graph`.
     """
-    loss_of = output_points(case, points)
+    loss_of = loss_at(points)
     network.requires_grad_(True)
     try:
         z, kept = case.front(network, *inputs)
@@ -151,11 +170,16 @@ def by_papers_code(case: Case, network: nn.Module, inputs: Inputs, points: Spars
 
 @contextlib.contextmanager
 def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
-    """What is timed, by name."""
+    """Gives what is timed: functions without arguments, each of which runs once, by name.
+
+    The names are those of `COMPARED`, which refine, and the forward pass, the front and the rear.
+    """
     network, inputs, points = setup(case)
+    # As a decorator: the function that it returns runs without gradients.
     no_grad = torch.no_grad()
     with torch.no_grad():
         z, kept = case.front(network, *inputs)
+    # A network is intercepted as long as its cut is open: a copy, so that the others are not.
     twin = case.network()
     twin.load_state_dict(network.state_dict())
     with Split(twin, case.layer) as split:
@@ -173,7 +197,7 @@ def variants(case: Case) -> Iterator[dict[str, Callable[[], object]]]:
 
 
 def measure(case: Case, runs: int) -> dict[str, float | str]:
-    """Medians of every variant, taken in turn, and the ratios."""
+    """Returns a row of the table: the median of so many runs of each variant, and their ratios."""
     with variants(case) as todo:
         # All variants give the same, bit for bit.
         results = [todo[name]() for name in COMPARED]
@@ -188,6 +212,7 @@ def measure(case: Case, runs: int) -> dict[str, float | str]:
     ratio = {name: median[name] / median["forward"] for name in COMPARED}
 
     def paired(one: str, other: str) -> float:
+        """Returns the median ratio of the times of two variants, run by run."""
         pairs = zip(spent[one], spent[other], strict=True)
         return statistics.median(a / b for a, b in pairs)
 
@@ -204,7 +229,7 @@ def measure(case: Case, runs: int) -> dict[str, float | str]:
 
 
 def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
-    """The seconds of every run of each function, after a first round that does not count.
+    """Returns the seconds of every run of each function, without those of a first round.
 
     They run in turn, so that other load on the machine slows all of them alike.
     """
@@ -219,9 +244,11 @@ def in_turn(todo: Mapping[str, Callable[[], object]], runs: int) -> dict[str, li
 
 
 def main() -> None:
+    """Measures the networks in turn, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=15)
-    parser.add_argument("--only", nargs="+", default=[case.name for case in ZOO])
+    parser.add_argument("--runs", type=int, default=15, help="runs of each variant")
+    all_names = [case.name for case in ZOO]
+    parser.add_argument("--only", nargs="+", default=all_names, help="only these networks")
     args = parser.parse_args()
     results = []
     for case in ZOO:
@@ -234,9 +261,11 @@ def main() -> None:
         " of a forward pass unless noted\n"
     )
     for number, row in enumerate(results):
-        if not number:
+        # The head is the names of the first row's cells.
+        if number == 0:
             print_row(*row, head=True)
-        print_row(*(f"{v:.3g}" if isinstance(v, float) else v for v in row.values()))
+        cells = [f"{cell:.3g}" if isinstance(cell, float) else cell for cell in row.values()]
+        print_row(*cells)
 
 
 if __name__ == "__main__":

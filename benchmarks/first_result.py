@@ -80,7 +80,16 @@ class Spent(NamedTuple):
 
 
 def written_folder(folder: Path, kind: str, config: dict[str, Any], processing: Any) -> str:
-    """A Hugging Face folder with random weights whose output varies, as of a trained network."""
+    """Writes a Hugging Face folder of random weights; returns its path.
+
+    The network's output varies over the image, as that of a trained one does.
+
+    Args:
+        folder: The folder.
+        kind: Name of the architecture in transformers.
+        config: Settings of the architecture.
+        processing: Content of its preprocessor_config.json.
+    """
     import transformers
 
     torch.manual_seed(0)
@@ -100,7 +109,7 @@ def written_folder(folder: Path, kind: str, config: dict[str, Any], processing: 
 
 
 def anything_small(folder: Path) -> str:
-    """A network of the shape of Depth Anything V2 Small, 24.8 million parameters."""
+    """Writes a folder of the shape of Depth Anything V2 Small, 24.8 million parameters."""
     backbone = {
         "model_type": "dinov2", "hidden_size": 384, "num_hidden_layers": 12,
         "num_attention_heads": 6, "image_size": 518, "patch_size": 14,
@@ -116,7 +125,7 @@ def anything_small(folder: Path) -> str:
 
 
 def dpt_hybrid(folder: Path) -> str:
-    """A network of the shape of DPT Hybrid, 122 million parameters."""
+    """Writes a folder of the shape of DPT Hybrid, 122 million parameters; returns its path."""
     config = {
         "is_hybrid": True, "backbone_out_indices": [2, 5, 8, 11],
         "neck_hidden_sizes": [256, 512, 768, 768],
@@ -170,12 +179,14 @@ class Light(nn.Module):
         self.head = nn.Conv2d(channels[-1], 1, 3, padding=1)
 
     def forward(self, rgb: Tensor) -> Tensor:
+        """Returns positive depth (B, 1, H, W) of images (B, 3, H, W); sides are multiples of 32."""
         x = self.stem(rgb)
         skips = list[Tensor]()
         for stage in self.stages:
             x = stage(x)
             skips.append(x)
-        for up, skip in zip(self.ups, skips[-2::-1], strict=True):
+        # The last features are x itself: the others, from the smallest on.
+        for up, skip in zip(self.ups, reversed(skips[:-1]), strict=True):
             x = torch.cat([nn.functional.interpolate(x, scale_factor=2.0), skip], dim=1)
             x = up(x).relu()
         x = self.head(nn.functional.interpolate(x, scale_factor=2.0))
@@ -183,7 +194,10 @@ class Light(nn.Module):
 
 
 def light_onnx(path: Path) -> str:
-    """The network above as an ONNX file of about 25 MB, its batch normalisations not folded."""
+    """Writes `Light` as an ONNX file of about 25 MB; returns its path.
+
+    Its batch normalisations are not folded into the convolutions.
+    """
     torch.manual_seed(0)
     torch.onnx.export(
         Light().eval(),
@@ -199,7 +213,7 @@ def light_onnx(path: Path) -> str:
 
 
 def cases(folder: Path, fastdepth: Path | None) -> list[Case]:
-    """The networks, written to a folder."""
+    """Returns the networks, those of random weights written to a folder."""
     small = anything_small(folder / "anything-small")
     hybrid = dpt_hybrid(folder / "dpt-hybrid")
     listed = [
@@ -215,7 +229,12 @@ def cases(folder: Path, fastdepth: Path | None) -> list[Case]:
 
 
 def run(command: list[str], cache: Path) -> Spent:
-    """Runs a process on one thread. Its output is shown only if it fails."""
+    """Returns what a process on one thread took; ends the program with its errors if it fails.
+
+    Args:
+        command: The program and its arguments.
+        cache: Folder that the command keeps its cache in.
+    """
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PNPDEPTH_CACHE": str(cache)}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
@@ -231,7 +250,10 @@ def run(command: list[str], cache: Path) -> Spent:
 
 
 def measure(case: Case, folder: Path, runs: int) -> dict[str, list[Spent]]:
-    """What each of the three processes took, in turn."""
+    """Returns what each run took: of the bare script, and of the command with and without cache.
+
+    The "first" command of a run finds an empty cache, the "second" what the first left.
+    """
     python = sys.executable
     files = [str(SAMPLE / "rgb.png"), "--sparse"]
     files += [str(SAMPLE / "sparse.png"), "--gt", str(SAMPLE / "gt.png")]
@@ -248,6 +270,7 @@ def measure(case: Case, folder: Path, runs: int) -> dict[str, list[Spent]]:
 
 
 def main() -> None:
+    """Measures the networks in turn, and prints a table as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fastdepth", type=Path, help="ONNX file of FastDepth")
     parser.add_argument("--runs", type=int, default=3)

@@ -45,7 +45,13 @@ class EvalFrame:
     register: Register = None
 
     def points(self, count: int | None, seed: int = 0) -> Points:
-        """`count` pixels of the pool, or all of the sensor; the same seed gives the same."""
+        """Returns sparse points of the frame, at pixels of its image, with depth in metres.
+
+        Args:
+            count: Number of points, drawn at random from the pixels of `pool`; all if there are
+                fewer. None: all points of `sensor`.
+            seed: Random seed of the draw.
+        """
         if count is None:
             assert self.sensor is not None
             depth = self.sensor
@@ -62,7 +68,7 @@ class EvalFrame:
 
 
 def kitti_dc(root: Path) -> Iterator[EvalFrame]:
-    """Street frames with one LiDAR scan each and the accumulated ground truth."""
+    """Yields street frames with one LiDAR scan each and the accumulated ground truth."""
     folder = root / "kitti_dc"
     for path in sorted((folder / "image").glob("*.jpg")):
         gt, scan = (
@@ -73,7 +79,7 @@ def kitti_dc(root: Path) -> Iterator[EvalFrame]:
 
 
 def nyu(root: Path) -> Iterator[EvalFrame]:
-    """Two Kinect frames of 224×224 and 480×640 pixels."""
+    """Yields Kinect frames of 224×224 and 480×640 pixels."""
     ready = (np.load(root / "nyu" / f"{name}.npy").squeeze() for name in ("rgb", "depth"))
     rgb, gt = (np.ascontiguousarray(values.astype(np.float32)) for values in ready)
     yield EvalFrame("nyu", rgb, gt)
@@ -81,7 +87,14 @@ def nyu(root: Path) -> Iterator[EvalFrame]:
 
 
 def _pairs(folder: Path, images: str, change: tuple[str, str], scale: float) -> Iterator[EvalFrame]:
-    """The frames of a folder; a change in the image's path gives that of its depth."""
+    """Yields the frames of a folder.
+
+    Args:
+        folder: The folder.
+        images: Pattern of the images' paths below it.
+        change: Text of an image's path, and what replaces it in that of its depth, a PNG.
+        scale: Integers a metre in the depth.
+    """
     for path in sorted(folder.glob(images)):
         name = path.relative_to(folder).as_posix().replace(*change)
         depth = (folder / name).with_suffix(".png")
@@ -145,16 +158,23 @@ REGISTRATIONS = ("off", "frame", "set")
 def registered(
     frames: Sequence[EvalFrame], count: int | None, seed: int, how: str
 ) -> list[EvalFrame]:
-    """The frames with how their images are moved into the frame of these points by the program."""
+    """Returns the frames with the registration of their images that the program estimates.
+
+    Args:
+        frames: Frames of one set.
+        count: Number of points of each; None: all of its LiDAR.
+        seed: Random seed of the points.
+        how: Whose registration it is, of `REGISTRATIONS`.
+    """
     if how == "off":
         return list(frames)
-    seen = [evidence(frame.rgb, frame.points(count, seed).tensors()) for frame in frames]
+    of_frames = [evidence(frame.rgb, frame.points(count, seed).tensors()) for frame in frames]
     if how == "set":
-        together = estimate_registration([seen[number] for number in spread(len(seen))])
-        found = [together] * len(frames)
+        chosen = [of_frames[number] for number in spread(len(of_frames))]
+        registrations = [estimate_registration(chosen)] * len(frames)
     else:
-        found = [estimate_registration([of_frame]) for of_frame in seen]
-    pairs = zip(frames, found, strict=True)
+        registrations = [estimate_registration([of_frame]) for of_frame in of_frames]
+    pairs = zip(frames, registrations, strict=True)
     return [replace(frame, register=registration) for frame, registration in pairs]
 
 
@@ -165,7 +185,7 @@ def drawn_inputs(frame: EvalFrame, count: int | None, seed: int) -> Frame:
 
 
 def refined(network: Network, layer: str, settings: ClosedSettings, inputs: Frame) -> Refined:
-    """The refinement of a frame with all of its points."""
+    """Returns a frame refined at a layer by the paper's method, with all of its points."""
     pipeline = pipeline_of(Settings(method="paper", propagate=settings.propagate))
     with OpenNetwork(network, layer, settings, always_updated=True) as opened:
         return refine_frame([opened], inputs.registered(), pipeline)
@@ -175,7 +195,7 @@ WEIGHTS = {"pncnn": "pncnn/kitti_model_best.pth.tar", "nconv": "nconv/CNN_ep0003
 
 
 def opened(name: str, data: Path) -> Network:
-    """The network with its published or shipped weights."""
+    """Returns a network by its name, with its published or shipped weights."""
     if name == "fastdepth":
         network = load_network(str(data / "weights" / "fastdepth_nyu.onnx"), None)
         definition = replace(network.definition, normalisation=Normalisation())
@@ -184,13 +204,23 @@ def opened(name: str, data: Path) -> Network:
 
 
 def by_default(network: Network, inputs: Frame, seed: int = 0, method: str = "fused") -> Refined:
-    """The frame as `pnpdepth refine` gives it without other options."""
+    """Returns a frame as `pnpdepth refine` refines it by default, with its stages.
+
+    Args:
+        network: The network.
+        inputs: The frame.
+        seed: Random seed of the refinement.
+        method: What `--method` names.
+    """
     with Method([network], Settings(seed=seed, method=method), inputs) as opened_method:
         return opened_method.refine(inputs, with_stages=True)
 
 
 def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
-    """So many of the points at random depths, from half the nearest to twice the farthest."""
+    """Returns the points, this fraction of them at random depths.
+
+    They are from half the nearest depth to twice the farthest.
+    """
     generator = torch.Generator().manual_seed(seed)
     outlier = torch.rand(len(points), generator=generator) < fraction
     low = float(points.depth.min()) / 2
@@ -200,7 +230,7 @@ def with_outliers(points: SparsePoints, fraction: float, seed: int) -> SparsePoi
 
 
 def with_wrong_factors(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
-    """So many of the points times exp(0.7 n), n normal."""
+    """Returns the points, the depth of this fraction of them times exp(0.7 n), n normal."""
     generator = torch.Generator().manual_seed(seed)
     outlier = torch.rand(len(points), generator=generator) < fraction
     factor = torch.exp(0.7 * torch.randn(len(points), generator=generator))
@@ -208,13 +238,18 @@ def with_wrong_factors(points: SparsePoints, fraction: float, seed: int) -> Spar
 
 
 def with_wrong_tracks(points: SparsePoints, fraction: float, seed: int) -> SparsePoints:
-    """So many of the points in groups of up to 6 neighbours, each times exp(0.5 n), n normal."""
+    """Returns the points, this fraction of them wrong in groups of up to 6 neighbours.
+
+    The depth of a group is multiplied by exp(0.5 n), n normal.
+    """
     rng = np.random.default_rng(seed)
     xy = points.xy.numpy()
     factor = np.ones(len(xy), np.float32)
     while (factor != 1).mean() < fraction:
-        near = np.argsort(((xy - xy[rng.integers(len(xy))]) ** 2).sum(axis=1))[:6]
-        factor[near[factor[near] == 1]] = np.exp(0.5 * rng.standard_normal())
+        squared_px = ((xy - xy[rng.integers(len(xy))]) ** 2).sum(axis=1)
+        group = np.argsort(squared_px)[:6]
+        # Points of an earlier group keep their factor.
+        factor[group[factor[group] == 1]] = np.exp(0.5 * rng.standard_normal())
     return replace(points, depth=points.depth * torch.from_numpy(factor))
 
 
@@ -223,7 +258,12 @@ OUTLIERS = {"random": with_outliers, "factors": with_wrong_factors, "tracks": wi
 
 
 def errors_of(depths: dict[str, torch.Tensor], gt: torch.Tensor) -> dict[str, tuple[float, float]]:
-    """(MAE, RMSE) over the pixels with ground truth where all are known."""
+    """Returns (MAE, RMSE) in metres of each depth, over the same pixels.
+
+    Args:
+        depths: Depths (H, W) in metres by name, 0 = unknown.
+        gt: Ground truth (H, W) in metres, 0 = unknown. It counts where all depths are known.
+    """
     seen = torch.stack([depth > 0 for depth in depths.values()]).all(dim=0)
     gt = torch.where(seen, gt, 0.0)
     scores = {name: score(depth, gt) for name, depth in depths.items()}

@@ -41,12 +41,12 @@ class Case:
     rear: Callable[..., Tensor]
 
     def network(self) -> nn.Module:
-        """It, with random weights, in eval mode."""
+        """Returns the network with random weights, in eval mode."""
         return find_definition(self.name).build().eval().requires_grad_(False)
 
 
 def eigen_front(network: Eigen, rgb: Tensor) -> Any:
-    """`coarse.conv5`; the fine network's first features stay."""
+    """Returns z, the output of `coarse.conv5`, and the fine network's first features."""
     coarse, fine = network.coarse, network.fine
     x = F.max_pool2d(F.relu(coarse.conv1(rgb)), 2)
     x = F.max_pool2d(F.relu(coarse.conv2(x)), 2)
@@ -55,6 +55,7 @@ def eigen_front(network: Eigen, rgb: Tensor) -> Any:
 
 
 def eigen_rear(network: Eigen, z: Tensor, features: Tensor) -> Tensor:
+    """Returns the network's output from z and the fine network's first features."""
     coarse, fine = network.coarse, network.fine
     x = coarse.fc2(coarse.dropout(F.relu(coarse.fc1(F.relu(z).flatten(1)))))
     x = torch.cat([features, x.reshape(-1, 1, *eigen.OUT)], dim=1)
@@ -62,21 +63,22 @@ def eigen_rear(network: Eigen, z: Tensor, features: Tensor) -> Tensor:
 
 
 def fcrn_front(network: FCRN, rgb: Tensor) -> Any:
-    """`layer1_BN`; nothing stays."""
+    """Returns z, the output of `layer1_BN`, and (), as the rear needs nothing else."""
     x = network.pool(network.relu(network.bn_conv1(network.conv1(rgb))))
     for name in network.trunk:
         x = network.get_submodule(name)(x)
     return network.layer1_BN(network.layer1(x)), ()
 
 
-def fcrn_rear(network: FCRN, z: Tensor, kept: Any) -> Tensor:
+def fcrn_rear(network: FCRN, z: Tensor, _kept: Any) -> Tensor:
+    """Returns the network's output from z alone."""
     for name in fcrn.UP_PROJECTIONS:
         z = network.get_submodule(name)(z)
     return F.relu(network.ConvPred(z))
 
 
 def sfmlearner_front(network: DispNet, rgb: Tensor) -> Any:
-    """`conv7`; the features beside the decoder stay."""
+    """Returns z, the output of `conv7`, and the image and the outputs of `conv1` to `conv6`."""
     features = [rgb]
     for level in range(1, 8):
         features.append(network.get_submodule(f"conv{level}")(features[-1]))
@@ -84,16 +86,18 @@ def sfmlearner_front(network: DispNet, rgb: Tensor) -> Any:
 
 
 def sfmlearner_rear(network: DispNet, z: Tensor, features: tuple[Tensor, ...]) -> Tensor:
+    """Returns the largest disparity from z, the image and the outputs of `conv1` to `conv6`."""
     x = z
     disparity = None
     for level in range(7, 0, -1):
         beside = features[level - 1]
         x = sfmlearner.cropped(network.get_submodule(f"upconv{level}")(x), beside)
-        parts = [x, beside] if level > 1 else [x]
+        # At level 1 the image gives the size only.
+        concatenated = [x, beside] if level > 1 else [x]
         if disparity is not None:
             larger = F.interpolate(disparity, scale_factor=2.0, mode="bilinear")
-            parts.append(sfmlearner.cropped(larger, beside))
-        x = network.get_submodule(f"iconv{level}")(torch.cat(parts, dim=1))
+            concatenated.append(sfmlearner.cropped(larger, beside))
+        x = network.get_submodule(f"iconv{level}")(torch.cat(concatenated, dim=1))
         if level in sfmlearner.PREDICTED:
             predicted = network.get_submodule(f"predict_disp{level}")(x)
             disparity = sfmlearner.GAIN * predicted + sfmlearner.FLOOR
@@ -102,28 +106,31 @@ def sfmlearner_rear(network: DispNet, z: Tensor, features: tuple[Tensor, ...]) -
 
 
 def sparseconv_front(network: SparseConvNet, sparse: Tensor) -> Any:
-    """`sparse_convs.0[0]`; the mask stays."""
+    """Returns z, the features of `sparse_convs.0`, and the mask that they come with."""
     return network.sparse_convs[0]((sparse, (sparse > 0).to(sparse)))
 
 
 def sparseconv_rear(network: SparseConvNet, z: Tensor, mask: Tensor) -> Tensor:
-    pair = (z, mask)
+    """Returns the network's output from z and its mask."""
+    features_and_mask = (z, mask)
     for block in network.sparse_convs[1:]:
-        pair = block(pair)
-    return network.mask_conv(torch.cat(pair, dim=1))
+        features_and_mask = block(features_and_mask)
+    return network.mask_conv(torch.cat(features_and_mask, dim=1))
 
 
 def adnn_front(network: Adnn, sparse: Tensor) -> Any:
-    """`solve`; the sizes of the layers stay."""
+    """Returns z, the output of `solve`, and each layer's kernel and input size (rows, columns)."""
     kernels = tuple(getattr(network, name) for name in network.kernels)
     biases = tuple(getattr(network, name) for name in network.biases)
     sizes = [tuple(sparse.shape[-2:])]
     for _ in kernels[1:]:
+        # Rounded up, as SAME padding gives it.
         sizes.append(tuple(-(-side // adnn.STRIDE) for side in sizes[-1]))
     return network.solve(sparse, kernels, biases), (kernels, sizes)
 
 
-def adnn_rear(network: Adnn, z: Tensor, kept: Any) -> Tensor:
+def adnn_rear(_network: Adnn, z: Tensor, kept: Any) -> Tensor:
+    """Returns the network's output from z, by each layer's kernel and input size."""
     kernels, sizes = kept
     for kernel, size in zip(reversed(kernels), reversed(sizes), strict=True):
         z = adnn.synthesised(z, kernel, size)
@@ -131,7 +138,7 @@ def adnn_rear(network: Adnn, z: Tensor, kept: Any) -> Tensor:
 
 
 def sparse2dense_front(network: SparseToDense, rgb: Tensor, sparse: Tensor) -> Any:
-    """`bn2`; the size stays."""
+    """Returns z, the output of `bn2`, and the image's (height, width)."""
     x = torch.cat([rgb, sparse], dim=1)
     x = network.maxpool(network.relu(network.bn1(network.conv1(x))))
     x = network.layer4(network.layer3(network.layer2(network.layer1(x))))
@@ -139,12 +146,17 @@ def sparse2dense_front(network: SparseToDense, rgb: Tensor, sparse: Tensor) -> A
 
 
 def sparse2dense_rear(network: SparseToDense, z: Tensor, size: Any) -> Tensor:
+    """Returns the network's output from z, enlarged to the image's (height, width)."""
     x = network.conv3(network.decoder(z))
     return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
 def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
-    """`decoder.s8`; the encoders' features at 1/4 and 1/2 and the size stay."""
+    """Returns z, the output of `decoder.s8`, and what the finer levels of the decoder need.
+
+    That is both encoders' features at 1/2 and 1/4, the largest first, and the image's size.
+    """
+    # An encoder's features at 1/2, 1/4, 1/8, 1/16 and 1/32; the decoder takes them from the end.
     image = network.rgb(rgb)
     points = network.sparse(sparse)
     x = network.fuse(torch.cat([image.pop(), points.pop()], dim=1))
@@ -154,7 +166,9 @@ def latefusion_front(network: LateFusion, rgb: Tensor, sparse: Tensor) -> Any:
 
 
 def latefusion_rear(network: LateFusion, z: Tensor, kept: Any) -> Tensor:
+    """Returns the network's output from z and what `latefusion_front` gives beside it."""
     image, points, size = kept
+    # The last features are those at 1/4.
     for index, level in enumerate(LEVELS[2:], start=1):
         z = network.decoder[level](z, image[-index], points[-index])
     x = F.interpolate(network.inverse(z), size, mode="bilinear", align_corners=False)

@@ -119,7 +119,15 @@ def filled(method: str, frame: EvalFrame, data: Path) -> Depth | Refined:
 
 
 def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores:
-    """The scores of a method on frames of a set."""
+    """Returns the scores of a method on frames of a set.
+
+    Args:
+        method: Name of `METHODS`.
+        name: Name of the set.
+        data: The folder of real frames.
+        half: Which frames of the set, of `HALVES`.
+        count: Number of frames.
+    """
     # One thread, so that seconds of the processor can be compared.
     torch.set_num_threads(1)
     errors: dict[int, list[Depth]] = {size: [] for size in SIZES}
@@ -166,16 +174,19 @@ def measure(method: str, name: str, data: Path, half: str, count: int) -> Scores
     )
 
 
-def coverage(of: Scores) -> list[str]:
-    """Per cent within one and two standard deviations by size and in all, and of valid pixels."""
-    if not of.within:
+def coverage(scores: Scores) -> list[str]:
+    """Returns the last cells of a row: per cent within one and two σ, and of valid pixels.
+
+    The former are by size of the hole and in all; "—" of a method that has no σ.
+    """
+    if not scores.within:
         return ["—"] * (len(SIZES) + 2)
-    every = np.concatenate(list(of.within.values()))
+    every = np.concatenate(list(scores.within.values()))
     cells = [
         f"{(deviations <= 1).mean():.0%}, {(deviations <= 2).mean():.0%}"
-        for deviations in (*of.within.values(), every)
+        for deviations in (*scores.within.values(), every)
     ]
-    return [*cells, f"{of.valid.mean():.1%}"]
+    return [*cells, f"{scores.valid.mean():.1%}"]
 
 
 def main() -> None:
@@ -195,12 +206,17 @@ def main() -> None:
         for method in args.methods:
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
                 task = process.submit(measure, method, name, args.data, args.half, args.frames)
-                of = task.result()
-            means = [f"{of.errors[size].mean():.4f}" for size in SIZES]
-            every = np.concatenate(list(of.errors.values())).mean()
-            costs = f"{of.changed:.1%}", f"{of.seconds:.1f}", f"{of.wall:.1f}", f"{of.peak:.2f}"
+                scores = task.result()
+            means = [f"{scores.errors[size].mean():.4f}" for size in SIZES]
+            every = np.concatenate(list(scores.errors.values())).mean()
+            costs = (
+                f"{scores.changed:.1%}",
+                f"{scores.seconds:.1f}",
+                f"{scores.wall:.1f}",
+                f"{scores.peak:.2f}",
+            )
             case = f"{name}, {args.frames}"
-            print_row(case, method, *means, f"**{every:.4f}**", *costs, *coverage(of))
+            print_row(case, method, *means, f"**{every:.4f}**", *costs, *coverage(scores))
 
 
 if __name__ == "__main__":

@@ -91,9 +91,9 @@ def main() -> None:
 def ratios_of(
     network: Network, frames: Sequence[EvalFrame], count: int | None
 ) -> dict[tuple[str, str], list[float]]:
-    """MAE with a setting over MAE without any, of each frame, by method and setting.
+    """Returns each frame's MAE with a setting over its MAE without any, by method and setting.
 
-    NaN where the refinement diverged.
+    It is NaN where the refinement diverged. `count` is the number of points; None: all of a LiDAR.
     """
     ratios = defaultdict[tuple[str, str], list[float]](list)
     for frame in frames:

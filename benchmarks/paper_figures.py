@@ -86,6 +86,7 @@ _MISSING = "eigen-tiny is fully connected for NYU's size and learnt rooms, so it
 
 
 def _row(text: str) -> PaperRow:
+    """Returns the row of two lines of `_TABLES`, joined."""
     name, kind, family, layer, points, table, *numbers = text.split()
     values = [float(number) for number in numbers]
     street = table == "II"

@@ -18,11 +18,13 @@ ERRORS = MEASURES[:3]
 TITLES = ("RMSE", "MAE", "MRE", "δ1", "δ2", "δ3")
 STATES = {"paper": "the paper's setting", "tuned": "our setting"}
 PUBLISHED = "published"
+NOTED_COVERAGE = 0.9995
+"""Fraction of the known ground truth that is scored, below which a remark says so."""
 COLOURS = {PUBLISHED: "0.7", STATES["paper"]: "tab:orange", STATES["tuned"]: "tab:blue"}
 
 
 def markdown(table: Table) -> str:
-    """A set's table with the paper's figures beside ours, the δ at 1.01^k, and the steps."""
+    """Returns a set's report: errors beside those of the paper, δ at 1.01^k, steps of z, notes."""
     rows, beside = table["rows"], table["beside_paper"]
     title = f"## {heading(table)}\n\n{_sample_line(table)}\n"
     texts = [title, _measures(rows, table["street"], beside=beside)]
@@ -34,24 +36,37 @@ def markdown(table: Table) -> str:
 
 
 def heading(table: Table) -> str:
-    """Which of the paper's tables a set's is, on what."""
+    """Returns the title of a set's table, such as "Table I on rendered rooms"."""
     name = f"Table {'II' if table['street'] else 'I'}"
     return f"{name} on {table['set']}"
 
 
 def _sample_line(table: Table) -> str:
-    """What the means are over; the interval needs several groups of frames."""
+    """Returns a sentence on what the means are over, and why they have no interval."""
     rendered = table["set"].startswith("rendered")
     groups = "each its own group" if rendered else "of one sequence, one group"
     return f"Means over frames (n in the table), {groups}; one draw of the points, no interval."
 
 
 def paper_row(row: Result, street: bool) -> PaperRow:
-    """The paper's lines for a result."""
-    return next(p for p in ROWS if p.name == row["paper_row"] and p.street == street)
+    """Returns the paper's figures of the network of a result.
+
+    Args:
+        row: Result of one of our networks.
+        street: Whether it is table II, KITTI; else table I, NYU.
+    """
+    of_name = (paper for paper in ROWS if paper.name == row["paper_row"])
+    return next(paper for paper in of_name if paper.street == street)
 
 
 def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
+    """Returns the table of errors and δ, lines of Markdown.
+
+    Args:
+        rows: Results of our networks.
+        street: Whether the paper's figures are those of its table II.
+        beside: Whether the paper's figures stand above ours.
+    """
     lines = [table_row("network", "input", "points", "frames", "", *TITLES, head=True)]
     for row in rows:
         # The paper's two lines.
@@ -83,7 +98,7 @@ def _measures(rows: Sequence[Result], street: bool, *, beside: bool) -> str:
 
 
 def described(settings: dict[str, dict[str, Any]]) -> str:
-    """Our setting in a few words."""
+    """Returns our setting in a few words: layer, step, iterations and loss, or "the same"."""
     setting = settings["tuned"]
     paper = settings["paper"]
     names = ("layer", "lr", "update", "iterations", "loss")
@@ -101,7 +116,14 @@ def _cells(
     fine: bool = False,
     printed: Sequence[float] = (),
 ) -> list[str]:
-    """Six cells; with the gains over `before` in per cent, the first as printed."""
+    """Returns the cells of the six `MEASURES`.
+
+    Args:
+        values: The measures by name.
+        before: Those that the errors' gains in per cent are over; None: no gains.
+        fine: Whether the δ are at 1.01^k: they stand in another table, and a † here.
+        printed: Gains of the first measures as the paper prints them, instead of computed ones.
+    """
     cells = []
     for column, name in enumerate(MEASURES):
         if name in ERRORS:
@@ -115,11 +137,12 @@ def _cells(
 
 
 def _gain(after: float, before: float) -> str:
+    """Returns by how many per cent an error fell, with its sign; a rise is negative."""
     return f"{100 * (1 - after / before):+.1f} %".replace("-", "−")
 
 
 def _fine(rows: Sequence[Result], *, beside: bool) -> str:
-    """The δ at 1.01^k of the depth completion rows, before and after."""
+    """Returns the table of the δ at 1.01^k, before and after, of the depth completion rows."""
     lines = [
         "\nδ at 1.01, 1.01², 1.01³, as in the paper's depth completion rows, before → after\n",
         table_row("network", "", *TITLES[3:], head=True),
@@ -139,7 +162,7 @@ def _fine(rows: Sequence[Result], *, beside: bool) -> str:
 
 
 def _steps(rows: Sequence[Result]) -> str:
-    """How far the paper's step moves z, and what both settings do at the points themselves."""
+    """Returns the table of how far the paper's step moves z, and of the loss at the points."""
     titles = ("network", "z", "std(z)", "α", "L1, the paper's setting", "loss, our setting")
     lines = [
         "\nThe step against the feature map: standard deviation of the paper's z, α as its"
@@ -162,7 +185,7 @@ def _steps(rows: Sequence[Result]) -> str:
 
 
 def remarks(rows: Sequence[Result]) -> list[str]:
-    """Alignments, pixels that are not scored, and divergence."""
+    """Returns a line for each network that was aligned, not scored everywhere, or diverged."""
     notes = []
     for row in rows:
         if row["aligned"]:
@@ -171,7 +194,7 @@ def remarks(rows: Sequence[Result]) -> list[str]:
                 f"`{row['network']}` does not give metres: its output is aligned with the same"
                 f" points, once for before and after alike ({kinds} frames)"
             )
-        if row["coverage"] < 0.9995:
+        if row["coverage"] < NOTED_COVERAGE:
             notes.append(
                 f"`{row['network']}`: {100 * (1 - row['coverage']):.2f} % of the pixels with known"
                 " ground truth have no positive depth before or after, and are not scored"
@@ -182,9 +205,10 @@ def remarks(rows: Sequence[Result]) -> list[str]:
 
 
 def plot(tables: Sequence[Table], path: Path) -> None:
-    """An image of the gains in MAE: published, at the paper's setting, and with our defaults.
+    """Draws the gains in MAE: published, at the paper's setting, and with our defaults.
 
-    UsageError without matplotlib.
+    Raises:
+        UsageError: matplotlib is not installed, or no table has a row.
     """
     try:
         from matplotlib.figure import Figure
@@ -216,7 +240,7 @@ def plot(tables: Sequence[Table], path: Path) -> None:
 
 
 def bars_of(table: Table) -> dict[str, list[float]]:
-    """Gains in MAE in per cent, of each row, by what they are gains of."""
+    """Returns the gain in MAE of each row in per cent, by the title of the bars."""
     bars: dict[str, list[float]] = {}
     if table["beside_paper"]:
         published = [paper_row(row, table["street"]) for row in table["rows"]]

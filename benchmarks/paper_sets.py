@@ -26,7 +26,7 @@ VIEWS = 4  # of one scene; frames are rendered a scene at a time
 
 
 def cut_by(frame: EvalFrame, part: FramePart) -> EvalFrame:
-    """What a protocol leaves of the frame."""
+    """Returns the frame with all of its images cut to the part that a protocol scores."""
     images = {name: getattr(frame, name) for name in ("rgb", "gt", "sensor", "pool")}
     left = {name: part.apply(image) for name, image in images.items() if image is not None}
     return replace(frame, **{name: np.ascontiguousarray(image) for name, image in left.items()})
@@ -68,7 +68,10 @@ STREETS = Scenes(
 
 
 def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
-    """`count` frames of these scenes; what of them is not in the cache is rendered first."""
+    """Returns the set of the first `count` frames of these scenes.
+
+    They are rendered now, by so many processes, unless the cache has them.
+    """
     folder = cache / f"{scenes.kind}-{scenes.size[0]}x{scenes.size[1]}-seed{scenes.seed}"
     shards = [folder / f"shard_{number:05d}.npz" for number in range(-(-count // VIEWS))]
     if not all(shard.exists() for shard in shards):
@@ -78,6 +81,7 @@ def rendered(scenes: Scenes, cache: Path, count: int, workers: int) -> FrameSet:
 
 
 def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
+    """Renders so many frames into shards in a folder. Raises UsageError without the renderer."""
     try:
         from model_zoo_defs.training.rendering.render import Job, render_all
     except ImportError as error:
@@ -96,6 +100,7 @@ def _render(scenes: Scenes, folder: Path, count: int, workers: int) -> None:
 
 
 def _rendered_frames(scenes: Scenes, shards: list[Path], count: int) -> Iterator[EvalFrame]:
+    """Yields the first `count` frames of the shards, those of streets with a LiDAR scan."""
     for first, path in zip(range(0, count, VIEWS), shards, strict=True):
         with np.load(path) as shard:
             views = list(zip(shard["rgb"], shard["depth"], shard["intrinsics"], strict=True))
@@ -111,14 +116,24 @@ def within(depth: Depth, limit: float) -> Depth:
 
 
 def scan_of(gt: Depth, lens: NDArray[np.float32], seed: int) -> Depth:
-    """(H, W) one turn of 64 scan lines from the camera's place; lens: fx, fy, cx, cy in pixels."""
+    """Returns (H, W) one turn of 64 scan lines from the camera's place.
+
+    Args:
+        gt: Depth (H, W) in metres, 0 = unknown.
+        lens: fx, fy, cx, cy in pixels.
+        seed: Random seed of the scan.
+    """
     fx, fy, cx, cy = (float(value) for value in lens)
     camera = Camera(intrinsics=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     return as_depth_image(simulate_lidar(gt, camera, HDL_64E, seed))
 
 
 def shared(root: Path, most: int) -> list[FrameSet]:
-    """The real frames at hand, at most so many of each, evenly taken."""
+    """Returns the sets of real frames at hand, each of at most so many frames, evenly spaced.
+
+    Raises:
+        UsageError: There is none.
+    """
     sets = []
     for name, read in SETS.items():
         every = [_shared_frame(frame) for frame in read(root)]
@@ -136,6 +151,10 @@ def shared(root: Path, most: int) -> list[FrameSet]:
 
 
 def _shared_frame(frame: EvalFrame) -> EvalFrame:
+    """Returns a real frame as its protocol scores it: near enough, and rooms without their border.
+
+    The points of a street are drawn from its scan.
+    """
     if frame.sensor is None:
         gt = within(frame.gt, ROOM_LIMIT)
         return cut_by(replace(frame, gt=gt), NYU_PART)

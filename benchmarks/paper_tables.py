@@ -63,7 +63,7 @@ class Entry:
 
 
 def entry_of(row: PaperRow, network: Network) -> Entry:
-    """The network at the paper's setting and with its own defaults, aligned alike in both."""
+    """Returns the network with the paper's setting and with its own defaults, aligned alike."""
     definition = network.definition
     # One factor, as in the evaluation of networks that know depth up to one; "auto" might take two.
     align = "scale" if definition.output_scale == "scale" else definition.default_alignment
@@ -94,7 +94,13 @@ def scores_of(depths: dict[str, Depth], gt: Depth) -> tuple[dict[str, dict[str, 
 
 
 def frame_figures(entry: Entry, frame: EvalFrame, number: int) -> dict[str, Any]:
-    """Scores of a network on one frame, the loss at the points and the standard deviation of z."""
+    """Returns a frame's scores, loss at the points, and standard deviation of z, of a network.
+
+    Args:
+        entry: The network and its two settings.
+        frame: The frame, which is cut as the row of the table asks.
+        number: Random seed of the points.
+    """
     frame = cut_by(frame, entry.row.cut)
     inputs = drawn_inputs(frame, entry.row.points, number)
     layer, paper = entry.settings["paper"]
@@ -120,7 +126,7 @@ def frame_figures(entry: Entry, frame: EvalFrame, number: int) -> dict[str, Any]
 
 
 def gains(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
-    """Per cent by which the errors fell, and points by which the fractions rose."""
+    """Returns per cent by which the errors fell, and percentage points by which the δ rose."""
     errors = MEASURES[:3]
     return {
         name: 100 * (1 - after[name] / before[name]) if name in errors else value - before[name]
@@ -129,9 +135,10 @@ def gains(before: dict[str, float], after: dict[str, float]) -> dict[str, float]
 
 
 def result_of(entry: Entry, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """A network's line in the tables: means over the frames."""
+    """Returns a network's line in the tables: means of `frame_figures` over the frames."""
 
     def mean(*path: str | int) -> float:
+        """Returns the mean over the frames of what these keys lead to, one in the other."""
         values: list[Any] = list(frames)
         for key in path:
             values = [value[key] for value in values]
@@ -197,7 +204,14 @@ def table_of(frame_set: FrameSet, entries: Sequence[Entry]) -> dict[str, Any]:
 
 
 def entries_of(only: Sequence[str]) -> tuple[list[Entry], list[str]]:
-    """The tiny editions, row by row, and notes on what there is none of."""
+    """Returns the tiny networks of each row of the paper, and notes on rows that have none.
+
+    Args:
+        only: Names of the networks; empty: all.
+
+    Raises:
+        UsageError: There is no such network.
+    """
     tiny = [name for name in all_definitions() if "-tiny" in name]
     if unknown := set(only) - set(tiny):
         raise UsageError(f"--only: no {', '.join(sorted(unknown))}; there are {', '.join(tiny)}")
@@ -224,7 +238,7 @@ def sets_of(args: argparse.Namespace, entries: Sequence[Entry]) -> Iterable[Fram
 
 
 def parsed() -> argparse.Namespace:
-    """What the command line says."""
+    """Returns the options of the command line; ends the program if they are wrong."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
         "--frames", type=int, help="of rooms and each real set; a quarter as many streets"

@@ -94,6 +94,8 @@ class Passes:
             yield
 
     def _as_step(self, function: Callable[..., Any], step: str) -> Callable[..., Any]:
+        """Returns the function with its passes counted under the name of this step."""
+
         def run(*args: Any, **kwargs: Any) -> Any:
             self._step.append(step)
             try:
@@ -104,11 +106,19 @@ class Passes:
         return run
 
     def _split(self, *args: Any, **kwargs: Any) -> Any:
-        found = self._split_frame(*args, **kwargs)
-        self._kept = found.kept.points if len(found.points) else None
-        return found
+        """Splits off the validation points, and remembers the points that remain."""
+        split_frame = self._split_frame(*args, **kwargs)
+        self._kept = split_frame.kept.points if len(split_frame.points) else None
+        return split_frame
 
     def _refine(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Returns `OpenNetwork.refine` with its seconds summed up and its passes counted.
+
+        They are counted under the step that calls it. Outside of `STEPS`, "validation points" is
+        the step that refines without the validation points, "all points" the one that refines with
+        them.
+        """
+
         def run(network: OpenNetwork, frame: Frame, *, updates: bool = True) -> Any:
             step = self._step[-1]
             if step == "other":
@@ -126,6 +136,8 @@ class Passes:
         return run
 
     def _part(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        """Returns a method of `Split` whose passes count as those of this part of the network."""
+
         def run(split: Split, *args: Any) -> Any:
             self._within.append((part, split._network))
             try:
@@ -136,6 +148,8 @@ class Passes:
         return run
 
     def _backward(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Returns `gradient_at` with each call counted as a backward pass."""
+
         def run(*args: Any) -> Any:
             self.counts[self._last, self._step[-1]]["backward"] += 1
             return function(*args)
@@ -143,6 +157,7 @@ class Passes:
         return run
 
     def _count(self, module: nn.Module, _inputs: object) -> None:
+        """Counts a forward pass; torch calls this before the forward pass of every module."""
         name = self.names.get(module)
         if name is None:
             return
@@ -154,13 +169,13 @@ class Passes:
 
 
 def sample(count: int) -> Frame:
-    """The indoor sample with so many points of its ground truth."""
+    """Returns the indoor sample with so many points of its ground truth."""
     gt = read_depth(SAMPLE / "gt.png").values
     return drawn_inputs(EvalFrame("indoor", read_rgb(SAMPLE / "rgb.png").values, gt), count, 0)
 
 
 def bare_seconds(network: Network, frame: Frame) -> float:
-    """The processor's seconds of one pass of the network alone."""
+    """Returns the processor's seconds of one forward pass of the network; the median of `RUNS`."""
     arguments = prepare(network, frame).arguments
     spent = list[float]()
     for _ in range(RUNS):
@@ -172,13 +187,17 @@ def bare_seconds(network: Network, frame: Frame) -> float:
 
 
 def update_seconds(member: OpenNetwork, frame: Frame) -> float:
-    """The processor's seconds of one update of z: the rear, and its gradient."""
+    """Returns the processor's seconds of one update of z; the median of `RUNS`.
+
+    An update is a pass of the rear, the part of the network behind the cut, and a backward pass.
+    """
     network = member.network
     spent = list[float]()
     with network.cut_at(member.layer) as split:
         z0 = split.front(*prepare(network, frame).arguments)
+        # The first pass of the rear is watched operation by operation, so it is not timed.
         with torch.no_grad():
-            split.rear(z0)  # which is recorded
+            split.rear(z0)
         for _ in range(RUNS):
             z = z0.detach().requires_grad_()
             start = time.process_time()
@@ -225,6 +244,7 @@ def report(title: str, network: Network, frame: Frame, settings: Settings) -> No
 
 
 def main() -> None:
+    """Counts the passes of each network, method and number of points, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
     parser.add_argument("--methods", nargs="+", default=["fused", "alone"])

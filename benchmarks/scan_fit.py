@@ -88,7 +88,7 @@ def frames_of(data: Path, part: str) -> Iterator[ScanFrame]:
 
 
 def _frame_of_map(image: Path, depth: NDArray[np.float32], calibration: Calibration) -> ScanFrame:
-    """A frame whose scan was stored as a depth map (H, W)."""
+    """Returns a frame whose scan was stored as a depth map (H, W) of its camera, in metres."""
     assert calibration.scanner is not None
     rows, columns = np.nonzero(depth)
     xy = np.column_stack([columns, rows]).astype(np.float64)
@@ -98,7 +98,7 @@ def _frame_of_map(image: Path, depth: NDArray[np.float32], calibration: Calibrat
 
 
 def _moved(frame: ScanFrame, turn_deg: tuple[float, ...], shift: tuple[float, ...]) -> ScanFrame:
-    """The frame with its calibration turned about the camera's x, y, z and moved."""
+    """Returns the frame, its scanner turned about the camera's x, y, z and moved by metres."""
     assert frame.calibration.scanner is not None
     turn = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
     pose = Extrinsics(turn, np.array(shift)) @ frame.calibration.scanner
@@ -106,7 +106,10 @@ def _moved(frame: ScanFrame, turn_deg: tuple[float, ...], shift: tuple[float, ..
 
 
 def _resized(frame: ScanFrame, factor: float, *, is_calibrated: bool) -> ScanFrame:
-    """The frame with an image of another size, and its calibration or that of the former size."""
+    """Returns the frame, its image resized by a factor.
+
+    The calibration is that of the new image, or if not `is_calibrated`, wrongly of the old one.
+    """
     height, width = frame.rgb.shape[:2]
     size = round(width * factor), round(height * factor)
     way = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
@@ -118,7 +121,10 @@ def _resized(frame: ScanFrame, factor: float, *, is_calibrated: bool) -> ScanFra
 
 
 def _cropped(frame: ScanFrame, top: float, left: float, rows: float, columns: float) -> ScanFrame:
-    """The frame cut to fractions of its height and width, with its calibration."""
+    """Returns the frame cut to a window, with the window's calibration.
+
+    All four numbers are fractions of the image's height or width.
+    """
     height, width = frame.rgb.shape[:2]
     first_row = round(top * height)
     first_column = round(left * width)
@@ -244,12 +250,14 @@ def _within_40_m(frame: ScanFrame) -> ScanFrame:
 
 
 def _jpeg(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns an image (H, W, 3) in 0…1 after JPEG of quality 25."""
     codes = np.rint(rgb * 255).astype(np.uint8)
     _, data = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, 25])
     return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(np.float32) / 255
 
 
 def main() -> None:
+    """Asks for the warning of every variant of every frame, and prints what was noticed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
     parser.add_argument("--part", choices=["choose", "report"], default="report")

@@ -62,6 +62,7 @@ class StoredMap(nn.Module):
         self.map = nn.Identity()
 
     def forward(self, _rgb: Tensor) -> Tensor:
+        """Returns the map (1, 1, H, W)."""
         stored: Tensor = self.map(self.values)
         return stored
 
@@ -93,6 +94,7 @@ class DecodedMap(nn.Module):
             self.rest = target - self(rgb[None])
 
     def forward(self, rgb: Tensor) -> Tensor:
+        """Returns the map (1, 1, H, W), changed by what the decoder makes of the image."""
         coarse = self.factor * self.decode(self.encode(rgb))
         size = self.rest.shape[-2:]
         return self.rest + F.interpolate(coarse, size, mode="bilinear", align_corners=False)
@@ -158,11 +160,14 @@ def weakened(gt: Depth, error: float, rng: Generator) -> Depth:
     fault = _fault(log_depth, rng)
 
     def off(amplitude: float, blur_px: float) -> float:
+        """Returns the error with the faults at this amplitude and the edges blurred so far."""
         return error_aligned(np.exp(_blurred(log_depth + amplitude * fault, blur_px)), gt)
 
+    # Less blur, if it alone makes too much of the error.
     blur_px = EDGE_BLUR_PX
     while off(0.0, blur_px) > MOST_OF_BLUR * error:
         blur_px /= 2
+    # The amplitude lies between two, which are halved 12 times.
     low = 0.0
     high = error
     while off(high, blur_px) < error:
@@ -182,14 +187,16 @@ def error_aligned(depth: Depth, gt: Depth) -> float:
     known = gt > 0
     x = 1 / depth[known].astype(np.float64)
     true = gt[known].astype(np.float64)
+    # true / aligned is true · (scale · x + shift), which should be 1: the normal equations.
     system = np.stack([x * true, true], axis=1)
     scale, shift = np.linalg.lstsq(system.T @ system, system.sum(axis=0), rcond=None)[0]
+    # At most ten times as far as the farthest true pixel, also where the line is not positive.
     aligned = 1 / np.maximum(scale * x + shift, 0.1 / true.max())
     return float(np.abs(aligned / true - 1).mean())
 
 
 def _fault(log_depth: Depth, rng: Generator) -> Depth:
-    """Errors of log depth (H, W), their standard deviation 1."""
+    """Returns errors of log depth (H, W), of standard deviation 1."""
     height, width = log_depth.shape
     centred = (log_depth - log_depth.mean()) / max(float(log_depth.std()), 1e-6)
     # A smooth field.
@@ -218,7 +225,7 @@ def _blurred(log_depth: Depth, blur_px: float) -> Depth:
 
 
 def as_outputs(depth: Depth, rng: Generator) -> dict[str, NDArray[np.float64]]:
-    """What networks of this depth (H, W) give, by what their numbers are.
+    """Returns maps (H, W) that networks of this depth give, by what their numbers are.
 
     Factors and shifts are drawn where such a network knows none.
     """

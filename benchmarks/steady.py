@@ -29,7 +29,7 @@ from __future__ import annotations
 import argparse
 import json
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -257,10 +257,15 @@ class TiedLines:
         return depths
 
     def _moved(self, x: Line) -> Line:
+        """Returns values of the maps less their median at the points, over their deviation."""
         return (x - self._centre) / self._spread
 
     def _weigh(self, weights: Sequence[Line]) -> None:
-        """The points have these weights from here on."""
+        """Sets the normal equations of each frame's line, with weights of its points.
+
+        Args:
+            weights: Weights (N,) of the points of each frame.
+        """
         count = len(self._rows)
         self._matrix = np.zeros((2 * count, 2 * count))
         self._side = np.zeros(2 * count)
@@ -271,7 +276,12 @@ class TiedLines:
         self._total = float(sum(weight.sum() for weight in weights))
 
     def _solved(self, count: int, variances: Line) -> Solved:
-        """What the points of the first frames say, given the variances."""
+        """Returns the posterior of the lines of the first frames, given their points.
+
+        Args:
+            count: Number of the frames.
+            variances: Logarithms of the five variances, in the order of `START`.
+        """
         variance = np.exp(variances)
         number = np.arange(count)
         steps = np.minimum(number[:, None], number[None])
@@ -345,7 +355,15 @@ def measure(
 def propagated(
     depths: Sequence[Tensor], frames: Sequence[EvalFrame], points: Sequence[SparsePoints]
 ) -> list[Tensor]:
-    """Returns depth (H, W) in metres of each frame with its residual propagated."""
+    """Returns depth (H, W) in metres of each frame, corrected by what its points measured.
+
+    The log ratio of measured and aligned depth at the points is propagated to all pixels.
+
+    Args:
+        depths: Aligned depth (H, W) in metres of each frame.
+        frames: The frames, whose images guide the propagation.
+        points: Points of each frame.
+    """
     return [
         ResidualField(depth, sparse, tensor_of(frame.rgb)).depth()
         for depth, frame, sparse in zip(depths, frames, points, strict=True)
@@ -376,22 +394,29 @@ def geometric_mean(values: Sequence[float]) -> float:
 
 
 def print_tables(runs: Sequence[Run]) -> None:
-    """Prints MAE and shake of every set and number of points, then by drift."""
+    """Prints a table for each stage's MAE, and for its change of scale from frame to frame.
+
+    A line is the mean of the runs with the same set and number of points, and in a second table
+    also with the same kind of errors and drift; a column is an alignment.
+    """
     names = list(dict.fromkeys(run["alignment"] for run in runs))
-    groups: dict[str, Callable[[Run], tuple[Any, ...]]] = {
-        "all": lambda run: (run["set"], run["points"]),
-        "by drift": lambda run: (run["set"], run["points"], run["faults"], run["drift"]),
+    # What the runs of a line have in common.
+    groupings = {
+        "all": ("set", "points"),
+        "by drift": ("set", "points", "faults", "drift"),
     }
     for what in (*STAGES, *(f"shake, {stage}" for stage in STAGES)):
-        for title, key in groups.items():
+        for title, keys in groupings.items():
             print(f"\n{what}: {title}\n")
             print_row("set", "points", "errors, drift", *names, head=True)
-            for case in dict.fromkeys(key(run) for run in runs):
-                of_case = [run for run in runs if key(run) == case]
+            for case in dict.fromkeys(tuple(run[key] for key in keys) for run in runs):
+                of_case = [run for run in runs if tuple(run[key] for key in keys) == case]
                 cells = list[str]()
                 for name in names:
-                    cells.append(_cell([r for r in of_case if r["alignment"] == name], what))
-                print_row(case[0], case[1], ", ".join(case[2:]), *cells)
+                    of_name = [run for run in of_case if run["alignment"] == name]
+                    cells.append(_cell(of_name, what))
+                set_name, points, *faults_and_drift = case
+                print_row(set_name, points, ", ".join(faults_and_drift), *cells)
 
 
 def print_changes(runs: Sequence[Run]) -> None:
@@ -426,16 +451,19 @@ def _log_errors(runs: Sequence[Run], alignment: str, what: str) -> Line:
 
 
 def _cell(runs: Sequence[Run], what: str) -> str:
+    """Returns the mean shake in per cent, or of a stage the geometric mean MAE in metres."""
     if what.startswith("shake"):
         return f"{100 * float(np.mean([run[what] for run in runs])):.2f} %"
     return f"{geometric_mean([value for run in runs for value in run[what]]):.4f}"
 
 
 def _depth(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> Tensor:
+    """Returns depth (H, W) in metres of a map x (H, W), aligned with the points of its frame."""
     return align(points.sample(x), points, tried).depth(x)
 
 
 def main() -> None:
+    """Measures every alignment on every sequence, and prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--sets", nargs="+", default=[*CHOOSING, *REPORTED])

@@ -64,7 +64,7 @@ Run = dict[str, Any]
 
 
 def measure(case: StrongFrame, count: int | None, seed: int) -> Run:
-    """The run of one frame with so many points; None: scan lines."""
+    """Returns the run of one frame with so many points; None: scan lines."""
     # The result, and what `compact` makes of the aligned network.
     frame = case.frame if count is not None else with_lines(case.frame)
     inputs = drawn_inputs(frame, count, seed)
@@ -117,7 +117,7 @@ def depth_with_prior(method: Method, inputs: Frame, refined: Refined) -> Tensor:
 
 
 def weights_by_kind(network: str, refined: Refined) -> dict[str, float]:
-    """The weights of the result, by the kinds of `OWN`."""
+    """Returns the experts' weights in the result, summed up by the kinds of `OWN`."""
     kinds = {network: OWN[0], f"compact with {network}": OWN[1], "compact": OWN[2]}
     weights = dict.fromkeys(OWN, 0.0)
     for name, weight in refined.weights.items():
@@ -126,7 +126,7 @@ def weights_by_kind(network: str, refined: Refined) -> dict[str, float]:
 
 
 def within_sigma(refined: Refined, gt: np.ndarray[Any, Any]) -> float:
-    """The part of the truth that is within two standard deviations of the result."""
+    """Returns the fraction of the pixels whose error is within two standard deviations."""
     assert refined.sigma is not None
     known = (gt > 0) & (refined.depth > 0)
     error = np.abs(gt - refined.depth)[known]
@@ -149,6 +149,7 @@ def print_tables(runs: Sequence[Run]) -> None:
     last_of_row = {row: place for (row, _), place in places.items()}
 
     def place(case: tuple[str, str, Any]) -> tuple[float, float]:
+        """Returns the place of a line: as measured, a row's line of all frames behind its sets."""
         row, name, points = case
         at = last_of_row[row] + 0.5 if name == ALL else places[row, name]
         return at, order.get(points, points)

@@ -144,7 +144,7 @@ def with_lines(frame: EvalFrame) -> EvalFrame:
 
 
 def stored_frames(folder: Path) -> Iterator[StrongFrame]:
-    """The frames of a folder, once for each network's map."""
+    """Yields the frames of a folder, once for each network's map."""
     stored = STORED[folder.name]
     for path in sorted(folder.glob("*_rgb.*")):
         number = path.stem.removesuffix("_rgb")
@@ -166,7 +166,7 @@ def stored_frames(folder: Path) -> Iterator[StrongFrame]:
 
 
 def rendered(kind: str, count: int) -> list[EvalFrame]:
-    """`count` rendered frames, each of a scene of its own."""
+    """Returns `count` rendered frames, each of a scene of its own."""
     from model_zoo_defs.training.scenes.scenes import scene_frames  # needs the extra `train`
 
     height, width = RENDERED_SIZE
@@ -181,6 +181,7 @@ def rendered(kind: str, count: int) -> list[EvalFrame]:
 
 
 def _simulated(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields networks of each error of `ERRORS`, with their rows."""
     for row, error in ERRORS.items():
         seed = zlib.crc32(f"{frame.name} {row}".encode())
         name = f"simulated-{100 * error:g}"
@@ -188,16 +189,19 @@ def _simulated(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
 
 
 def _fastdepth(_frame: EvalFrame, data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields FastDepth and its row, if its file is there."""
     if (data / "weights" / "fastdepth_nyu.onnx").is_file():
         yield "FastDepth", opened("fastdepth", data)
 
 
 def _tiny(_frame: EvalFrame, data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields the networks of `TINY`, each a row of its own."""
     for name in TINY:
         yield name, opened(name, data)
 
 
 def _random(frame: EvalFrame, _data: Path) -> Iterator[tuple[str, Network]]:
+    """Yields the networks of `RANDOM` with weights that are drawn for the frame, in one row."""
     for name in RANDOM:
         torch.manual_seed(zlib.crc32(frame.name.encode()))
         definition = replace(find_definition(name), checkpoint=None, complete=True)
@@ -214,7 +218,7 @@ MAKERS: dict[str, Networks] = {
 
 
 def _read_grey(path: Path) -> Map:
-    """The numbers (H, W) of a picture of one channel."""
+    """Returns the numbers (H, W) of a picture of one channel."""
     from PIL import Image
 
     with Image.open(path) as image:

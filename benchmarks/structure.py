@@ -85,6 +85,8 @@ def circles(graph: Graph) -> list[frozenset[str]]:
     on_path: set[str] = set()
 
     def visit(node: str) -> None:
+        """Numbers a node and all that it reaches; adds the components that begin there."""
+        # The lowest number that the node and those behind it lead back to.
         number[node] = len(number)
         lowest[node] = number[node]
         path.append(node)

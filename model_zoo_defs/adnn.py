@@ -125,7 +125,13 @@ class Solve(nn.Module):
         self.step = Step()
 
     def forward(self, sparse: Tensor, kernels: Three, biases: Three) -> Tensor:
-        """Returns the codes after all iterations; filters and biases are those of each layer."""
+        """Returns the last layer's codes (B, n, ⌈H/8⌉, ⌈W/8⌉) after all iterations.
+
+        Args:
+            sparse: (B, 1, H, W) metres, 0 = unknown.
+            kernels: Filters (n, c, k, k) of each layer.
+            biases: Bias () of each layer.
+        """
         known = covered((sparse > 0).to(sparse), kernels)
         state = first_state(sparse, known, kernels, biases)
         for _ in range(self.iterations):
@@ -137,7 +143,7 @@ class Synthesis(nn.Module):
     """Synthesis as a submodule, so that the network can be cut behind it."""
 
     def forward(self, codes: Tensor, kernel: Tensor, size: tuple[int, int]) -> Tensor:
-        """Returns the map of this size that codes of one layer synthesise."""
+        """Returns the map (B, c, h, w) of `size` (h, w) that codes (B, n, …) synthesise."""
         return synthesised(codes, kernel, size)
 
 
@@ -161,7 +167,7 @@ class Adnn(nn.Module):
             channels = count
 
     def forward(self, sparse: Tensor) -> Tensor:
-        """Returns depth from sparse depth."""
+        """Returns depth (B, 1, H, W) from sparse depth of this shape, 0 = unknown; metres."""
         kernels = _three([getattr(self, name) for name in self.kernels])
         biases = _three([getattr(self, name) for name in self.biases])
         x = self.solve(sparse, kernels, biases)

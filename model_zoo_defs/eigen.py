@@ -61,7 +61,7 @@ class Coarse(nn.Module):
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Returns coarse log depth from the image."""
+        """Returns coarse log depth (B, 1, h, w) from the image (B, 3, H, W)."""
         x = self.pool(self.relu(self.conv1(rgb)))
         x = self.pool(self.relu(self.conv2(x)))
         x = self.relu(self.conv4(self.relu(self.conv3(x))))
@@ -87,7 +87,7 @@ class Fine(nn.Module):
         self.pool = nn.MaxPool2d(2)
 
     def forward(self, rgb: Tensor, coarse: Tensor) -> Tensor:
-        """Returns log depth from the image and the coarse log depth."""
+        """Returns log depth (B, 1, h, w) from image (B, 3, H, W) and coarse one (B, 1, h, w)."""
         x = self.pool(self.relu(self.conv1(rgb)))
         x = self.relu(self.conv2(torch.cat([x, coarse], dim=1)))
         log_depth: Tensor = self.conv3(x)
@@ -115,7 +115,7 @@ class Eigen(nn.Module):
         self.fine = Fine(fine)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Returns log depth from the image."""
+        """Returns log depth (B, 1, 55, 74) from the image (B, 3, 228, 304)."""
         log_depth: Tensor = self.fine(rgb, self.coarse(rgb))
         return log_depth
 

@@ -180,7 +180,7 @@ class FCRN(nn.Module):
         self.ConvPred.bias = nn.Parameter(torch.full((1,), 2.0))
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Returns depth from the image."""
+        """Returns depth (B, 1, 16·⌈H/32⌉, 16·⌈W/32⌉) in metres from the image (B, 3, H, W)."""
         x = self.pool(self.relu(self.bn_conv1(self.conv1(rgb))))
         for name in self.trunk:
             x = self.get_submodule(name)(x)

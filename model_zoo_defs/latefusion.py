@@ -113,7 +113,12 @@ class NormalCell(nn.Module):
         self.earlier3_too = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        """Returns (B, 6·width, h, w) from the last two features, the later (B, later, h, w)."""
+        """Returns (B, 6·width, h, w) from the last two features.
+
+        Args:
+            earlier: The features before the last (B, earlier, h, w), or of twice the size.
+            later: The last features (B, later, h, w).
+        """
         earlier = self.earlier(earlier)
         later = self.later(later)
         # The earlier features and five sums of two.
@@ -151,10 +156,15 @@ class ReductionCell(nn.Module):
         self.first3 = separable(width, width, 3)
 
     def forward(self, earlier: Tensor, later: Tensor) -> Tensor:
-        """Returns (B, 4·width, h/2, w/2) from the last two features, the later (B, later, h, w)."""
+        """Returns (B, 4·width, h/2, w/2) from the last two features.
+
+        Args:
+            earlier: The features before the last (B, earlier, h, w), or of twice the size.
+            later: The last features (B, later, h, w).
+        """
         earlier = self.earlier(earlier)
         later = self.later(later)
-        # Sums of two at half the size; the first goes into two of those that are concatenated.
+        # The cell's five sums of two, at half the size. The first goes into the fourth and fifth.
         first = self.later5(later) + self.earlier7(earlier)
         largest = F.max_pool2d(later, 3, 2, 1)
         second = largest + self.earlier7_too(earlier)
@@ -242,7 +252,7 @@ class Encoder(nn.Module):
             self.channels.append(later)
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """Returns the features, the largest first."""
+        """Returns the features at 1/2, 1/4, 1/8, 1/16 and 1/32 of x (B, channels, H, W)."""
         later = self.stem(x)
         earlier = later
         features = [later]
@@ -297,7 +307,7 @@ class LateFusion(nn.Module):
         nn.init.constant_(self.inverse.bias, -1.5)  # type: ignore[arg-type]  # about 5 m
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-        """Returns depth from image and sparse depth."""
+        """Returns depth (B, 1, H, W) from image (B, 3, H, W) and sparse depth; in metres."""
         rgb_skips = self.rgb(rgb)
         sparse_skips = self.sparse(sparse)
         x = self.fuse(torch.cat([rgb_skips.pop(), sparse_skips.pop()], dim=1))

@@ -109,8 +109,9 @@ class NConv(NormalisedUNet):
     """Sparse depth (1, 1, H, W) in metres, 0 = unknown → depth (1, 1, H, W)."""
 
     def forward(self, sparse: Tensor) -> Tensor:  # type: ignore[override]
-        """Returns dense depth from sparse depth, whose known pixels have a confidence of 1."""
-        return super().forward(sparse, (sparse > 0).to(sparse))[0]
+        """Returns depth (1, 1, H, W) from sparse depth, of confidence 1 where it is known."""
+        depth, _confidence = super().forward(sparse, (sparse > 0).to(sparse))
+        return depth
 
 
 definitions = {

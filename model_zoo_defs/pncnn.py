@@ -36,7 +36,10 @@ def named(**layers: nn.Module) -> nn.Sequential:
 
 
 def two_convolutions(channels: int, out: int) -> nn.Sequential:
-    """Returns 3×3 convolution, batch norm, ReLU, twice: `channels` → `out` channels."""
+    """Returns 3×3 convolution, batch norm, ReLU, twice: `channels` → `out` channels.
+
+    They are within a layer `conv`, as in the published weights.
+    """
     layers: list[nn.Module] = []
     for count in (channels, out):
         layers += [nn.Conv2d(count, out, 3, padding=1), nn.BatchNorm2d(out), nn.ReLU(inplace=True)]
@@ -94,8 +97,9 @@ class Pncnn(nn.Module):
         self.nconv = NormalisedUNet(SoftplusNormalisedConv)
 
     def forward(self, sparse: Tensor) -> Tensor:
-        """Returns dense depth from sparse depth."""
-        depth: Tensor = self.nconv(sparse, self.conf_estimator(sparse))[0]
+        """Returns dense depth (1, 1, H, W) from sparse depth of this shape, 0 = unknown; metres."""
+        depth: Tensor
+        depth, _confidence = self.nconv(sparse, self.conf_estimator(sparse))
         return depth
 
 

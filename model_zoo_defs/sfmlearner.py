@@ -106,7 +106,7 @@ class DispNet(nn.Module):
                     nn.init.zeros_(layer.bias)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Returns disparity from the image."""
+        """Returns disparity (B, 1, H, W) from the image (B, 3, H, W) in -1…1."""
         return self.pyramid(rgb)[0]
 
     def pyramid(self, rgb: Tensor) -> list[Tensor]:
@@ -121,6 +121,7 @@ class DispNet(nn.Module):
         for level in reversed(LEVELS):
             skip = features.pop()
             x = cropped(self.get_submodule(f"upconv{level}")(x), skip)
+            # At full size the image gives the size only.
             joint = [x, skip] if level > 1 else [x]
             if disparities:
                 enlarged = F.interpolate(disparities[-1], scale_factor=2.0, mode="bilinear")

@@ -151,7 +151,7 @@ class UpProjection(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns the enlarged features."""
+        """Returns (B, channels / 2, 2h, 2w) from (B, channels, h, w)."""
         return F.relu(self.upper_branch(x) + self.bottom_branch(x))
 
 
@@ -183,7 +183,7 @@ class SparseToDense(nn.Module):
         self.conv3 = nn.Conv2d(channels, 1, 3, padding=1, bias=False)
 
     def forward(self, rgb: Tensor, sparse: Tensor) -> Tensor:
-        """Returns depth from image and sparse depth, at their size."""
+        """Returns depth (B, 1, H, W) from image (B, 3, H, W) and sparse depth; in metres."""
         x = torch.cat([rgb, sparse], dim=1)
         size = x.shape[-2:]
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))

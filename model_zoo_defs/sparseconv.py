@@ -84,7 +84,7 @@ class SparseConvNet(nn.Module):
         self.mask_conv.bias.data.zero_()  # type: ignore[union-attr]
 
     def forward(self, sparse: Tensor) -> Tensor:
-        """Returns dense depth from sparse depth."""
+        """Returns depth (B, 1, H, W) from sparse depth of this shape, 0 = unknown; metres."""
         x, mask = self.sparse_convs((sparse, (sparse > 0).to(sparse)))
         return self.mask_conv(torch.cat([x, mask], 1))  # type: ignore[no-any-return]
 

@@ -71,6 +71,7 @@ class Block(nn.Module):
         super().__init__()
         self.enter = nn.Conv2d(channels, out, 3, padding=1)
         self.first = nn.Conv2d(out, out, 3, padding=1)
+        # Untrained, neither the second convolution nor a prior changes the features.
         self.second = nn.Conv2d(out, out, 3, padding=1)
         nn.init.zeros_(self.second.weight)
         if hints:
@@ -196,6 +197,7 @@ class SigmaHead(nn.Module):
         super().__init__()
         self.enter = nn.Conv2d(channels, 16, 3, padding=1)
         self.leave = nn.Conv2d(16, 1, 1)
+        # Untrained, the error is the same everywhere: exp(-3), 5 % of the depth.
         nn.init.zeros_(self.leave.weight)
         self.leave.bias = nn.Parameter(torch.tensor([-3.0]))
 

@@ -18,6 +18,8 @@ FIT_HEADS = 4
 FIT_KEY = 16
 # Log distance in cells to the nearest point, where there is none.
 FAR = 5.0
+# A cell's prior is known if at least this part of the weights is on cells where it is known.
+LEAST_SUPPORT = 1e-4
 # So many cells are fitted at a time: bounds the memory.
 FIT_CHUNK = 1024
 
@@ -78,15 +80,18 @@ class PointFit(nn.Module):
         self.floor = nn.Parameter(torch.tensor(0.3).log())
 
     def forward(self, near: Tensor, far: Tensor, points: Points, prior: Prior | None = None) -> Fit:
-        """Returns planes at 1/16 through the points and, with a prior, the residuals against it.
+        """Returns the values in each cell at 1/16 of local planes through the points.
+
+        With a prior, planes are also fitted to the points' residuals against it.
 
         Args:
-            near: Features of the image at 1/16.
+            near: Features of the image at 1/16 (B, c, h, w).
             far: Features of the image at 1/32.
             points: The points, with inlier weights.
             prior: Another network's depth; None without.
         """
-        # Queries of all cells, and keys of those that have points in any image of the batch.
+        # Queries of all cells, and keys of those that have points in any image of the batch. What
+        # the points of a cell say is in `cells`, whether there are any comes last.
         height, width = near.shape[-2:]
         features = F.relu(self.near(near) + resize(self.far(far), (height, width)))
         queries = self._per_head(self.query(features))
@@ -118,7 +123,7 @@ class PointFit(nn.Module):
         # The prior is known where its own pixel is, and enough of what its residuals are fitted to.
         residual, std, reliability, support = of_prior
         value, valid = prior.at(16)
-        valid = valid * (support > 1e-4)
+        valid = valid * (support > LEAST_SUPPORT)
         fit = PriorFit(value + residual, std, reliability * valid, valid)
         return Fit(estimates, distance.unsqueeze(1), fit)
 
@@ -211,7 +216,7 @@ class PointFit(nn.Module):
         moments = weight @ torch.cat([products, more_products], -1).unsqueeze(1)
         estimate = self._plane(centres, moments[..., :8])
         support = moments[..., 9]
-        rest = moments[..., 10:] / support.unsqueeze(-1).clamp(min=1e-4)
+        rest = moments[..., 10:] / support.unsqueeze(-1).clamp(min=LEAST_SUPPORT)
         shifted = self._plane(centres, rest[..., :8])
         # How much smaller the residuals are than the depths themselves.
         std = torch.sqrt((rest[..., 8] - rest[..., 2].square()).clamp(min=0.0) + 1e-4)

@@ -119,6 +119,7 @@ def _run_and_keep_maps(
     run_counts: Counter[str] = Counter()
 
     def keep_map(name: str, _module: nn.Module, _inputs: object, output: object) -> None:
+        """Counts a run of a submodule, and keeps its output if it could be cut there."""
         run_counts[name] += 1
         if isinstance(output, Tensor) and output.ndim == 4 and output.requires_grad:
             maps[name] = output

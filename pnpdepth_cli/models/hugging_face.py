@@ -285,6 +285,7 @@ def _fewer_parameters_than_bytes(folder: Path) -> Iterator[None]:
     bytes_left = (folder / "model.safetensors").stat().st_size
 
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        """Takes a new parameter off the bytes; raises ModelError if there are too few."""
         nonlocal bytes_left
         if parameter is not None and parameter.is_meta:
             bytes_left -= max(1, parameter.numel())  # an element takes a byte at least

@@ -245,6 +245,7 @@ def _zero_nan_gradients_behind(prediction: Tensor) -> None:
     """
 
     def without_nan(gradients: tuple[Tensor | None, ...], _: object) -> tuple[Tensor | None, ...]:
+        """Returns the gradients with 0 for NaN; torch calls this behind each operation."""
         return tuple(
             None if gradient is None else gradient.nan_to_num(0.0, math.inf, -math.inf)
             for gradient in gradients
@@ -391,6 +392,7 @@ def _with_suggested_layers(network: Network) -> Network:
     frame = FrameMap.fit(network.definition.size, _SUGGESTION_SIDE, _SUGGESTION_SIDE)
 
     def suggest() -> list[str]:
+        """Returns the names of the layers, found by a pass of the network."""
         with out_of_memory_is_a_device_error(network.device):
             arguments = network.synthetic_arguments(frame)
             return list(suggest_layers(network.module, arguments, network.map_of))

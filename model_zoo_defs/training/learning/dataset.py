@@ -102,14 +102,16 @@ class Samples(Dataset[Sample]):
         self.frames: Frames | None = None
 
     def __getitem__(self, index: int) -> Sample:
+        """Returns a sample, the same for the same index and seed, with known depth and points."""
         # A process of the loader opens the shards itself.
         if self.frames is None:
             self.frames = Frames(*self.folders)
         rng = np.random.default_rng((self.seed, index))
+        # Again if a random crop has no depth or no points, as one of sky alone.
         while True:
             rgb, depth = self.frames[int(rng.integers(len(self.frames)))]
-            other = self.frames[int(rng.integers(len(self.frames)))][1]
-            sample = augmented(rng, rgb, depth, self.size, other, self.prior_fraction)
+            _, unrelated = self.frames[int(rng.integers(len(self.frames)))]
+            sample = augmented(rng, rgb, depth, self.size, unrelated, self.prior_fraction)
             if bool((sample.depth > 0).any() and (sample.sparse > 0).any()):
                 return sample
 

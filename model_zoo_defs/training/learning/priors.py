@@ -143,15 +143,16 @@ def nonsense(rng: Generator, shape: tuple[int, ...], other: Depth) -> Depth:
 
 
 def _lost_details(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Near objects thinner than a few pixels are removed or merged (opening, closing)."""
+    """Returns log depth x (1, 1, H, W) without thin near objects, or thin gaps between them."""
     reach = 2 * int(rng.integers(1, 2 + round(4 * severity))) + 1
     sign = 1.0 if rng.random() < 0.75 else -1.0
+    # A morphological closing of depth, of its negative an opening.
     grown = F.max_pool2d(sign * x, reach, 1, reach // 2)
     return sign * -F.max_pool2d(-grown, reach, 1, reach // 2)
 
 
 def _blurred(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth at 1/2 to 1/16 of the resolution, enlarged again."""
+    """Returns log depth x (1, 1, H, W) at 1/2 to 1/16 of the resolution, enlarged again."""
     factor = 2 ** int(rng.integers(1, 3 + round(2 * severity)))
     if rng.random() < 0.3:
         return _enlarged(x[..., factor // 2 :: factor, factor // 2 :: factor], x.shape[-2:])
@@ -159,7 +160,7 @@ def _blurred(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _displaced(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth moved by a smooth field of a few pixels."""
+    """Returns log depth x (1, 1, H, W) moved by a smooth field of a few pixels."""
     height, width = x.shape[-2:]
     pixels = float(rng.uniform(0.5, 1.0 + 6.0 * severity))
     flow = _field(rng, x, int(rng.integers(3, 12)), channels=2)[0] * pixels
@@ -169,18 +170,21 @@ def _displaced(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _scale_field(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth with a smoothly varying scale error."""
+    """Returns log depth x (1, 1, H, W) with a smoothly varying error of scale."""
     return x + _field(rng, x, int(rng.integers(2, 9))) * float(rng.uniform(0.02, 0.3) * severity)
 
 
 def _contrast(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth raised to a random power."""
+    """Returns log depth x (1, 1, H, W) of depth that is raised to a random power."""
     middle = x.mean()
     return middle + (x - middle) * float(np.exp(rng.normal(0.0, 0.35 * severity)))
 
 
 def _affine(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """An offset of depth or of inverse depth, relative to the nearest depth."""
+    """Returns log depth x (1, 1, H, W) after an offset of depth, or of inverse depth.
+
+    The offset is relative to the smallest value of either.
+    """
     sign = 1.0 if rng.random() < 0.5 else -1.0
     linear = torch.exp(sign * (x - x.median()).clamp(-4.0, 4.0))
     ratio = float(rng.uniform(-0.7, 1.0) * severity)
@@ -188,13 +192,13 @@ def _affine(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _flat_range(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth beyond a random distance is compressed."""
+    """Returns log depth x (1, 1, H, W) with what is beyond a random distance compressed."""
     limit = torch.quantile(x.flatten(), float(rng.uniform(0.4, 0.95)))
     return torch.where(x > limit, limit + (x - limit) * float(rng.uniform(0.1, 0.8)), x)
 
 
 def _wrong_planes(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Windows with another offset and tilt."""
+    """Returns log depth x (1, 1, H, W) with one to three windows at another offset and tilt."""
     height, width = x.shape[-2:]
     rows = torch.linspace(-1.0, 1.0, height)[:, None]
     columns = torch.linspace(-1.0, 1.0, width)[None, :]
@@ -206,14 +210,14 @@ def _wrong_planes(rng: Generator, x: Tensor, severity: float) -> Tensor:
 
 
 def _tiles(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Tiles with a scale each, as tiled inference leaves them."""
+    """Returns log depth x (1, 1, H, W) in tiles with a scale each, as tiled inference leaves it."""
     count = rng.integers(2, 5, 2)
     offsets = torch.from_numpy(rng.normal(0.0, 0.1 * severity, (1, 1, *count))).float()
     return x + F.interpolate(offsets, x.shape[-2:], mode="nearest")
 
 
 def _noise(rng: Generator, x: Tensor, severity: float) -> Tensor:
-    """Depth with smooth noise of a random frequency."""
+    """Returns log depth x (1, 1, H, W) with smooth noise of a random frequency."""
     cells = int(np.exp(rng.uniform(np.log(8.0), np.log(96.0))))
     return x + _field(rng, x, cells) * float(rng.uniform(0.005, 0.1) * severity)
 
@@ -222,10 +226,18 @@ FAULTS: tuple[Callable[[Generator, Tensor, float], Tensor], ...] = (
     _lost_details, _displaced, _wrong_planes, _contrast, _affine, _flat_range, _tiles,
     _scale_field, _blurred, _noise,
 )  # fmt: skip
+"""Functions of random numbers, log depth and a severity in 0…1, which scales the error."""
 
 
 def _field(rng: Generator, like: Tensor, cells: int, channels: int = 1) -> Tensor:
-    """A smooth field (1, channels, H, W) of unit variance at its nodes, `cells` across."""
+    """Returns a smooth random field (1, channels, H, W) of the size of a map.
+
+    Args:
+        rng: Random numbers.
+        like: The map (…, H, W).
+        cells: Nodes along either axis, whose values have unit variance.
+        channels: Number of fields.
+    """
     grid = rng.normal(0.0, 1.0, (1, channels, cells, cells))
     return _enlarged(torch.from_numpy(grid).float(), like.shape[-2:])
 

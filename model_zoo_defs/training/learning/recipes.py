@@ -20,19 +20,22 @@ NEAREST = 0.1  # metres; below this the logarithm is continued by its tangent
 
 
 def smooth_log(depth: Tensor) -> Tensor:
-    """log(depth), continued by its tangent below `NEAREST`, so that negative predictions count."""
+    """Returns log(depth), below `NEAREST` its tangent, so that negative predictions count."""
     above = depth.clamp(min=NEAREST)
     return torch.log(above) + (depth - above) / NEAREST
 
 
 def log_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
-    """Mean |log depth − log ground truth| over known pixels; 0 = unknown."""
+    """Returns the mean |log depth − log ground truth| over known pixels; metres, 0 = unknown."""
     known = ground_truth > 0
     return (smooth_log(depth[known]) - torch.log(ground_truth[known])).abs().mean()
 
 
 def log_error_up_to_scale(depth: Tensor, ground_truth: Tensor) -> Tensor:
-    """`log_error` after removing the mean of each image, plus 0.1 of that mean towards 10 m = 1."""
+    """Returns `log_error` without the mean log error of each image, its scale.
+
+    A tenth of the size of that mean is added: it draws the network to give 1 at 10 m.
+    """
     losses = []
     for predicted, true in zip(depth, ground_truth, strict=True):
         known = true > 0
@@ -43,7 +46,10 @@ def log_error_up_to_scale(depth: Tensor, ground_truth: Tensor) -> Tensor:
 
 
 def relative_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
-    """Mean log of the MAE of each image over its median depth: near and far scenes count alike."""
+    """Returns the mean log of each image's MAE over its median depth.
+
+    So near and far scenes count alike.
+    """
     losses = []
     for predicted, true in zip(depth, ground_truth, strict=True):
         known = true > 0
@@ -53,7 +59,8 @@ def relative_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
 
 
 def inverse_error(depth: Tensor, ground_truth: Tensor) -> Tensor:
-    """Mean log of the MAE of inverse depth of each image times its median depth."""
+    """Returns the mean log of each image's MAE of inverse depth, times its median depth."""
+    # Below `NEAREST` continued by its tangent, so that negative predictions count.
     inverse = 1.0 / depth.clamp(min=NEAREST) + (NEAREST - depth).clamp(min=0.0) / NEAREST**2
     losses = []
     for predicted, true in zip(inverse, ground_truth, strict=True):
@@ -73,7 +80,7 @@ def whole(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
 
 
 def pyramid(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """Outputs of a network at several resolutions, the finest first."""
+    """Returns outputs of a network at several resolutions, the finest first."""
     outputs: list[Tensor] = network.pyramid(*arguments)
     return outputs
 
@@ -84,7 +91,7 @@ def coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
 
 
 def fine_and_coarse(network: Any, arguments: tuple[Tensor, ...]) -> list[Tensor]:
-    """The outputs of both halves of `eigen`, the fine one first."""
+    """Returns the outputs of both halves of `eigen`, the fine one first."""
     first = network.coarse(*arguments)
     return [network.fine(*arguments, first), first]
 

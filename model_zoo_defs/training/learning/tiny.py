@@ -79,7 +79,7 @@ class TinyRun(Learner):
         super().__init__(network, schedule, settings.out, definition.name, settings.lanes)
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """Weighted sum of the recipe's loss over the outputs, the finest weighing most."""
+        """Returns the sum of the recipe's loss over the outputs; the finest weighs most."""
         batch = Batch(*part)
         known = self.known(batch)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half_precision):
@@ -132,7 +132,7 @@ class TinyRun(Learner):
         return without_scaffold(self.average)
 
     def arguments(self, batch: Batch) -> tuple[Tensor, ...]:
-        """Arguments of the network for a batch."""
+        """Returns the arguments of the network for a batch, its images normalised."""
         normalisation = self.definition.normalisation
         assert normalisation is not None
         mean, std = (
@@ -143,7 +143,7 @@ class TinyRun(Learner):
 
     @torch.no_grad()
     def depth(self, batch: Batch) -> Tensor:
-        """The averaged network's depth for a batch, (B, 1, h, w), at the size of this stage."""
+        """Returns the averaged network's depth for a batch, (B, 1, h, w), at the stage's size."""
         self.average.eval()
         if shown := self.stage.shown:
             rgb = F.interpolate(batch.rgb, shown, mode="bilinear", antialias=True)
@@ -153,10 +153,18 @@ class TinyRun(Learner):
 
 
 def as_depth(output: Tensor, kind: str) -> Tensor:
-    """Depth from the output of a network of this output kind."""
+    """Returns depth (B, 1, h, w) from a network's output, by what its numbers are.
+
+    Args:
+        output: (B, 1, h, w).
+        kind: "inverse" for inverse depth, whose depth is at most 1000; "log" for log depth, whose
+            depth is limited to exp(±7); else depth itself, which is not limited.
+    """
     if kind == "inverse":
         return 1.0 / output.clamp(min=1e-3)
-    return output.clamp(-7.0, 7.0).exp() if kind == "log" else output
+    if kind == "log":
+        return output.clamp(-7.0, 7.0).exp()
+    return output
 
 
 def held_out(settings: Settings, definition: ModelDefinition, recipe: Recipe) -> list[Batch]:

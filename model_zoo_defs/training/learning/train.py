@@ -97,7 +97,10 @@ class Run(Learner):
         self.bfloat16 = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups: the encoder learns more slowly."""
+        """Returns the optimiser's parameter groups, each with its factor on the learning rate.
+
+        The encoder's is `encoder_rate`.
+        """
         groups: dict[float, list[nn.Parameter]] = {}
         for name, parameter in self.network.named_parameters():
             if parameter.requires_grad:
@@ -106,7 +109,11 @@ class Run(Learner):
         return [{"params": members, "factor": factor} for factor, members in groups.items()]
 
     def loss(self, part: Sequence[Tensor]) -> Tensor:
-        """Depth loss over all levels plus the weighted loss of sigma."""
+        """Returns the loss of depth at all levels plus the weighted loss of sigma.
+
+        Args:
+            part: Image, sparse depth, ground truth and prior of a batch, as in `Sample`.
+        """
         rgb, sparse, depth, prior = part
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
@@ -117,7 +124,13 @@ class Run(Learner):
 
 
 def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:
-    """Negative log likelihood of the error of log depth under a Laplace distribution."""
+    """Returns the mean negative log likelihood of log depth's error, Laplace distributed.
+
+    Args:
+        sigma: Scale of the distribution (B, 1, H, W).
+        depth: Predicted depth (B, 1, H, W) in metres; no gradient goes to it.
+        ground_truth: Depth (B, 1, H, W) in metres, 0 = unknown.
+    """
     known = ground_truth > 0
     error = (torch.log(depth.detach()[known]) - torch.log(ground_truth[known])).abs()
     scale = sigma[known]
@@ -125,7 +138,12 @@ def sigma_loss(sigma: Tensor, depth: Tensor, ground_truth: Tensor) -> Tensor:
 
 
 def pyramid_loss(depths: list[Tensor], ground_truth: Tensor) -> Tensor:
-    """Weighted sum of `depth_loss` over the levels; `ground_truth` (B, 1, H, W), 0 = unknown."""
+    """Returns the weighted sum of `depth_loss` over the levels.
+
+    Args:
+        depths: Depth (B, 1, h, w) in metres of each level.
+        ground_truth: Depth (B, 1, H, W) in metres, 0 = unknown.
+    """
     total = ground_truth.new_zeros(())
     for weight, depth in zip(LEVEL_WEIGHTS, depths, strict=True):
         stride = ground_truth.shape[-1] // depth.shape[-1]

@@ -73,6 +73,7 @@ class Examples(Dataset[Example]):
         return self.count
 
     def __getitem__(self, index: int) -> Example:
+        """Returns an example, the same for the same index and seed."""
         rng = np.random.default_rng((self.seed, index, 1))
         sample = self.samples[index]
         sparse = sample.sparse[0].numpy()

@@ -44,7 +44,8 @@ _POSE = "1 0 0 0 0 1 0 0 0 0 1 {ahead:g}\n"  # the camera moves along its own ax
 def make_drive(folder: Path) -> None:
     """Writes rgb/, sparse/, gt/ and calib/ of the frames, and poses.txt."""
     rng = generator(SAMPLE_SEED, STREET_SCENE, 0)
-    # The scene of samples/street, and a camera in its lane.
+    # The scene of samples/street. The camera is in the right lane, 1.65 m above the road, and
+    # looks along the street, a hair to the left and down.
     world, plan = build("street", rng)
     start = looking(
         (float(plan.high[0]) * 0.55, 0.0, 1.65), (0.02, -0.01, 0.0), fov_deg=80, size=_SIZE

@@ -56,6 +56,9 @@ _BASELINES_M = (0.0, -0.54, 0.06, -0.48)
 _LASER_IN_CAMERA = np.array([0.0, -0.08, -0.27])
 """Position of the scanner in the reference camera's frame (right, down, forward), metres."""
 
+_IMU_TO_LASER = (1, 0, 0, -0.81, 0, 1, 0, 0.32, 0, 0, 1, -0.8)
+"""Rows of (rotation, metres) from the IMU's frame to the scanner's: KITTI's offset, not turned."""
+
 # A scanner like KITTI's HDL-64E: beams, and the elevation of the first and of the last one.
 _BEAMS = 64
 _TOP_DEG = 2.0
@@ -189,15 +192,21 @@ def laser_scan(
 
 
 def calibration_text(turn: npt.NDArray[np.float64]) -> str:
-    """Returns a calibration file in the format of KITTI's object benchmark."""
+    """Returns a calibration file in the format of KITTI's object benchmark.
+
+    Args:
+        turn: Rotation (3, 3) from the scanner's frame to the reference camera's.
+    """
+    # The projections of the four cameras, which differ in their offset along x alone.
     rows = {}
     for camera, baseline in enumerate(_BASELINES_M):
         rows[f"P{camera}"] = [
             _FOCAL_PX, 0, _CX, _FOCAL_PX * baseline, 0, _FOCAL_PX, _CY, 0, 0, 0, 1, 0,
         ]  # fmt: skip
+    # The images are rectified, and no rotation is left.
     rows["R0_rect"] = [1, 0, 0, 0, 1, 0, 0, 0, 1]
     rows["Tr_velo_to_cam"] = np.column_stack([turn, _LASER_IN_CAMERA]).ravel().tolist()
-    rows["Tr_imu_to_velo"] = [1, 0, 0, -0.81, 0, 1, 0, 0.32, 0, 0, 1, -0.8]
+    rows["Tr_imu_to_velo"] = list(_IMU_TO_LASER)
     return "".join(
         f"{name}: {' '.join(f'{value:.12e}' for value in values)}\n"
         for name, values in rows.items()

@@ -210,7 +210,16 @@ def cylinder(radius: float, height: float, *, sides: int = 18, top: float | None
 def superquadric(
     size: Point, *, vertical: float = 1.0, around: float = 1.0, rows: int = 14, columns: int = 24
 ) -> Mesh:
-    """Returns a body about the origin between ellipsoid (exponents 1) and box (near 0)."""
+    """Returns a body about the origin between ellipsoid (exponents 1) and box (near 0).
+
+    Args:
+        size: Full width, depth and height in metres.
+        vertical: Exponent of the outline from pole to pole.
+        around: Exponent of the horizontal sections.
+        rows: Points from pole to pole.
+        columns: Points around.
+    """
+    # Not up to the poles, where all points of a row would be one.
     lat = np.linspace(-np.pi / 2 + 0.01, np.pi / 2 - 0.01, rows)[:, None]
     lon = np.linspace(-np.pi, np.pi, columns + 1)[None, :]
     ring = _power(np.cos(lat), vertical)
@@ -222,6 +231,7 @@ def superquadric(
         ],
         axis=2,
     )
+    # The last column is the first one, exactly, so that the surface is closed.
     points[:, -1] = points[:, 0]
     return surface(points * (np.asarray(size, np.float64) / 2))
 
@@ -253,7 +263,13 @@ def rod(start: Point, end: Point, radius: float, *, sides: int = 8) -> Mesh:
 
 
 def torus(ring: float, radius: float, *, turn: float = 2 * np.pi) -> Mesh:
-    """Returns a ring (or a part of one) lying in the plane z = 0."""
+    """Returns a ring (or a part of one) about the origin, lying in the plane z = 0.
+
+    Args:
+        ring: Radius of the ring's middle line in metres.
+        radius: Radius of its round section in metres.
+        turn: Angle of the part in radians; 2 π is the whole ring.
+    """
     angle = np.linspace(0, turn, 25)
     path = np.stack([ring * np.cos(angle), ring * np.sin(angle), np.zeros(25)], axis=1)
     around = np.linspace(0, 2 * np.pi, 9)

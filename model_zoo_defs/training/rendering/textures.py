@@ -82,7 +82,18 @@ _V, _U = np.meshgrid(
 def _cells(
     rng: np.random.Generator, columns: int, rows: int, *, stagger: float, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns one random value per cell, and 1 in the joints between cells."""
+    """Returns two images (SIDE, SIDE): a random value 0…1 for each cell, and where joints are.
+
+    Args:
+        rng: Random numbers.
+        columns: Cells from left to right.
+        rows: Cells from top to bottom.
+        stagger: Shift of every second row, as a fraction of a cell's width.
+        gap: Width of the joints, as a fraction of a cell's shorter side.
+
+    Returns:
+        The values, and 1 in the joints between cells, 0 elsewhere.
+    """
     row = np.floor(_V * rows)
     shifted = _U * columns + (row % 2) * stagger
     column = np.floor(shifted) % columns
@@ -143,6 +154,7 @@ def mixed_over(image: FloatArray, ink: npt.ArrayLike, weight: FloatArray) -> Flo
 def _brick(rng: np.random.Generator, base: FloatArray) -> FloatArray:
     """Returns an image (SIDE, SIDE, 3): staggered bricks with mortar."""
     columns = int(rng.choice([3, 4, 6]))
+    # Bricks are three times as wide as high.
     value, joint = _cells(rng, columns, columns * 3, stagger=0.5, gap=0.09)
     wall = mixed(base, near(rng, base, 0.3), value) * (0.8 + 0.4 * noise(rng)[..., None])
     return mixed_over(wall, near(rng, (0.7, 0.68, 0.64), 0.15), joint)

@@ -8,15 +8,20 @@ from model_zoo_defs.training.rendering.shapes import Group, box, cylinder, prism
 from model_zoo_defs.training.scenes.kit import Kit
 from model_zoo_defs.training.scenes.walls import Hole, wall
 
+_ROW_END_M = 95.0
+"""Distance along the street at which a row of houses ends."""
+_OWN_HOUSES_END_M = 40.0
+"""Distance along the street beyond which every house is one of the three that repeat."""
+
 
 def building(kit: Kit, width: float) -> Group:
     """Returns a house whose front lies along x at y = 0 and looks toward -y."""
     group = Group()
     # Size and materials.
     floors = int(kit.rng.integers(1, 6))
-    storey = kit.size(2.6, 3.4)
-    height = floors * storey + kit.size(0.2, 1)
-    deep = kit.size(7, 12)
+    storey = kit.uniform(2.6, 3.4)
+    height = floors * storey + kit.uniform(0.2, 1)
+    deep = kit.uniform(7, 12)
     skin = kit.surface(
         "plaster",
         "plaster",
@@ -25,10 +30,10 @@ def building(kit: Kit, width: float) -> Group:
         "plain",
         "speckle",
         "tiles",
-        tile_m=kit.size(1.2, 2.5),
+        tile_m=kit.uniform(1.2, 2.5),
         vivid=0.15,
     )
-    glass = kit.palette.new("plain", (0.08, 0.09, 0.1), gloss=0.6, mirror=kit.size(0.1, 0.3))
+    glass = kit.palette.new("plain", (0.08, 0.09, 0.1), gloss=0.6, mirror=kit.uniform(0.1, 0.3))
     trim = (
         kit.palette.new("plain", (0.85, 0.84, 0.8))
         if kit.chance(0.6)
@@ -41,7 +46,7 @@ def building(kit: Kit, width: float) -> Group:
     for x in (-width / 2, width / 2):
         group.add(quads([side]), skin, (x, 0, 0))
     # Windows and doors: pane or curtain, reveals, sills and bars, balconies.
-    recess = kit.size(0.06, 0.3)
+    recess = kit.uniform(0.06, 0.3)
     balcony = kit.chance(0.3)
     for u0, v0, u1, v1 in holes:
         x = (u0 + u1) / 2 - width / 2
@@ -72,18 +77,18 @@ def building(kit: Kit, width: float) -> Group:
         ]
         group.add(quads([awning]), kit.surface("stripes", "plain", vivid=0.7, tile_m=2))
     if kit.chance(0.3):
-        shop = kit.palette.new("poster", tile_m=2.0, glow=kit.size(0, 0.5))
-        group.add(box(width * kit.size(0.3, 0.9), 0.12, 0.6), shop, (0, -0.06, storey - 0.3))
+        shop = kit.palette.new("poster", tile_m=2.0, glow=kit.uniform(0, 0.5))
+        group.add(box(width * kit.uniform(0.3, 0.9), 0.12, 0.6), shop, (0, -0.06, storey - 0.3))
     return group
 
 
 def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
     """Returns the holes (left, low, right, high) of windows and one door in a front, in metres."""
     holes: list[Hole] = []
-    count = max(1, int(width / kit.size(1.8, 3.2)))
-    window_width = kit.size(0.8, 1.5)
-    height = kit.size(1.1, 1.8)
-    sill = kit.size(0.7, 1.0)
+    count = max(1, int(width / kit.uniform(1.8, 3.2)))
+    window_width = kit.uniform(0.8, 1.5)
+    height = kit.uniform(1.1, 1.8)
+    sill = kit.uniform(0.7, 1.0)
     door = int(kit.rng.integers(count))
     for floor in range(floors):
         for column in range(count):
@@ -104,7 +109,7 @@ def _windows(kit: Kit, width: float, floors: int, storey: float) -> list[Hole]:
 
 
 def _balcony(kit: Kit, group: Group, x: float, z: float, width: float) -> None:
-    """Adds a balcony of a door `w` wide, in the middle of its floor's edge at (x, z)."""
+    """Adds a balcony of a door of this width, in the middle of its floor's edge at (x, z)."""
     wide = width + 0.8
     group.add(box(wide, 1.0, 0.12), kit.palette.new("plain", (0.6, 0.6, 0.58)), (x, -0.5, z))
     steel = kit.metal()
@@ -115,11 +120,13 @@ def _balcony(kit: Kit, group: Group, x: float, z: float, width: float) -> None:
 
 def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin: int) -> None:
     """Adds a roof, pitched or flat, and a downpipe; `skin` is the walls' material."""
-    tiles = kit.palette.new("tiles", np.array([0.5, 0.25, 0.18]) * kit.size(0.4, 1.2), tile_m=1.2)
+    tiles = kit.palette.new(
+        "tiles", np.array([0.5, 0.25, 0.18]) * kit.uniform(0.4, 1.2), tile_m=1.2
+    )
     if kit.chance(0.65):
         # Two slopes from eaves to ridge, gables, chimney and gutter.
-        rise = kit.size(1.5, 4.5)
-        eave = kit.size(0.2, 0.6)
+        rise = kit.uniform(1.5, 4.5)
+        eave = kit.uniform(0.2, 0.6)
         half_width = width / 2 + 0.1
         ridge = height + rise
         low = height - eave * rise / (deep / 2)
@@ -138,7 +145,9 @@ def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin:
         group.add(quads([front, back]), tiles)
         gable = [(0, height), (deep, height), (deep / 2, ridge - 0.05)]
         group.add(prism(gable, 2 * half_width - 0.25), skin, (0, 0, 0), yaw=np.pi / 2)
-        group.add(box(0.6, 0.5, 1.6), skin, (kit.size(-0.3, 0.3) * width, deep * 0.4, ridge - 0.9))
+        group.add(
+            box(0.6, 0.5, 1.6), skin, (kit.uniform(-0.3, 0.3) * width, deep * 0.4, ridge - 0.9)
+        )
         group.add(rod((-half_width, -eave, low), (half_width, -eave, low), 0.06), kit.metal())
     else:
         # A flat roof.
@@ -152,28 +161,40 @@ def _top(kit: Kit, group: Group, width: float, height: float, deep: float, skin:
 
 
 def row(kit: Kit, group: Group, side: float, x: float) -> None:
-    """Adds a row of houses, garden walls and gaps along one side of the road."""
-    style = kit.rng.random()
-    y = kit.size(-12, 5)
-    gaps = 0.1 if style < 0.6 else 0.6
-    kinds = [building(kit, kit.size(6, 16)) for _ in range(3)]
-    while y < 95:
-        if kit.chance(gaps):
-            length = kit.size(3, 15)
+    """Adds a row of houses, garden walls and gaps along one side of the road.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        side: 1 for the right side of the road, which runs along +y; -1 for the left one.
+        x: Distance of the row from the middle of the road in metres.
+    """
+    # A closed row has few gaps, an open one many. Most houses are copies of three.
+    is_closed = kit.rng.random() < 0.6
+    y = kit.uniform(-12, 5)
+    gap_chance = 0.1 if is_closed else 0.6
+    kinds = [building(kit, kit.uniform(6, 16)) for _ in range(3)]
+    while y < _ROW_END_M:
+        # A gap, mostly behind a garden wall.
+        if kit.chance(gap_chance):
+            length = kit.uniform(3, 15)
             if kit.chance(0.6):
                 material = kit.surface("brick", "plaster", "paving", tile_m=1.5, vivid=0.1)
                 group.add(
-                    box(0.25, length, kit.size(0.6, 2.4)), material, (side * x, y + length / 2, 0)
+                    box(0.25, length, kit.uniform(0.6, 2.4)),
+                    material,
+                    (side * x, y + length / 2, 0),
                 )
             y += length
             continue
+        # A house; its front, which looks toward -y, is turned to the road.
         house = (
-            building(kit, kit.size(6, 16))
-            if kit.chance(0.3) and y < 40
+            building(kit, kit.uniform(6, 16))
+            if kit.chance(0.3) and y < _OWN_HOUSES_END_M
             else kinds[int(kit.rng.integers(3))]
         )
         lower, upper = house.bounds()
         width = float(upper[0] - lower[0])
-        at = (side * (x + kit.size(0, 1.2)), y + width / 2, 0)
+        at = (side * (x + kit.uniform(0, 1.2)), y + width / 2, 0)
         group.insert(house, at, yaw=-side * np.pi / 2)
-        y += width + (0.0 if kit.chance(0.6) else kit.size(0.5, 4))
+        y += width + (0.0 if kit.chance(0.6) else kit.uniform(0.5, 4))

@@ -35,32 +35,33 @@ from model_zoo_defs.training.scenes.kit import Kit
 
 
 def gadget(kit: Kit) -> Group:
-    """Returns a toy-like pile of rounded bodies."""
+    """Returns a toy-like pile of rounded bodies on z = 0."""
     group = Group()
     z = 0.0
     for _ in range(int(kit.rng.integers(1, 4))):
         size = kit.rng.uniform(0.03, 0.16, 3)
-        body = superquadric(size, vertical=kit.size(0.15, 1.8), around=kit.size(0.15, 1.8))
+        body = superquadric(size, vertical=kit.uniform(0.15, 1.8), around=kit.uniform(0.15, 1.8))
         shift = size * kit.rng.uniform(-0.3, 0.3, 3)
         group.add(
-            body, kit.any_surface(), (shift[0], shift[1], z + size[2] / 2), yaw=kit.size(0, 6.3)
+            body, kit.any_surface(), (shift[0], shift[1], z + size[2] / 2), yaw=kit.uniform(0, 6.3)
         )
-        z += size[2] * kit.size(0.6, 0.98)
+        z += size[2] * kit.uniform(0.6, 0.98)
     return group
 
 
 def ring(kit: Kit) -> Group:
-    """Returns a ring, flat or leaning."""
+    """Returns a ring on z = 0, flat or leaning."""
     group = Group()
-    radius = kit.size(0.03, 0.1)
-    thick = radius * kit.size(0.1, 0.5)
-    pitch = kit.size(0, 1.4)
+    radius = kit.uniform(0.03, 0.1)
+    thick = radius * kit.uniform(0.1, 0.5)
+    pitch = kit.uniform(0, 1.4)
+    # So high that the lowest point of the leaning ring touches the ground.
     group.add(
         torus(radius, thick),
         kit.any_surface(),
         (0, 0, thick + radius * np.sin(pitch)),
         pitch=pitch,
-        yaw=kit.size(0, 6.3),
+        yaw=kit.uniform(0, 6.3),
     )
     return group
 
@@ -68,9 +69,9 @@ def ring(kit: Kit) -> Group:
 def tool(kit: Kit) -> Group:
     """Returns something long: pen, spoon, screwdriver, ruler, scissors."""
     group = Group()
-    long = kit.size(0.1, 0.35)
-    thick = kit.size(0.003, 0.014)
-    yaw = kit.size(0, 6.3)
+    long = kit.uniform(0.1, 0.35)
+    thick = kit.uniform(0.003, 0.014)
+    yaw = kit.uniform(0, 6.3)
     along_x = np.cos(yaw) * long / 2
     along_y = np.sin(yaw) * long / 2
     group.add(rod((-along_x, -along_y, thick), (along_x, along_y, thick), thick), kit.any_surface())
@@ -101,29 +102,31 @@ def cable(kit: Kit) -> Group:
     for axis in (0, 1):
         for k in (1, 2, 3):
             path[:, axis] += (
-                kit.size(-0.2, 0.2)
+                kit.uniform(-0.2, 0.2)
                 / k
-                * np.sin(2 * np.pi * k * s * kit.size(0.4, 1) + kit.size(0, 6))
+                * np.sin(2 * np.pi * k * s * kit.uniform(0.4, 1) + kit.uniform(0, 6))
             )
-    thick = kit.size(0.002, 0.006)
+    thick = kit.uniform(0.002, 0.006)
     path[:, 2] = thick + 0.008 * np.abs(np.sin(9 * s))
     group.add(tube(path, thick, sides=6), kit.dark() if kit.chance(0.6) else kit.any_surface())
     return group
 
 
 def cloth(kit: Kit) -> Group:
-    """Returns a crumpled piece of cloth or paper: a rough height field."""
+    """Returns a crumpled piece of cloth or paper: a rough height field, low at its rim."""
     group = Group()
-    size = kit.size(0.1, 0.4)
+    # Creases of four frequencies, each in a direction of its own, on a square of 2 · size.
+    size = kit.uniform(0.1, 0.4)
     x, y = np.meshgrid(np.linspace(-1, 1, 24), np.linspace(-1, 1, 24))
     z = sum(
-        kit.size(0.2, 1)
+        kit.uniform(0.2, 1)
         / k
-        * np.abs(np.sin(k * (x * kit.size(-2, 2) + y * kit.size(-2, 2)) + kit.size(0, 6)))
+        * np.abs(np.sin(k * (x * kit.uniform(-2, 2) + y * kit.uniform(-2, 2)) + kit.uniform(0, 6)))
         for k in (1, 2, 3, 5)
     )
+    # Toward the corners the height falls to 3 mm, and the outline is not quite straight.
     rim = np.clip(1.1 - x**2 - y**2, 0, 1)
-    points = np.stack([x * size, y * size, 0.003 + size * kit.size(0.1, 0.4) * z * rim], axis=2)
+    points = np.stack([x * size, y * size, 0.003 + size * kit.uniform(0.1, 0.4) * z * rim], axis=2)
     points[..., :2] += kit.rng.normal(0, size * 0.01, points[..., :2].shape)
     group.add(surface(points), kit.any_surface())
     return group
@@ -133,9 +136,9 @@ def letters(kit: Kit) -> Group:
     """Returns standing block letters built of bars."""
     group = Group()
     material = kit.any_surface()
-    height = kit.size(0.06, 0.2)
-    depth = kit.size(0.015, 0.05)
-    thickness = height * kit.size(0.14, 0.24)
+    height = kit.uniform(0.06, 0.2)
+    depth = kit.uniform(0.015, 0.05)
+    thickness = height * kit.uniform(0.14, 0.24)
     strokes = {
         "L": "lb",
         "T": "tm",
@@ -164,8 +167,8 @@ def letters(kit: Kit) -> Group:
 def frame(kit: Kit) -> Group:
     """Returns a small framed photo leaning back."""
     group = Group()
-    tall = kit.size(0.1, 0.3)
-    wide = tall * kit.size(0.6, 1.4)
+    tall = kit.uniform(0.1, 0.3)
+    wide = tall * kit.uniform(0.6, 1.4)
     group.add(
         box(wide, 0.015, tall), kit.wood() if kit.chance(0.6) else kit.any_surface(), pitch=-0.2
     )
@@ -179,13 +182,13 @@ def frame(kit: Kit) -> Group:
 def wedge(kit: Kit) -> Group:
     """Returns a many-cornered block, such as a house-shaped toy or a piece of cheese."""
     count = int(kit.rng.integers(3, 9))
-    radius = kit.size(0.03, 0.12)
+    radius = kit.uniform(0.03, 0.12)
     angle = np.sort(kit.rng.uniform(0, 2 * np.pi, count)) + np.linspace(0, 1, count)
     far = radius * kit.rng.uniform(0.6, 1.0, count)
     outline = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=1)
     outline[:, 1] -= outline[:, 1].min()
     group = Group()
-    group.add(prism(outline, kit.size(0.02, 0.15)), kit.any_surface(), yaw=kit.size(0, 6.3))
+    group.add(prism(outline, kit.uniform(0.02, 0.15)), kit.any_surface(), yaw=kit.uniform(0, 6.3))
     return group
 
 
@@ -223,7 +226,10 @@ def scatter(
         scale = min(
             1.0, tallest / float(upper[2]), (high[1] - low[1]) * 1.2 / float(upper[1] - lower[1])
         )
-        at = (kit.size(low[0], high[0]), kit.size(low[1], high[1]), area.z)
+        at = (kit.uniform(low[0], high[0]), kit.uniform(low[1], high[1]), area.z)
         group.insert(
-            item, at, yaw=kit.size(-0.6, 0.6) if kit.chance(0.6) else kit.size(0, 6.3), scale=scale
+            item,
+            at,
+            yaw=kit.uniform(-0.6, 0.6) if kit.chance(0.6) else kit.uniform(0, 6.3),
+            scale=scale,
         )

@@ -22,13 +22,13 @@ def _wild(kit: Kit) -> Group:
     """Returns a body that no household has: bent, lumpy or turned."""
     group = Group()
     choice = kit.rng.random()
-    size = kit.size(0.04, 0.3)
+    size = kit.uniform(0.04, 0.3)
     if choice < 0.35:
         # A rounded body, dented by waves.
         body = superquadric(
             kit.rng.uniform(0.3, 1.0, 3) * size,
-            vertical=kit.size(0.1, 2),
-            around=kit.size(0.1, 2),
+            vertical=kit.uniform(0.1, 2),
+            around=kit.uniform(0.1, 2),
             rows=24,
             columns=36,
         )
@@ -40,8 +40,8 @@ def _wild(kit: Kit) -> Group:
             surface(points.reshape(24, 37, 3)),
             kit.any_surface(),
             (0, 0, size * 0.4),
-            pitch=kit.size(-1, 1),
-            roll=kit.size(-1, 1),
+            pitch=kit.uniform(-1, 1),
+            roll=kit.uniform(-1, 1),
         )
     elif choice < 0.65:
         # A turned body of random radii.
@@ -54,7 +54,7 @@ def _wild(kit: Kit) -> Group:
         waves = [np.sin(s * kit.rng.uniform(1, 7, 3) + kit.rng.uniform(0, 6, 3)) for _ in range(2)]
         path = size * (waves[0] + waves[1])
         path[:, 2] += size * 1.3
-        group.add(tube(path, size * kit.size(0.02, 0.15), sides=10), kit.any_surface())
+        group.add(tube(path, size * kit.uniform(0.02, 0.15), sides=10), kit.any_surface())
     return group
 
 
@@ -62,8 +62,8 @@ def desk_scene(kit: Kit) -> Plan:
     """Returns a table top seen from near by, full of things."""
     group = Group()
     # The table.
-    width = kit.size(0.8, 2.2)
-    depth = kit.size(0.6, 1.4)
+    width = kit.uniform(0.8, 2.2)
+    depth = kit.uniform(0.6, 1.4)
     top = kit.surface(
         "wood",
         "planks",
@@ -75,7 +75,7 @@ def desk_scene(kit: Kit) -> Plan:
         "checks",
         "speckle",
         "carpet",
-        tile_m=kit.size(0.2, 1.0),
+        tile_m=kit.uniform(0.2, 1.0),
     )
     z = 0.75
     group.add(box(width, depth, 0.04), top, (0, 0, z - 0.04))
@@ -92,10 +92,10 @@ def desk_scene(kit: Kit) -> Plan:
         "tiles",
         "poster",
         "mottled",
-        tile_m=kit.size(0.5, 2),
+        tile_m=kit.uniform(0.5, 2),
     )
-    far = depth / 2 + (kit.size(0.0, 0.3) if kit.chance(0.5) else kit.size(0.3, 3))
-    for yaw in np.arange(4) * np.pi / 2 + kit.size(-0.2, 0.2):
+    far = depth / 2 + (kit.uniform(0.0, 0.3) if kit.chance(0.5) else kit.uniform(0.3, 3))
+    for yaw in np.arange(4) * np.pi / 2 + kit.uniform(-0.2, 0.2):
         side = Group()
         side.add(quads([[(-5, 0, 0), (5, 0, 0), (5, 0, 2.8), (-5, 0, 2.8)]]), paper)
         group.insert(
@@ -113,10 +113,10 @@ def desk_scene(kit: Kit) -> Plan:
     heaps = int(kit.rng.integers(2, 7))
     targets = []
     for _ in range(heaps):
-        x = kit.size(-half[0], half[0])
-        y = kit.size(-half[1], half[1])
-        radius = kit.size(0.05, 0.4)
-        targets.append((x, y, z + kit.size(0, 0.15)))
+        x = kit.uniform(-half[0], half[0])
+        y = kit.uniform(-half[1], half[1])
+        radius = kit.uniform(0.05, 0.4)
+        targets.append((x, y, z + kit.uniform(0, 0.15)))
         low = (max(-half[0], x - radius), max(-half[1], y - radius))
         high = (min(half[0], x + radius), min(half[1], y + radius))
         clutter.scatter(
@@ -126,27 +126,29 @@ def desk_scene(kit: Kit) -> Plan:
         for _ in range(int(kit.rng.integers(0, 4))):
             group.insert(
                 _wild(kit),
-                (kit.size(low[0], high[0]), kit.size(low[1], high[1]), z),
-                yaw=kit.size(0, 6.3),
+                (kit.uniform(low[0], high[0]), kit.uniform(low[1], high[1]), z),
+                yaw=kit.uniform(0, 6.3),
             )
     # Furniture behind the table.
     for _ in range(int(kit.rng.integers(0, 4))):
         maker = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))]
         group.insert(
-            maker(kit), (kit.size(-2, 2), far - kit.size(0, 0.5), 0), yaw=kit.size(-0.5, 0.5)
+            maker(kit),
+            (kit.uniform(-2, 2), far - kit.uniform(0, 0.5), 0),
+            yaw=kit.uniform(-0.5, 0.5),
         )
     # Lights, and the light from all sides.
     lights = []
     for _ in range(int(kit.rng.integers(1, 5))):
-        power = kit.size(0.3, 1.5)
-        position = (kit.size(-2, 2), kit.size(-2, min(1.5, far - 0.2)), kit.size(1.3, 2.7))
-        tone = (power, power * kit.size(0.75, 1.0), power * kit.size(0.5, 1.05))
-        lights.append(Light(position=position, colour=tone, radius=kit.size(0.03, 0.4)))
-    level = kit.size(0.1, 0.4)
+        power = kit.uniform(0.3, 1.5)
+        position = (kit.uniform(-2, 2), kit.uniform(-2, min(1.5, far - 0.2)), kit.uniform(1.3, 2.7))
+        tone = (power, power * kit.uniform(0.75, 1.0), power * kit.uniform(0.5, 1.05))
+        lights.append(Light(position=position, colour=tone, radius=kit.uniform(0.03, 0.4)))
+    level = kit.uniform(0.1, 0.4)
     sky = Sky(
         zenith=(1, 1, 1), horizon=(1, 1, 1), clouds=0.0, ambient_up=(level, level, level),
         ambient_down=(level * 0.6, level * 0.58, level * 0.55), haze_m=0.0,
-        occlusion_m=kit.size(0.15, 0.6),
+        occlusion_m=kit.uniform(0.15, 0.6),
     )  # fmt: skip
     return Plan(
         group=group, lights=tuple(lights), sky=sky, low=(-width * 0.7, -depth * 0.5 - 0.9, z + 0.1),

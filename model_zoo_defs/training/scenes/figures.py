@@ -14,9 +14,11 @@ def person(kit: Kit) -> Group:
     # Clothes, skin and size.
     cloth = kit.any_surface()
     legs = kit.surface("plain", "fabric", vivid=0.2)
-    skin = kit.palette.new("plain", np.array([0.85, 0.65, 0.52]) * kit.size(0.45, 1.1), gloss=0.1)
-    height = kit.size(1.5, 1.9)
-    stride = kit.size(0, 0.3)
+    skin = kit.palette.new(
+        "plain", np.array([0.85, 0.65, 0.52]) * kit.uniform(0.45, 1.1), gloss=0.1
+    )
+    height = kit.uniform(1.5, 1.9)
+    stride = kit.uniform(0, 0.3)
     # Legs, feet, arms and hands; the arms swing against the legs.
     for side in (-1, 1):
         x = side * 0.09

@@ -48,10 +48,10 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
     group = Group()
     # Size and materials.
     wood = kit.wood() if kit.chance(0.7) else kit.surface("plain", "marble")
-    table_width = width or kit.size(0.7, 2.0)
-    depth = kit.size(0.5, 0.95)
-    height = kit.size(0.4, 0.78)
-    thick = kit.size(0.015, 0.05)
+    table_width = width or kit.uniform(0.7, 2.0)
+    depth = kit.uniform(0.5, 0.95)
+    height = kit.uniform(0.4, 0.78)
+    thick = kit.uniform(0.015, 0.05)
     legs = kit.metal() if kit.chance(0.3) else wood
     y = -depth / 2
     # A round table on one leg, or one on four.
@@ -61,7 +61,7 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
         group.add(cylinder(depth * 0.3, 0.03, top=depth * 0.1), legs, (0, y, 0))
     else:
         group.add(box(table_width, depth, thick), wood, (0, y, height - thick))
-        thickness = kit.size(0.03, 0.09)
+        thickness = kit.uniform(0.03, 0.09)
         for sx in (-1, 1):
             for sy in (-1, 1):
                 at = (sx * (table_width / 2 - thickness), y + sy * (depth / 2 - thickness), 0)
@@ -90,10 +90,10 @@ def table(kit: Kit, *, width: float = 0.0) -> Group:
 
 
 def desk(kit: Kit) -> Group:
-    """Returns a writing desk with a screen and clutter."""
-    group = table(kit, width=kit.size(1.1, 1.8))
-    top = 0.0
+    """Returns a writing desk with a screen and clutter; one in five is a mere table."""
+    group = table(kit, width=kit.uniform(1.1, 1.8))
     if kit.chance(0.8):
+        # As wide as the table, but a plain board on two sides, at a desk's height.
         lower, upper = group.bounds()
         top = 0.74
         group = Group()
@@ -102,7 +102,8 @@ def desk(kit: Kit) -> Group:
         group.add(box(width, 0.7, 0.03), wood, (0, -0.35, top - 0.03))
         for side in (-1, 1):
             group.add(box(0.03, 0.65, top - 0.03), wood, (side * (width / 2 - 0.02), -0.35, 0))
-        group.insert(monitor(kit), (kit.size(-0.2, 0.2), -0.2, top), yaw=kit.size(-0.3, 0.3))
+        # Screen, keyboard and small things in front of it.
+        group.insert(monitor(kit), (kit.uniform(-0.2, 0.2), -0.2, top), yaw=kit.uniform(-0.3, 0.3))
         group.add(box(0.42, 0.14, 0.02), kit.dark(), (0, -0.5, top))
         scatter(
             kit,
@@ -118,9 +119,9 @@ def bookshelf(kit: Kit) -> Group:
     """Returns open shelves full of books and things."""
     group = Group()
     wood = kit.wood() if kit.chance(0.6) else kit.surface("plain")
-    width = kit.size(0.6, 1.6)
-    depth = kit.size(0.24, 0.4)
-    height = kit.size(0.8, 2.2)
+    width = kit.uniform(0.6, 1.6)
+    depth = kit.uniform(0.24, 0.4)
+    height = kit.uniform(0.8, 2.2)
     thickness = 0.025
     for side in (-1, 1):
         group.add(
@@ -128,7 +129,7 @@ def bookshelf(kit: Kit) -> Group:
         )
     if kit.chance(0.75):
         group.add(box(width, 0.01, height), wood, (0, -0.005, 0))
-    shelves = np.linspace(0.06, height - thickness, max(2, int(height / kit.size(0.28, 0.42))))
+    shelves = np.linspace(0.06, height - thickness, max(2, int(height / kit.uniform(0.28, 0.42))))
     gap = float(shelves[1] - shelves[0])
     covers = [kit.palette.new("poster", tile_m=0.3) for _ in range(3)]
     covers += [kit.palette.new("plain", tile_m=0.3, vivid=0.6) for _ in range(6)]
@@ -154,20 +155,20 @@ def _fill_shelf(
     while x < width / 2 - 0.06:
         if kit.chance(0.8):
             # A book, some of them leaning.
-            wide = kit.size(0.012, 0.06)
-            tall = gap * kit.size(0.5, 0.97)
-            deep = depth * kit.size(0.5, 0.9)
-            lean = kit.size(-0.25, 0.0) if kit.chance(0.06) else 0.0
+            wide = kit.uniform(0.012, 0.06)
+            tall = gap * kit.uniform(0.5, 0.97)
+            deep = depth * kit.uniform(0.5, 0.9)
+            lean = kit.uniform(-0.25, 0.0) if kit.chance(0.06) else 0.0
             group.add(
                 box(wide * 0.97, deep, tall),
                 int(kit.rng.choice(covers)),
-                (x + wide / 2, -depth * kit.size(0.93, 1.0) + deep / 2, z),
+                (x + wide / 2, -depth * kit.uniform(0.93, 1.0) + deep / 2, z),
                 roll=lean,
             )
             x += wide
         else:
             # A thing, or a gap.
-            wide = kit.size(0.08, 0.3)
+            wide = kit.uniform(0.08, 0.3)
             end = min(x + wide, width / 2)
             if kit.chance(0.7):
                 scatter(
@@ -184,21 +185,29 @@ def _fill_shelf(
 
 
 def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
-    """Returns a closed cupboard with door panels, joints and handles."""
+    """Returns a closed cupboard with door panels, joints and handles.
+
+    Args:
+        kit: Random numbers and materials.
+        hang: Height of its bottom on the wall in metres. 0: it stands on the floor, may be taller
+            and deeper, and may have things on its top.
+    """
     group = Group()
+    # The body, lower and less deep if it hangs, and its doors.
     front = (
         kit.wood()
         if kit.chance(0.5)
-        else kit.palette.new("plain", tile_m=1.0, gloss=0.4, mirror=kit.size(0, 0.05), vivid=0.4)
+        else kit.palette.new("plain", tile_m=1.0, gloss=0.4, mirror=kit.uniform(0, 0.05), vivid=0.4)
     )
-    width = kit.size(0.5, 1.8)
-    depth = kit.size(0.35, 0.65)
-    height = kit.size(0.5, 2.2)
+    width = kit.uniform(0.5, 1.8)
+    depth = kit.uniform(0.35, 0.65)
+    height = kit.uniform(0.5, 2.2)
     if hang:
         depth = 0.35
-        height = kit.size(0.5, 0.8)
+        height = kit.uniform(0.5, 0.8)
     group.add(box(width, depth, height), front, (0, -depth / 2, hang))
     _doors(kit, group, (width, depth, height), hang, front)
+    # Things on its top, where one is seen from above.
     if height < 1.3 and not hang:
         scatter(
             kit,
@@ -211,14 +220,22 @@ def cupboard(kit: Kit, *, hang: float = 0.0) -> Group:
 
 
 def _doors(kit: Kit, group: Group, size: tuple[float, float, float], z: float, front: int) -> None:
-    """Adds doors with handles to the front of a body of this width, depth and height at z."""
+    """Adds doors or drawers with handles to the front of a body, whose back is on y = 0.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        size: Width, depth and height of the body in metres.
+        z: Height of its bottom in metres.
+        front: Material of the doors.
+    """
     width, depth, height = size
     steel = kit.metal()
     # Rows and columns of doors or drawers, with handles of one style.
-    columns = max(1, round(width / kit.size(0.4, 0.6)))
+    columns = max(1, round(width / kit.uniform(0.4, 0.6)))
     rows = int(kit.rng.integers(1, 5)) if height > 0.6 else 1
     style = int(kit.rng.integers(3))
-    gap = 0.006
+    gap = 0.006  # metres, on each side of a door
     for column in range(columns):
         for row in range(rows):
             wide = width / columns
@@ -257,10 +274,12 @@ def kitchen(kit: Kit) -> Group:
     """Returns a kitchen counter with tap, tiled back wall, hung cupboards and clutter."""
     group = Group()
     # The body with its doors, the top and the back wall.
-    width = kit.size(1.6, 3.6)
-    depth = kit.size(0.58, 0.68)
-    height = kit.size(0.84, 0.94)
-    front = kit.palette.new("plain", tile_m=1.0, gloss=0.5, mirror=kit.size(0.0, 0.06), vivid=0.6)
+    width = kit.uniform(1.6, 3.6)
+    depth = kit.uniform(0.58, 0.68)
+    height = kit.uniform(0.84, 0.94)
+    front = kit.palette.new(
+        "plain", tile_m=1.0, gloss=0.5, mirror=kit.uniform(0.0, 0.06), vivid=0.6
+    )
     top = kit.surface("marble", "speckle", "plain", "wood", tile_m=0.8)
     group.add(box(width, depth - 0.05, height - 0.1), front, (0, -depth / 2, 0.1))
     group.add(box(width, depth - 0.12, 0.1), kit.dark(), (0, -depth / 2 + 0.03, 0))
@@ -272,7 +291,7 @@ def kitchen(kit: Kit) -> Group:
         (0, -0.006, height),
     )
     # Sink and tap.
-    x = kit.size(-0.3, 0.3) * width
+    x = kit.uniform(-0.3, 0.3) * width
     steel = kit.metal()
     group.add(box(0.5, 0.4, 0.006), steel, (x, -depth / 2, height))
     group.add(box(0.42, 0.32, 0.002), kit.dark(), (x, -depth / 2, height + 0.006))
@@ -294,7 +313,7 @@ def kitchen(kit: Kit) -> Group:
     # Hung cupboards.
     if kit.chance(0.6):
         for side in (-0.25, 0.25):
-            group.insert(cupboard(kit, hang=height + kit.size(0.5, 0.65)), (side * width, 0, 0))
+            group.insert(cupboard(kit, hang=height + kit.uniform(0.5, 0.65)), (side * width, 0, 0))
     return group
 
 
@@ -302,11 +321,11 @@ def floor_lamp(kit: Kit) -> Group:
     """Returns a tall thin lamp."""
     group = Group()
     metal = kit.metal()
-    height = kit.size(1.3, 1.8)
+    height = kit.uniform(1.3, 1.8)
     group.add(cylinder(0.14, 0.02), metal, (0, -0.2, 0))
     group.add(cylinder(0.011, height), metal, (0, -0.2, 0))
-    radius = kit.size(0.12, 0.22)
-    shade = kit.palette.new("fabric", (0.85, 0.8, 0.7), glow=kit.size(0, 1.5))
+    radius = kit.uniform(0.12, 0.22)
+    shade = kit.palette.new("fabric", (0.85, 0.8, 0.7), glow=kit.uniform(0, 1.5))
     group.add(
         lathe(
             [
@@ -325,7 +344,7 @@ def floor_lamp(kit: Kit) -> Group:
 def floor_plant(kit: Kit) -> Group:
     """Returns a large pot plant."""
     group = Group()
-    group.insert(plant(kit), (0, -0.3, 0), scale=kit.size(1.5, 3.5))
+    group.insert(plant(kit), (0, -0.3, 0), scale=kit.uniform(1.5, 3.5))
     return group
 
 
@@ -334,7 +353,9 @@ def drawers(kit: Kit) -> Group:
     group = cupboard(kit)
     if kit.chance(0.4):
         upper = group.bounds()[1]
-        group.insert(monitor(kit), (0, -0.25, min(float(upper[2]), 0.9)), scale=kit.size(1.0, 1.8))
+        group.insert(
+            monitor(kit), (0, -0.25, min(float(upper[2]), 0.9)), scale=kit.uniform(1.0, 1.8)
+        )
     return group
 
 
@@ -342,11 +363,11 @@ def railing(kit: Kit) -> Group:
     """Returns a rail with thin bars."""
     group = Group()
     steel = kit.metal() if kit.chance(0.6) else kit.wood()
-    width = kit.size(0.8, 2.4)
-    height = kit.size(0.7, 1.1)
+    width = kit.uniform(0.8, 2.4)
+    height = kit.uniform(0.7, 1.1)
     group.add(rod((-width / 2, -0.05, height), (width / 2, -0.05, height), 0.022), steel)
     group.add(rod((-width / 2, -0.05, 0.1), (width / 2, -0.05, 0.1), 0.012), steel)
-    for x in np.arange(-width / 2, width / 2 + 0.01, kit.size(0.08, 0.16)):
+    for x in np.arange(-width / 2, width / 2 + 0.01, kit.uniform(0.08, 0.16)):
         group.add(cylinder(0.007, height), steel, (float(x), -0.05, 0))
     return group
 

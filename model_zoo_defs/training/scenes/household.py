@@ -21,9 +21,9 @@ def mug(kit: Kit) -> Group:
     """Returns a hollow cup with a handle."""
     group = Group()
     material = kit.any_surface()
-    radius = kit.size(0.03, 0.05)
-    height = kit.size(0.07, 0.12)
-    taper = kit.size(0.75, 1.1)
+    radius = kit.uniform(0.03, 0.05)
+    height = kit.uniform(0.07, 0.12)
+    taper = kit.uniform(0.75, 1.1)
     group.add(
         lathe(
             [
@@ -52,9 +52,9 @@ def mug(kit: Kit) -> Group:
 def bottle(kit: Kit) -> Group:
     """Returns a bottle with a cap."""
     group = Group()
-    radius = kit.size(0.025, 0.05)
-    height = kit.size(0.15, 0.33)
-    neck = kit.size(0.25, 0.5)
+    radius = kit.uniform(0.025, 0.05)
+    height = kit.uniform(0.15, 0.33)
+    neck = kit.uniform(0.25, 0.5)
     body = [
         (0, 0),
         (radius, 0),
@@ -75,11 +75,12 @@ def bottle(kit: Kit) -> Group:
 def vase(kit: Kit) -> Group:
     """Returns a turned body with a random wavy profile."""
     group = Group()
-    z = np.linspace(0, kit.size(0.08, 0.4), 14)
+    z = np.linspace(0, kit.uniform(0.08, 0.4), 14)
     waves = sum(
-        kit.size(-0.5, 0.5) * np.sin(k * z / z[-1] * 3.3 + kit.size(0, 6)) / k for k in (1, 2, 3)
+        kit.uniform(-0.5, 0.5) * np.sin(k * z / z[-1] * 3.3 + kit.uniform(0, 6)) / k
+        for k in (1, 2, 3)
     )
-    radius = z[-1] * kit.size(0.15, 0.4) * np.clip(1 + waves, 0.25, None)
+    radius = z[-1] * kit.uniform(0.15, 0.4) * np.clip(1 + waves, 0.25, None)
     group.add(lathe(np.stack([radius, z], axis=1), sides=24), kit.any_surface())
     return group
 
@@ -87,9 +88,9 @@ def vase(kit: Kit) -> Group:
 def bowl(kit: Kit) -> Group:
     """Returns a bowl, at times with fruit in it."""
     group = Group()
-    radius = kit.size(0.06, 0.16)
+    radius = kit.uniform(0.06, 0.16)
     a = np.linspace(0.2, 1.0, 6)
-    height = radius * kit.size(0.2, 0.8)
+    height = radius * kit.uniform(0.2, 0.8)
     outer = np.stack([radius * a, height * a**2], axis=1)
     group.add(
         lathe(np.concatenate([[(0, 0)], outer, outer[::-1] * [0.94, 1], [(0, 0.01)]])),
@@ -97,12 +98,12 @@ def bowl(kit: Kit) -> Group:
     )
     if kit.chance(0.5):
         for _ in range(int(kit.rng.integers(2, 6))):
-            angle = kit.size(0, 6.3)
-            far = radius * kit.size(0, 0.5)
-            aside = radius * kit.size(0.45, 0.7)
+            angle = kit.uniform(0, 6.3)
+            far = radius * kit.uniform(0, 0.5)
+            aside = radius * kit.uniform(0.45, 0.7)
             material = kit.palette.new("speckle", tile_m=0.1, vivid=1.0)
             group.add(
-                superquadric((aside, aside, aside * kit.size(0.85, 1.3))),
+                superquadric((aside, aside, aside * kit.uniform(0.85, 1.3))),
                 material,
                 (far * np.cos(angle), far * np.sin(angle), height * 0.6 + aside * 0.25),
             )
@@ -113,8 +114,8 @@ def pot(kit: Kit) -> Group:
     """Returns a cooking pot or pan with its handles."""
     group = Group()
     steel = kit.metal()
-    radius = kit.size(0.08, 0.16)
-    height = kit.size(0.04, 0.2)
+    radius = kit.uniform(0.08, 0.16)
+    height = kit.uniform(0.04, 0.2)
     group.add(
         lathe(
             [
@@ -131,7 +132,7 @@ def pot(kit: Kit) -> Group:
     )
     if kit.chance(0.5):
         group.add(
-            rod((radius, 0, height * 0.85), (radius + kit.size(0.12, 0.22), 0, height), 0.011),
+            rod((radius, 0, height * 0.85), (radius + kit.uniform(0.12, 0.22), 0, height), 0.011),
             kit.dark(),
         )
     else:
@@ -156,9 +157,9 @@ def pot(kit: Kit) -> Group:
 def carton(kit: Kit) -> Group:
     """Returns a box, plain or printed."""
     group = Group()
-    width = kit.size(0.05, 0.3)
-    depth = kit.size(0.04, 0.2)
-    height = kit.size(0.05, 0.3)
+    width = kit.uniform(0.05, 0.3)
+    depth = kit.uniform(0.04, 0.2)
+    height = kit.uniform(0.05, 0.3)
     printed = kit.chance(0.5)
     material = (
         kit.palette.new("poster", tile_m=max(width, height), whole=True)
@@ -174,13 +175,13 @@ def books(kit: Kit) -> Group:
     group = Group()
     z = 0.0
     for _ in range(int(kit.rng.integers(1, 6))):
-        width = kit.size(0.13, 0.24)
-        depth = kit.size(0.18, 0.3)
-        height = kit.size(0.008, 0.045)
+        width = kit.uniform(0.13, 0.24)
+        depth = kit.uniform(0.18, 0.3)
+        height = kit.uniform(0.008, 0.045)
         cover = kit.palette.new("poster", tile_m=depth, whole=True)
         paper = kit.palette.new("stripes", (0.9, 0.88, 0.8), tile_m=0.05)
-        yaw = kit.size(-0.4, 0.4)
-        at = (kit.size(-0.02, 0.02), kit.size(-0.02, 0.02), z)
+        yaw = kit.uniform(-0.4, 0.4)
+        at = (kit.uniform(-0.02, 0.02), kit.uniform(-0.02, 0.02), z)
         group.add(box(width, depth, height * 0.999, fit=depth), cover, at, yaw=yaw)
         group.add(
             box(width * 0.99, depth * 1.004, height * 0.8),
@@ -197,8 +198,8 @@ def papers(kit: Kit) -> Group:
     group = Group()
     for index in range(int(kit.rng.integers(1, 5))):
         sheet = kit.palette.new("poster", (0.93, 0.93, 0.9), tile_m=0.3, whole=True)
-        at = (kit.size(-0.1, 0.1), kit.size(-0.1, 0.1), 0.0007 * index)
-        group.add(box(0.21, 0.297, 0.0006, fit=0.3), sheet, at, yaw=kit.size(0, 6.3))
+        at = (kit.uniform(-0.1, 0.1), kit.uniform(-0.1, 0.1), 0.0007 * index)
+        group.add(box(0.21, 0.297, 0.0006, fit=0.3), sheet, at, yaw=kit.uniform(0, 6.3))
     return group
 
 
@@ -206,9 +207,9 @@ def laptop(kit: Kit) -> Group:
     """Returns an open portable computer."""
     group = Group()
     case = kit.metal() if kit.chance(0.5) else kit.dark()
-    width = kit.size(0.28, 0.38)
-    depth = kit.size(0.2, 0.26)
-    tilt = kit.size(-0.6, 0.1)
+    width = kit.uniform(0.28, 0.38)
+    depth = kit.uniform(0.2, 0.26)
+    tilt = kit.uniform(-0.6, 0.1)
     group.add(box(width, depth, 0.016), case)
     group.add(
         box(width * 0.9, depth * 0.5, 0.002),
@@ -230,9 +231,9 @@ def monitor(kit: Kit) -> Group:
     """Returns a flat screen on a foot, facing -y."""
     group = Group()
     case = kit.dark()
-    width = kit.size(0.4, 0.75)
-    height = width * kit.size(0.55, 0.65)
-    z = kit.size(0.08, 0.16)
+    width = kit.uniform(0.4, 0.75)
+    height = width * kit.uniform(0.55, 0.65)
+    z = kit.uniform(0.08, 0.16)
     group.add(box(width, 0.03, height), case, (0, 0, z))
     on = kit.chance(0.5)
     screen = (
@@ -252,12 +253,12 @@ def lamp(kit: Kit) -> Group:
     """Returns a table lamp: foot, stem and shade."""
     group = Group()
     metal = kit.metal()
-    height = kit.size(0.25, 0.55)
-    radius = kit.size(0.08, 0.17)
+    height = kit.uniform(0.25, 0.55)
+    radius = kit.uniform(0.08, 0.17)
     group.add(cylinder(radius * 0.6, 0.02), metal)
     group.add(cylinder(0.008, height), metal)
-    shade = kit.palette.new("fabric", tile_m=0.3, glow=kit.size(0, 1.5), vivid=0.3)
-    top = radius * kit.size(0.5, 1.0)
+    shade = kit.palette.new("fabric", tile_m=0.3, glow=kit.uniform(0, 1.5), vivid=0.3)
+    top = radius * kit.uniform(0.5, 1.0)
     group.add(
         lathe(
             [
@@ -276,8 +277,8 @@ def plant(kit: Kit) -> Group:
     """Returns a pot with many thin bent leaves."""
     group = Group()
     # Pot and earth.
-    radius = kit.size(0.05, 0.15)
-    height = kit.size(0.08, 0.25)
+    radius = kit.uniform(0.05, 0.15)
+    height = kit.uniform(0.08, 0.25)
     group.add(cylinder(radius * 0.8, height, top=radius), kit.any_surface())
     group.add(
         cylinder(radius * 0.9, 0.01),
@@ -287,19 +288,19 @@ def plant(kit: Kit) -> Group:
     # Leaves: strips that rise and bend down along s, 0 at the stem and 1 at the tip.
     green = kit.palette.new(
         "foliage",
-        (kit.size(0.15, 0.4), kit.size(0.35, 0.6), kit.size(0.1, 0.3)),
+        (kit.uniform(0.15, 0.4), kit.uniform(0.35, 0.6), kit.uniform(0.1, 0.3)),
         tile_m=0.2,
         gloss=0.2,
     )
     count = int(kit.rng.integers(12, 60))
-    reach = kit.size(0.15, 0.6)
-    wide = kit.size(0.008, 0.05)
+    reach = kit.uniform(0.15, 0.6)
+    wide = kit.uniform(0.008, 0.05)
     angle = kit.rng.uniform(0, 2 * np.pi, count)
     lift = kit.rng.uniform(0.2, 1.5, count)
     long = reach * kit.rng.uniform(0.5, 1.0, count)
     s = np.linspace(0, 1, 6)[None, :]
     along = long[:, None] * s * np.cos(lift)[:, None]
-    up = height + long[:, None] * (s * np.sin(lift)[:, None] - kit.size(0, 0.6) * s**2)
+    up = height + long[:, None] * (s * np.sin(lift)[:, None] - kit.uniform(0, 0.6) * s**2)
     half = wide * np.sqrt(np.clip(s * (1.05 - s), 0, None)) * 2
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     left = np.stack([along * cosine - half * sine, along * sine + half * cosine, up], axis=2)

@@ -16,8 +16,8 @@ class Kit:
     rng: np.random.Generator
     palette: Palette
 
-    def size(self, low: float, high: float) -> float:
-        """Returns a length between the two, in metres."""
+    def uniform(self, low: float, high: float) -> float:
+        """Returns a random number between the two: a length in metres, an angle, a fraction."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:
@@ -33,20 +33,22 @@ class Kit:
         """Returns a new material as everyday objects have it."""
         kinds = ("plain", "plain", "plain", "mottled", "spots", "stripes", "checks", "fabric",
                  "poster", "wood", "speckle", "marble")  # fmt: skip
-        return self.surface(*kinds, tile_m=self.size(0.1, 0.5), vivid=0.55)
+        return self.surface(*kinds, tile_m=self.uniform(0.1, 0.5), vivid=0.55)
 
     def wood(self) -> int:
         """Returns a wooden material."""
         tones = ((0.62, 0.45, 0.28), (0.40, 0.26, 0.16), (0.78, 0.62, 0.42), (0.28, 0.19, 0.14))
         tone = np.array(tones[int(self.rng.integers(4))]) * self.rng.uniform(0.85, 1.15)
-        return self.palette.new("wood", tone, tile_m=self.size(0.5, 1.2), mirror=self.size(0, 0.03))
+        return self.palette.new(
+            "wood", tone, tile_m=self.uniform(0.5, 1.2), mirror=self.uniform(0, 0.03)
+        )
 
     def metal(self) -> int:
         """Returns a metallic material."""
-        grey = self.size(0.3, 0.8)
-        mirror = self.size(0.05, 0.4)
+        grey = self.uniform(0.3, 0.8)
+        mirror = self.uniform(0.05, 0.4)
         return self.palette.new("brushed", (grey,) * 3, tile_m=0.5, gloss=0.8, mirror=mirror)
 
     def dark(self) -> int:
         """Returns a black or nearly black material."""
-        return self.palette.new("plain", (self.size(0.04, 0.16),) * 3, tile_m=0.5)
+        return self.palette.new("plain", (self.uniform(0.04, 0.16),) * 3, tile_m=0.5)

@@ -18,10 +18,10 @@ def room(kit: Kit) -> Plan:
     rng = kit.rng
     # Size: some rooms are corridors, some ceilings slope.
     corridor = kit.chance(0.12)
-    width = kit.size(1.4, 2.2) if corridor else kit.size(2.2, 6.5)
-    depth = kit.size(4, 9) if corridor else kit.size(2.2, 7.5)
-    height = kit.size(2.2, 3.1)
-    rise = kit.size(-0.9, 1.5) if kit.chance(0.2) else 0.0
+    width = kit.uniform(1.4, 2.2) if corridor else kit.uniform(2.2, 6.5)
+    depth = kit.uniform(4, 9) if corridor else kit.uniform(2.2, 7.5)
+    height = kit.uniform(2.2, 3.1)
+    rise = kit.uniform(-0.9, 1.5) if kit.chance(0.2) else 0.0
     # Floor, ceiling and walls.
     group = Group()
     paint = _add_floor_and_ceiling(kit, group, (width, depth, height), rise)
@@ -43,7 +43,7 @@ def room(kit: Kit) -> Plan:
             if kit.chance(0.5)
             else cylinder(0.18, height + max(rise, 0))
         )
-        group.add(thing, paint, (kit.size(0.3, 0.7) * width, kit.size(0.3, 0.7) * depth, 0))
+        group.add(thing, paint, (kit.uniform(0.3, 0.7) * width, kit.uniform(0.3, 0.7) * depth, 0))
     clutter.scatter(
         kit,
         group,
@@ -55,7 +55,9 @@ def room(kit: Kit) -> Plan:
     # Places that the cameras look at, and lights.
     targets = []
     for _ in range(16):
-        targets.append((kit.size(0.1, 0.9) * width, kit.size(0.1, 0.9) * depth, kit.size(0.1, 1.4)))
+        targets.append(
+            (kit.uniform(0.1, 0.9) * width, kit.uniform(0.1, 0.9) * depth, kit.uniform(0.1, 1.4))
+        )
     lights = _lights(kit, width, depth, height, group)
     return Plan(
         group=group,
@@ -88,7 +90,7 @@ def _add_floor_and_ceiling(
         "brick",
         "mottled",
         "spots",
-        tile_m=kit.size(1, 3),
+        tile_m=kit.uniform(1, 3),
         vivid=0.15,
     )
     floor = kit.surface(
@@ -101,14 +103,14 @@ def _add_floor_and_ceiling(
         "plain",
         "marble",
         "speckle",
-        tile_m=kit.size(0.6, 2),
+        tile_m=kit.uniform(0.6, 2),
         vivid=0.2,
     )
-    mirror = kit.size(0, 0.12) if kit.chance(0.4) else 0.0
+    mirror = kit.uniform(0, 0.12) if kit.chance(0.4) else 0.0
     if mirror:
         floor = kit.palette.new(
             "planks" if kit.chance(0.5) else "tiles",
-            tile_m=kit.size(0.6, 2),
+            tile_m=kit.uniform(0.6, 2),
             mirror=mirror,
             vivid=0.1,
         )
@@ -159,7 +161,7 @@ def _side(
         opening(kit, side, hole, own)
     if kit.chance(0.7):
         skirting = kit.palette.new("plain", (0.88, 0.87, 0.85)) if kit.chance(0.6) else kit.wood()
-        side.add(box(length, 0.03, kit.size(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
+        side.add(box(length, 0.03, kit.uniform(0.05, 0.14)), skirting, (length / 2, -0.015, 0))
     decorate(kit, side, length, min(height, height + rise), holes)
     _line_up(kit, side, length, across, holes, corridor)
     return side
@@ -169,12 +171,12 @@ def _line_up(
     kit: Kit, side: Group, length: float, across: float, holes: Sequence[Hole], corridor: bool
 ) -> None:
     """Adds furniture with its back to the wall, keeping doors free."""
-    u = kit.size(0.0, 0.8)
+    u = kit.uniform(0.0, 0.8)
     tries = 0
     while u < length - 0.4 and tries < 12:
         tries += 1
         if kit.chance(0.7 if corridor else 0.2):
-            u += kit.size(0.3, 1.0)
+            u += kit.uniform(0.3, 1.0)
             continue
         item = furniture.AGAINST_WALL[int(kit.rng.integers(len(furniture.AGAINST_WALL)))](kit)
         lower, upper = item.bounds()
@@ -187,19 +189,21 @@ def _line_up(
             u += 0.15
             continue
         side.insert(
-            item, (u - float(lower[0]), -0.03 - kit.size(0, 0.05), 0), yaw=kit.size(-0.06, 0.06)
+            item,
+            (u - float(lower[0]), -0.03 - kit.uniform(0, 0.05), 0),
+            yaw=kit.uniform(-0.06, 0.06),
         )
-        u += wide + (kit.size(0.0, 0.1) if kit.chance(0.5) else kit.size(0.2, 0.9))
+        u += wide + (kit.uniform(0.0, 0.1) if kit.chance(0.5) else kit.uniform(0.2, 0.9))
 
 
 def _middle(kit: Kit, group: Group, width: float, depth: float) -> None:
     """Adds a table with chairs, a rug, single chairs, people and hanging lamps."""
-    x = kit.size(0.35, 0.65) * width
-    y = kit.size(0.35, 0.65) * depth
-    yaw = kit.size(0, 6.3)
+    x = kit.uniform(0.35, 0.65) * width
+    y = kit.uniform(0.35, 0.65) * depth
+    yaw = kit.uniform(0, 6.3)
     # A rug.
     if kit.chance(0.5):
-        rug = box(kit.size(1, 2.4), kit.size(0.8, 1.8), 0.008, fit=0.0)
+        rug = box(kit.uniform(1, 2.4), kit.uniform(0.8, 1.8), 0.008, fit=0.0)
         group.add(
             rug,
             kit.surface("carpet", "fabric", "poster", "stripes", "checks", tile_m=1.5),
@@ -218,11 +222,11 @@ def _middle(kit: Kit, group: Group, width: float, depth: float) -> None:
                 if kit.chance(0.75):
                     at = (
                         float(along * (upper[0] - lower[0])),
-                        side * (-float(lower[1]) / 2 + kit.size(0.1, 0.5)),
+                        side * (-float(lower[1]) / 2 + kit.uniform(0.1, 0.5)),
                         0,
                     )
                     ensemble.insert(
-                        seat, at, yaw=(0.0 if side > 0 else np.pi) + kit.size(-0.5, 0.5)
+                        seat, at, yaw=(0.0 if side > 0 else np.pi) + kit.uniform(-0.5, 0.5)
                     )
         group.insert(ensemble, (x, y, 0), yaw=yaw)
     # Single pieces of furniture.
@@ -238,22 +242,24 @@ def _middle(kit: Kit, group: Group, width: float, depth: float) -> None:
         )
         item = makers[int(kit.rng.integers(len(makers)))](kit)
         group.insert(
-            item, (kit.size(0.2, 0.8) * width, kit.size(0.2, 0.8) * depth, 0), yaw=kit.size(0, 6.3)
+            item,
+            (kit.uniform(0.2, 0.8) * width, kit.uniform(0.2, 0.8) * depth, 0),
+            yaw=kit.uniform(0, 6.3),
         )
     # A person.
     if kit.chance(0.3):
         group.insert(
             figures.person(kit),
-            (kit.size(0.2, 0.8) * width, kit.size(0.2, 0.8) * depth, 0),
-            yaw=kit.size(0, 6.3),
+            (kit.uniform(0.2, 0.8) * width, kit.uniform(0.2, 0.8) * depth, 0),
+            yaw=kit.uniform(0, 6.3),
         )
     # A hanging lamp.
     if kit.chance(0.4):
-        shade = kit.palette.new("plain", glow=kit.size(0, 2), vivid=0.4)
-        z = kit.size(1.5, 2.0)
+        shade = kit.palette.new("plain", glow=kit.uniform(0, 2), vivid=0.4)
+        z = kit.uniform(1.5, 2.0)
         group.add(rod((x, y, z), (x, y, 2.9), 0.004, sides=5), kit.dark())
         group.add(
-            cylinder(kit.size(0.1, 0.25), kit.size(0.12, 0.3), top=kit.size(0.03, 0.2)),
+            cylinder(kit.uniform(0.1, 0.25), kit.uniform(0.12, 0.3), top=kit.uniform(0.03, 0.2)),
             shade,
             (x, y, z),
         )
@@ -262,37 +268,39 @@ def _middle(kit: Kit, group: Group, width: float, depth: float) -> None:
 def _outside(kit: Kit, group: Group, width: float, depth: float) -> None:
     """Adds what is seen through windows: ground and, at random, a wall, a hedge or boxes."""
     ground = kit.surface("paving", "foliage", "speckle", tile_m=3, vivid=0.2)
-    group.add(box(80, 80, 0.1), ground, (width / 2, depth / 2, -kit.size(0.3, 4)))
+    group.add(box(80, 80, 0.1), ground, (width / 2, depth / 2, -kit.uniform(0.3, 4)))
     for _ in range(int(kit.rng.integers(0, 6))):
-        angle = kit.size(0, 6.3)
-        far = kit.size(4, 25) + max(width, depth)
-        block = box(kit.size(1, 12), kit.size(1, 8), kit.size(1, 9))
+        angle = kit.uniform(0, 6.3)
+        far = kit.uniform(4, 25) + max(width, depth)
+        block = box(kit.uniform(1, 12), kit.uniform(1, 8), kit.uniform(1, 9))
         material = kit.surface("brick", "plaster", "foliage", tile_m=2, vivid=0.2)
         group.add(
             block,
             material,
             (width / 2 + far * np.cos(angle), depth / 2 + far * np.sin(angle), -2),
-            yaw=kit.size(0, 6.3),
+            yaw=kit.uniform(0, 6.3),
         )
 
 
 def _lights(kit: Kit, width: float, depth: float, height: float, group: Group) -> tuple[Light, ...]:
     """Returns lamps in a room of this width, depth and height, and often a sun."""
+    # Lamps, white to orange.
     lights = []
     for _ in range(int(kit.rng.integers(1, 4))):
-        warm = kit.size(0.65, 1.0)
-        power = kit.size(0.5, 3.0)
+        warm = kit.uniform(0.65, 1.0)
+        power = kit.uniform(0.5, 3.0)
         position = (
-            kit.size(0.15, 0.85) * width,
-            kit.size(0.15, 0.85) * depth,
-            kit.size(1.7, height - 0.1),
+            kit.uniform(0.15, 0.85) * width,
+            kit.uniform(0.15, 0.85) * depth,
+            kit.uniform(1.7, height - 0.1),
         )
         colour = (power, power * (0.3 + 0.7 * warm), power * warm**2)
-        lights.append(Light(position=position, colour=colour, radius=kit.size(0.05, 0.5)))
+        lights.append(Light(position=position, colour=colour, radius=kit.uniform(0.05, 0.5)))
+    # A sun in any direction; its position is the direction toward it.
     if kit.chance(0.5):
-        angle = kit.size(0, 6.3)
-        power = kit.size(2, 9)
-        position = (np.cos(angle), np.sin(angle), kit.size(0.3, 1.2))
+        angle = kit.uniform(0, 6.3)
+        power = kit.uniform(2, 9)
+        position = (np.cos(angle), np.sin(angle), kit.uniform(0.3, 1.2))
         lights.append(
             Light(
                 position=position, colour=(power, power * 0.93, power * 0.8), radius=0.03, sun=True
@@ -303,15 +311,15 @@ def _lights(kit: Kit, width: float, depth: float, height: float, group: Group) -
 
 def _indoor_sky(kit: Kit) -> Sky:
     """Returns the sky outside the windows, and the ambient light of a room."""
-    bright = kit.size(1, 5)
-    level = kit.size(0.15, 0.6)
+    bright = kit.uniform(1, 5)
+    level = kit.uniform(0.15, 0.6)
     up = tuple(float(v) for v in level * kit.rng.uniform(0.85, 1.1, 3))
     down = tuple(
         float(v) for v in level * kit.rng.uniform(0.35, 1.0) * kit.rng.uniform(0.85, 1.1, 3)
     )
     return Sky(
         zenith=(bright * 0.5, bright * 0.7, bright), horizon=(bright * 0.9, bright * 0.95, bright),
-        clouds=kit.size(0, 1), ambient_up=(up[0], up[1], up[2]),
+        clouds=kit.uniform(0, 1), ambient_up=(up[0], up[1], up[2]),
         ambient_down=(down[0], down[1], down[2]),
-        haze_m=0.0, occlusion_m=kit.size(0.4, 1.5),
+        haze_m=0.0, occlusion_m=kit.uniform(0.4, 1.5),
     )  # fmt: skip

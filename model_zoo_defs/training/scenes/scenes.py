@@ -139,6 +139,16 @@ def _street_view(
 def _indoor_view(
     plan: Plan, rng: np.random.Generator, height: int, width: int, rig: Rig | None, *, near: bool
 ) -> View:
+    """Returns a view from the cameras' free box of a scene toward one of its targets.
+
+    Args:
+        plan: The scene.
+        rng: Random numbers.
+        height: Rows of the image.
+        width: Columns of the image.
+        rig: Height, tilt and lens of a given camera; None: random ones.
+        near: Whether the camera may be moved close to its target.
+    """
     position = rng.uniform(plan.low, plan.high)
     target = np.asarray(plan.targets[int(rng.integers(len(plan.targets)))])
     if near:
@@ -146,6 +156,7 @@ def _indoor_view(
         position[2] = max(position[2], plan.low[2])
     if rig is not None:
         position[2] = rng.uniform(*rig.height)
+    # Toward the target, but seldom exactly: less steeply, and a little aside.
     toward = target - position
     yaw = float(np.arctan2(-toward[0], toward[1]))
     pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]) + 1e-6))

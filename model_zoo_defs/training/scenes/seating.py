@@ -25,7 +25,7 @@ def cushion(
     **turn: float,
 ) -> None:
     """Adds a padded block whose middle is at `at`; turn: `pitch` and `yaw` in radians."""
-    body = superquadric(size, vertical=kit.size(0.25, 0.5), around=kit.size(0.2, 0.4))
+    body = superquadric(size, vertical=kit.uniform(0.25, 0.5), around=kit.uniform(0.2, 0.4))
     group.add(body, material, at, **turn)
 
 
@@ -35,11 +35,11 @@ def chair(kit: Kit) -> Group:
     # Size and materials.
     wood = kit.wood() if kit.chance(0.65) else kit.metal()
     seat = kit.surface("fabric", "plain", tile_m=0.3) if kit.chance(0.6) else wood
-    width = kit.size(0.38, 0.5)
-    depth = kit.size(0.38, 0.5)
-    height = kit.size(0.42, 0.48)
-    back = kit.size(0.75, 1.1)
-    thickness = kit.size(0.02, 0.045)
+    width = kit.uniform(0.38, 0.5)
+    depth = kit.uniform(0.38, 0.5)
+    height = kit.uniform(0.42, 0.48)
+    back = kit.uniform(0.75, 1.1)
+    thickness = kit.uniform(0.02, 0.045)
     y = -depth / 2
     # Seat and legs.
     if kit.chance(0.5):
@@ -101,14 +101,14 @@ def sofa(kit: Kit) -> Group:
     cloth = kit.surface("fabric", "plain", "stripes", "mottled", tile_m=0.4)
     # Size.
     seats = int(kit.rng.integers(1, 4))
-    each = kit.size(0.55, 0.75)
-    depth = kit.size(0.75, 0.95)
-    height = kit.size(0.38, 0.46)
+    each = kit.uniform(0.55, 0.75)
+    depth = kit.uniform(0.75, 0.95)
+    height = kit.uniform(0.38, 0.46)
     width = seats * each
-    arm = kit.size(0.12, 0.25)
+    arm = kit.uniform(0.12, 0.25)
     # Body, back and arms.
     group.add(box(width + 2 * arm, depth, height * 0.6), cloth, (0, -depth / 2, 0.06))
-    cushion(kit, group, (width + 2 * arm, 0.25, kit.size(0.7, 0.95)), (0, -0.13, 0.45), cloth)
+    cushion(kit, group, (width + 2 * arm, 0.25, kit.uniform(0.7, 0.95)), (0, -0.13, 0.45), cloth)
     for side in (-1, 1):
         cushion(
             kit,
@@ -123,15 +123,15 @@ def sofa(kit: Kit) -> Group:
         cushion(kit, group, (each, depth * 0.75, 0.18), (x, -depth * 0.58, height), cloth)
         if kit.chance(0.6):
             pillow = kit.any_surface()
-            s = kit.size(0.35, 0.5)
+            s = kit.uniform(0.35, 0.5)
             cushion(
                 kit,
                 group,
                 (s, 0.16, s),
-                (x + kit.size(-0.1, 0.1), -0.36, height + s * 0.55),
+                (x + kit.uniform(-0.1, 0.1), -0.36, height + s * 0.55),
                 pillow,
                 pitch=-0.35,
-                yaw=kit.size(-0.3, 0.3),
+                yaw=kit.uniform(-0.3, 0.3),
             )
     return group
 
@@ -140,10 +140,10 @@ def bed(kit: Kit) -> Group:
     """Returns a bed with blanket and pillows."""
     group = Group()
     wood = kit.wood()
-    width = kit.size(0.9, 1.9)
-    depth = kit.size(1.9, 2.1)
+    width = kit.uniform(0.9, 1.9)
+    depth = kit.uniform(1.9, 2.1)
     group.add(box(width, depth, 0.3), wood, (0, -depth / 2, 0))
-    group.add(box(width, 0.06, kit.size(0.6, 1.1)), wood, (0, -0.03, 0))
+    group.add(box(width, 0.06, kit.uniform(0.6, 1.1)), wood, (0, -0.03, 0))
     cushion(
         kit,
         group,
@@ -156,7 +156,7 @@ def bed(kit: Kit) -> Group:
     )
     z = (
         0.55
-        + 0.025 * np.sin(x * kit.size(4, 12) + 3 * np.sin(y * 4))
+        + 0.025 * np.sin(x * kit.uniform(4, 12) + 3 * np.sin(y * 4))
         + 0.015 * np.sin(y * 13 + x * 5)
     )
     z -= np.clip(np.abs(x) - width * 0.48, 0, None) * 4

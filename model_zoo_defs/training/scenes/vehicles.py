@@ -57,6 +57,15 @@ def _loft(stations: list[tuple[float, float, float, float]], power: float) -> Me
 
 
 def _wheels(kit: Kit, group: Group, track: float, axles: tuple[float, ...], radius: float) -> None:
+    """Adds a wheel on both sides of each axle, standing on z = 0.
+
+    Args:
+        kit: Random numbers and materials.
+        group: Group that they are added to.
+        track: Distance of the wheels' middle planes from x = 0 in metres.
+        axles: Each axle's y in metres.
+        radius: Radius of the wheels in metres.
+    """
     tyre = kit.dark()
     hub = kit.metal()
     for y in axles:
@@ -84,19 +93,19 @@ def car(kit: Kit) -> Group:
         (0.5, 0.08, 0.07),
         (0.1, 0.18, 0.4),
     )
-    base = np.array(paint_colours[int(kit.rng.integers(6))]) * kit.size(0.8, 1.1)
+    base = np.array(paint_colours[int(kit.rng.integers(6))]) * kit.uniform(0.8, 1.1)
     vivid = kit.chance(0.2)
     paint = kit.palette.new(
-        "plain", None if vivid else base, gloss=0.7, mirror=kit.size(0.04, 0.12), vivid=1.0
+        "plain", None if vivid else base, gloss=0.7, mirror=kit.uniform(0.04, 0.12), vivid=1.0
     )
-    glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.size(0.1, 0.25))
+    glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=kit.uniform(0.1, 0.25))
     # Measures: half its width, and heights of its lines above the road.
-    long = kit.size(3.7, 4.8)
-    half = kit.size(0.82, 0.93)
-    low = kit.size(0.18, 0.24)
-    belt = kit.size(0.82, 0.98)
-    roof = kit.size(1.4, 1.72)
-    hood = belt - kit.size(0.02, 0.14)
+    long = kit.uniform(3.7, 4.8)
+    half = kit.uniform(0.82, 0.93)
+    low = kit.uniform(0.18, 0.24)
+    belt = kit.uniform(0.82, 0.98)
+    roof = kit.uniform(1.4, 1.72)
+    hood = belt - kit.uniform(0.02, 0.14)
     front = long / 2
     rear = -long / 2
     estate = kit.chance(0.55)
@@ -112,7 +121,7 @@ def car(kit: Kit) -> Group:
         (front, half * 0.8, low + 0.12, hood * 0.62),
     ]
     group.add(_loft(body, 0.35), paint)
-    tail = rear + (0.1 if estate else kit.size(0.45, 0.85))
+    tail = rear + (0.1 if estate else kit.uniform(0.45, 0.85))
     cabin = [
         (tail, half * 0.82, belt - 0.1, belt + 0.02),
         (tail + (0.3 if estate else 0.7), half * 0.76, belt - 0.1, roof - 0.04),
@@ -151,7 +160,7 @@ def car(kit: Kit) -> Group:
             light,
             (side * half * 0.66, front - 0.1, hood * 0.72),
         )
-        red = kit.palette.new("plain", (0.6, 0.04, 0.04), gloss=0.8, glow=kit.size(0, 1))
+        red = kit.palette.new("plain", (0.6, 0.04, 0.04), gloss=0.8, glow=kit.uniform(0, 1))
         group.add(
             superquadric((0.2, 0.1, 0.3), vertical=0.5),
             red,
@@ -164,7 +173,7 @@ def car(kit: Kit) -> Group:
     group.add(box(0.5, 0.02, 0.11), plate, (0, rear - 0.005, belt * 0.6))
     group.add(box(half * 1.5, 0.06, 0.14), kit.dark(), (0, front - 0.03, low + 0.05))
     # Wheels.
-    radius = kit.size(0.29, 0.36)
+    radius = kit.uniform(0.29, 0.36)
     # A dark box under the car and dark discs behind the wheels stand for the wheel arches.
     group.add(box(half * 1.8, long * 0.86, 0.3), kit.dark(), (0, 0, low - 0.02))
     arch = kit.dark()
@@ -185,9 +194,9 @@ def lorry(kit: Kit) -> Group:
     # Materials, length and the heights of its parts.
     paint = kit.palette.new("plain", gloss=0.5, mirror=0.05, vivid=0.5)
     glass = kit.palette.new("plain", (0.06, 0.07, 0.08), gloss=0.7, mirror=0.2)
-    long = kit.size(4.8, 11)
-    half = kit.size(0.95, 1.25)
-    tall = kit.size(1.9, 3.4)
+    long = kit.uniform(4.8, 11)
+    half = kit.uniform(0.95, 1.25)
+    tall = kit.uniform(1.9, 3.4)
     front = long / 2
     rear = -long / 2
     # A closed body, or a cab before a load.
@@ -253,9 +262,10 @@ def street_box(kit: Kit) -> Group:
         for x in (-0.22, 0.22):
             group.add(torus(0.08, 0.03), kit.dark(), (x, 0.25, 0.1), roll=np.pi / 2)
     elif choice < 0.75:
-        group.add(cylinder(0.09, kit.size(0.6, 1.1)), kit.surface("plain", "stripes", vivid=0.5))
+        group.add(cylinder(0.09, kit.uniform(0.6, 1.1)), kit.surface("plain", "stripes", vivid=0.5))
     else:
         group.add(
-            box(kit.size(0.4, 1.4), kit.size(0.3, 0.6), kit.size(0.5, 1.6)), kit.any_surface()
+            box(kit.uniform(0.4, 1.4), kit.uniform(0.3, 0.6), kit.uniform(0.5, 1.6)),
+            kit.any_surface(),
         )
     return group

@@ -40,7 +40,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     """Adds the reveal, the frame and what closes a window or door."""
     u0, v0, u1, v1 = hole
     # Reveals around the hole.
-    deep = kit.size(0.08, 0.3)
+    deep = kit.uniform(0.08, 0.3)
     x = (u0 + u1) / 2
     width = u1 - u0
     height = v1 - v0
@@ -51,7 +51,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
         side.add(box(*size), paint, at)
     # The frame.
     trim = kit.wood() if kit.chance(0.4) else kit.palette.new("plain", (0.9, 0.9, 0.88), gloss=0.3)
-    thickness = kit.size(0.04, 0.09)
+    thickness = kit.uniform(0.04, 0.09)
     for at, size in (
         ((u0 + thickness / 2, deep, v0), (thickness, 0.05, height)),
         ((u1 - thickness / 2, deep, v0), (thickness, 0.05, height)),
@@ -64,7 +64,7 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
         _hallway(kit, side, (u0 + u1) / 2, deep, paint)
         if kit.chance(0.75):
             door = kit.wood() if kit.chance(0.5) else kit.surface("plain", vivid=0.2)
-            angle = kit.size(-1.7, -0.2) if kit.chance(0.4) else 0.0
+            angle = kit.uniform(-1.7, -0.2) if kit.chance(0.4) else 0.0
             leaf = Group()
             leaf.add(
                 box(width - 2 * thickness, 0.04, height - thickness),
@@ -86,14 +86,14 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
     for along in np.linspace(0, 1, int(kit.rng.integers(1, 4)) + 1)[1:-1]:
         side.add(box(0.05, 0.05, height), trim, (u0 + width * float(along), deep, v0))
     if kit.chance(0.4):
-        side.add(box(width, 0.04, 0.04), trim, (x, deep, v0 + height * kit.size(0.4, 0.7)))
+        side.add(box(width, 0.04, 0.04), trim, (x, deep, v0 + height * kit.uniform(0.4, 0.7)))
     side.add(box(width + 0.1, deep + 0.1, 0.03), trim, (x, deep / 2 - 0.1, v0 - 0.03))
     # Curtains, or a blind.
     if kit.chance(0.5):
         _curtain(kit, side, u0, u1, v1)
     elif kit.chance(0.4):
         slat = kit.surface("plain", vivid=0.15)
-        for z in np.arange(v0 + height * kit.size(0, 0.6), v1, 0.06):
+        for z in np.arange(v0 + height * kit.uniform(0, 0.6), v1, 0.06):
             side.add(box(width - 0.02, 0.04, 0.002), slat, (x, deep * 0.5, float(z)), pitch=0.6)
     # Things on the sill.
     scatter_z = v0
@@ -109,9 +109,9 @@ def opening(kit: Kit, side: Group, hole: Hole, paint: int) -> None:
 
 def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
     """Adds the walls and the floor that an open door shows."""
-    left = x - kit.size(0.6, 2)
-    right = x + kit.size(0.6, 2)
-    far = deep + kit.size(0.9, 3)
+    left = x - kit.uniform(0.6, 2)
+    right = x + kit.uniform(0.6, 2)
+    far = deep + kit.uniform(0.9, 3)
     top = 2.6
     low = deep + 0.03
     faces = [
@@ -125,7 +125,7 @@ def _hallway(kit: Kit, side: Group, x: float, deep: float, paint: int) -> None:
     side.add(quads([ground]), kit.surface("planks", "carpet", "tiles", vivid=0.1))
     if kit.chance(0.5):
         item = furniture.drawers(kit) if kit.chance(0.5) else seating.chair(kit)
-        side.insert(item, (kit.size(left, right), far, 0))
+        side.insert(item, (kit.uniform(left, right), far, 0))
 
 
 def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
@@ -133,10 +133,13 @@ def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
     cloth = kit.surface("fabric", "plain", "stripes", tile_m=0.8, vivid=0.3)
     bottom = 0.03 if kit.chance(0.6) else top * 0.3
     side.add(rod((u0 - 0.3, -0.08, top + 0.1), (u1 + 0.3, -0.08, top + 0.1), 0.015), kit.metal())
-    for start, end in ((u0 - 0.25, u0 + kit.size(0.1, 0.5)), (u1 - kit.size(0.1, 0.5), u1 + 0.25)):
+    for start, end in (
+        (u0 - 0.25, u0 + kit.uniform(0.1, 0.5)),
+        (u1 - kit.uniform(0.1, 0.5), u1 + 0.25),
+    ):
         s, z = np.meshgrid(np.linspace(0, 1, 60), np.linspace(bottom, top + 0.1, 6))
-        folds = kit.size(4, 9)
-        deep = kit.size(0.02, 0.05)
+        folds = kit.uniform(4, 9)
+        deep = kit.uniform(0.02, 0.05)
         y = -0.08 + deep * np.sin(2 * np.pi * folds * s + z * 0.4) * (1.2 - 0.2 * z)
         side.add(surface(np.stack([start + (end - start) * s, y, z], axis=2)), cloth)
 
@@ -144,20 +147,20 @@ def _curtain(kit: Kit, side: Group, u0: float, u1: float, top: float) -> None:
 def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequence[Hole]) -> None:
     """Adds posters, switches, radiators and shelves where the wall is free."""
     for _ in range(int(kit.rng.integers(0, 6))):
-        u = kit.size(0.3, max(0.4, length - 0.3))
+        u = kit.uniform(0.3, max(0.4, length - 0.3))
         if any(hole[0] - 0.5 < u < hole[2] + 0.5 for hole in holes):
             continue
         choice = kit.rng.random()
-        z = kit.size(1.1, max(1.2, height - 0.7))
-        width = kit.size(0.2, 1.0)
-        h = kit.size(0.2, 0.8)
+        z = kit.uniform(1.1, max(1.2, height - 0.7))
+        width = kit.uniform(0.2, 1.0)
+        h = kit.uniform(0.2, 0.8)
         # A picture, some with a frame.
         if choice < 0.6:
-            thick = kit.size(0.002, 0.04)
+            thick = kit.uniform(0.002, 0.04)
             if thick > 0.01:
                 edge = kit.wood() if kit.chance(0.5) else kit.dark()
                 side.add(box(width + 0.06, thick, h + 0.06), edge, (u, -thick / 2, z - 0.03))
-            poster = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.size(0, 0.05))
+            poster = kit.palette.new("poster", tile_m=h, whole=True, mirror=kit.uniform(0, 0.05))
             side.add(box(width, 0.004, h, fit=h), poster, (u, -thick - 0.002, z))
         elif choice < 0.75:
             # A shelf with things.
@@ -182,14 +185,16 @@ def decorate(kit: Kit, side: Group, length: float, height: float, holes: Sequenc
 def openings(kit: Kit, length: float, height: float) -> list[Hole]:
     """Returns random windows and doors of a wall of this length and height, metres."""
     holes: list[Hole] = []
-    u = kit.size(0.2, 0.8)
+    u = kit.uniform(0.2, 0.8)
     while u < length - 1.0:
         chance = kit.rng.random()
-        width = kit.size(0.7, min(2.0, length - u - 0.2))
+        width = kit.uniform(0.7, min(2.0, length - u - 0.2))
         if chance < 0.22:
-            holes.append((u, kit.size(0.5, 1.0), u + width, min(height - 0.15, kit.size(1.7, 2.4))))
+            holes.append(
+                (u, kit.uniform(0.5, 1.0), u + width, min(height - 0.15, kit.uniform(1.7, 2.4)))
+            )
         elif chance < 0.4:
-            width = min(width, kit.size(0.75, 1.0))
-            holes.append((u, 0.0, u + width, min(height - 0.1, kit.size(1.95, 2.15))))
-        u += width + kit.size(0.3, 1.5)
+            width = min(width, kit.uniform(0.75, 1.0))
+            holes.append((u, 0.0, u + width, min(height - 0.1, kit.uniform(1.95, 2.15))))
+        u += width + kit.uniform(0.3, 1.5)
     return holes

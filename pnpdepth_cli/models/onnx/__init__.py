@@ -271,6 +271,7 @@ def _verify(
     """
 
     def compare() -> list[str]:
+        """Returns the note that is stored; raises ModelError if they do not agree."""
         with spent_on("check"):
             _compare(source, file, module, arguments)
         return [_AGREES]

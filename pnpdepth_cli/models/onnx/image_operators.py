@@ -238,7 +238,7 @@ def group_norm(node: Node, inputs: Inputs) -> Tensor:
     return F.group_norm(x, node.get("num_groups"), weight, bias, node.get("epsilon", 1e-5))
 
 
-@operator("Upsample", "Resize", host=(1, 2, 3))
+@operator("Upsample", "Resize", host_inputs=(1, 2, 3))
 def resize(node: Node, inputs: Inputs) -> Tensor:
     """Returns the input resized along each axis, to stated sizes or by stated factors.
 

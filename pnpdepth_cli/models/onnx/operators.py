@@ -56,32 +56,32 @@ class Node:
         return self.attributes.get(name, default)
 
 
-def operator(*names: str, host: tuple[int, ...] = ()) -> Callable[[Operator], Operator]:
+def operator(*names: str, host_inputs: tuple[int, ...] = ()) -> Callable[[Operator], Operator]:
     """Returns a decorator that enters a function as that of these operators.
 
     Args:
         *names: Names of the operators.
-        host: Indices of the inputs that are read as Python numbers, as in `HOST_INPUTS`.
+        host_inputs: Indices of the inputs that are read as Python numbers, as in `HOST_INPUTS`.
     """
 
     def enter(function: Operator) -> Operator:
         for name in names:
             OPERATORS[name] = function
-            HOST_INPUTS[name] = host
+            HOST_INPUTS[name] = host_inputs
         return function
 
     return enter
 
 
-def register(functions: Mapping[str, Operator], host: tuple[int, ...] = ()) -> None:
+def register(functions: Mapping[str, Operator], host_inputs: tuple[int, ...] = ()) -> None:
     """Enters the functions of operators by their names, for those that are one expression.
 
     Args:
         functions: Functions by the name of the operator.
-        host: Indices of the inputs that are read as Python numbers, as in `HOST_INPUTS`.
+        host_inputs: Indices of the inputs that are read as Python numbers, as in `HOST_INPUTS`.
     """
     for name, function in functions.items():
-        operator(name, host=host)(function)
+        operator(name, host_inputs=host_inputs)(function)
 
 
 def optional(inputs: Inputs, index: int) -> Tensor | None:
@@ -247,7 +247,7 @@ _REDUCTIONS: dict[str, Callable[[Tensor, list[int], bool], Tensor]] = {
 """Functions of a tensor, the axes, and whether these stay as axes of length 1."""
 
 
-@operator(*_REDUCTIONS, host=(1,))
+@operator(*_REDUCTIONS, host_inputs=(1,))
 def reduce(node: Node, inputs: Inputs) -> Tensor:
     """Returns the input reduced over the stated axes, or over all."""
     axes = numbers_of(node, "axes", inputs, 1) or list(range(inputs[0].ndim))
@@ -286,11 +286,11 @@ register(
             numbers_of(node, "axes", i, 1) or [*range(i[0].ndim)]
         ),
     },
-    host=(1,),
+    host_inputs=(1,),
 )
 
 
-@operator("Reshape", host=(1,))
+@operator("Reshape", host_inputs=(1,))
 def reshape(node: Node, inputs: Inputs) -> Tensor:
     """Returns the input in a shape in which one side may be −1, and 0 stands for its own side."""
     x = inputs[0]
@@ -300,7 +300,7 @@ def reshape(node: Node, inputs: Inputs) -> Tensor:
     return x.reshape(shape)
 
 
-@operator("Unsqueeze", host=(1,))
+@operator("Unsqueeze", host_inputs=(1,))
 def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     """Returns the input with axes of length 1, which have these numbers in the result."""
     x = inputs[0]
@@ -311,7 +311,7 @@ def unsqueeze(node: Node, inputs: Inputs) -> Tensor:
     return x
 
 
-@operator("Split", host=(1,))
+@operator("Split", host_inputs=(1,))
 def split(node: Node, inputs: Inputs) -> tuple[Tensor, ...]:
     """Returns the input in parts of stated lengths along an axis, or in equal ones."""
     x = inputs[0]
@@ -324,7 +324,7 @@ _PAD_MODES = {"edge": "replicate", "reflect": "reflect"}
 """Modes of torch's pad by the standard's."""
 
 
-@operator("Pad", host=(1, 2))
+@operator("Pad", host_inputs=(1, 2))
 def pad(node: Node, inputs: Inputs) -> Tensor:
     """Returns the input with elements added at both ends of its axes, or cut off where negative.
 
@@ -376,21 +376,21 @@ def constant(node: Node, inputs: Inputs) -> Tensor:
     return torch.as_tensor(value)
 
 
-@operator("ConstantOfShape", host=(0,))
+@operator("ConstantOfShape", host_inputs=(0,))
 def constant_of_shape(node: Node, inputs: Inputs) -> Tensor:
     """Returns a tensor whose shape is the input, filled with one value, by default 0."""
     value: Tensor = node.get("value", torch.zeros(1))
     return value.reshape(()).expand(whole_numbers(inputs[0])).clone()
 
 
-@operator("Range", host=(0, 1, 2))
+@operator("Range", host_inputs=(0, 1, 2))
 def number_range(node: Node, inputs: Inputs) -> Tensor:
-    """Returns the numbers from a start to below a limit, with a step."""
+    """Returns the numbers (n,) from a start to below a limit, with a step: the three inputs."""
     start, limit, delta = (number.reshape(()).item() for number in inputs)
     return torch.arange(start, limit, delta, dtype=inputs[0].dtype, device=inputs[0].device)
 
 
-@operator("Slice", host=(1, 2, 3, 4))
+@operator("Slice", host_inputs=(1, 2, 3, 4))
 def slice_(node: Node, inputs: Inputs) -> Tensor:
     """Returns a part of the input: from start to end with a step, along each of some axes."""
     x = inputs[0]

@@ -42,7 +42,7 @@ _READERS: dict[str, tuple[str, _Reader]] = {
 WEIGHT_SUFFIXES = (*_READERS, ".pth", ".pt", ".bin", ".ckpt", ".tar")
 
 _BATCH_COUNTER = "num_batches_tracked"
-"""How the name of the counter of a batch normalisation ends."""
+"""How the name of the counter of a batch normalisation ends, which matters in training only."""
 _SHOWN_NAMES = 4
 """Names out of a file that a message shows."""
 _MAX_WORD = 60
@@ -252,6 +252,7 @@ def _misfits(
         parameters: Names of the network's parameters, which must be finite.
     """
     both = [name for name in own if name in state]
+    # Files from before PyTorch 0.4.1 have no counters of batch normalisations.
     faulty_names = {
         "missing": [
             name for name in own if name not in state and not name.endswith(_BATCH_COUNTER)

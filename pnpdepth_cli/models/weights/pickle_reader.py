@@ -241,7 +241,10 @@ class _Unpickler(pickle._Unpickler):
         return dict(zip(keys, keys_and_values[1::2], strict=True))
 
     def load_build(self) -> None:
-        """Opcode BUILD: takes a state from the stack, and keeps it in the stand-in below."""
+        """Opcode BUILD: takes an object's state from the stack, for the object below it.
+
+        A stand-in keeps it. Tensors and plain containers need none.
+        """
         state = self.stack.pop()
         if isinstance(self.stack[-1], StandIn):
             self.stack[-1].state = state

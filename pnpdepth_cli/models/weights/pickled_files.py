@@ -172,6 +172,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
     allocated = 0
 
     def allocate(key: str, byte_count: int) -> bytearray:
+        """Returns the empty bytes of a storage; raises if the file cannot hold as many."""
         nonlocal allocated
         check_claim(f"a storage has {byte_count:,} bytes", byte_count, len(file) - allocated)
         allocated += byte_count
