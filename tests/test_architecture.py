@@ -52,6 +52,7 @@ MAY_IMPORT = {
         "sensors",
         "io",
         "dataset",
+        "refiner",  # the self-test of `doctor`
     },
     "cli": {*GROUND_FLOOR, "commands", "dataset"},
     "refiner": {*GROUND_FLOOR, "completion", "models", "frames", "dataset"},

@@ -12,9 +12,11 @@ import numpy as np
 import psutil
 import torch
 
-import pnpdepth_cli
 from pnpdepth_cli.commands.shared.tables import count_of
 from pnpdepth_cli.models import decisions
+from pnpdepth_cli.models.network import load_network
+from pnpdepth_cli.refiner import Refiner
+from pnpdepth_cli.version import __version__
 
 _DEVELOPERS = ("test", "docs", "train")
 """Extras that no command needs."""
@@ -35,7 +37,7 @@ def examine(*, clear_cache: bool = False) -> dict[str, list[str]]:
         decisions.forget()
     memory = psutil.virtual_memory()
     return {
-        "pnpdepth": [pnpdepth_cli.__version__],
+        "pnpdepth": [__version__],
         "python": [f"{platform.python_version()}, {platform.system()} {platform.machine()}"],
         "packages": list(_packages()),
         "devices": _devices(),
@@ -87,8 +89,8 @@ def _self_test() -> str:
     rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=2)
     # Its refinement, and the error.
     start = time.perf_counter()
-    network = pnpdepth_cli.load_network("compact")
-    refined = pnpdepth_cli.refine(network, rgb, depth * is_measured)
+    with Refiner(load_network("compact", None)) as refiner:
+        refined = refiner.refine(rgb, depth * is_measured)
     seconds = time.perf_counter() - start
     error = float(np.abs(refined.depth - depth).mean())
     verdict = "passed" if error < _WRONG_M else "FAILED: the depth is wrong"
