@@ -134,6 +134,7 @@ class Alignment:
             x: The network's numbers.
         """
         low, high = self._limits
+        # x, too, is clamped: a line in 1/x or log x needs it above 0.
         line = self._line(_clamp_value(x, low=self._least_x))
         return from_space(_clamp_value(line, low, high), _READINGS[self.reading].depth_space)
 
@@ -230,7 +231,8 @@ def candidates(
     # What is stated; the scale of a power is its exponent, which is negative for a disparity.
     sign = 0 if reading == "power" else 1
     fits = [Candidate(reading, kind, sign) for kind in kinds if _has_kind(reading, kind)]
-    # Networks stretch or compress the range, which a power of what they state shows.
+    # A network may stretch or compress the range of depth; then it gives a power of what is stated.
+    # Log depth has none, as it may be below 0.
     if align_setting == "auto" and reading != "log":
         fits.append(Candidate("power", "affine", -1 if reading == "disparity" else 1))
     return tuple(fits)
@@ -291,7 +293,7 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
     if best_of_reading:
         best, *others = best_of_reading.values()
         return [best, *(fit for fit in others if _is_alike(fit, best, x, depth))]
-    # There is none.
+    # No candidate fits; the error is that of the first.
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
@@ -377,7 +379,7 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
     if line is None or not all(map(math.isfinite, line)):
         return None
     scale, _ = line
-    if candidate.sign and scale * candidate.sign <= 0:
+    if candidate.sign and scale * candidate.sign <= 0:  # the points contradict the sign
         # Depth that is the same everywhere needs a shift, and says something of two points or more.
         has_level = candidate.kind == "affine" and len(x) > 1
         return _level(x, depth, candidate) if has_level else None
@@ -505,7 +507,7 @@ def _bic(fit: Alignment) -> float:
     Errors of log depth are taken as distributed by Laplace, whose log likelihood of N of them is
     −N·log(mean error) and a constant.
     """
-    parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
+    parameters = {"none": 0, "scale": 1, "median": 1, "affine": 2}[fit.kind]
     error = max(fit.misfit, _LEAST_ERROR)
     if fit.points <= parameters:  # it goes through all points, which says nothing of its error
         error = _UNTESTED

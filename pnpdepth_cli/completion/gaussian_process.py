@@ -192,6 +192,7 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     known = log_depth.isfinite()
     known_values = log_depth if bool(known.all()) else log_depth[known]  # picking pixels is slow
     known_values = known_values.double().flatten()
+    # The standard deviation by a dot product, which is faster than `Tensor.std`.
     mean = known_values.mean()
     mean_square = known_values.dot(known_values) / len(known_values)
     std = (mean_square - mean.square()).clamp_min(0).sqrt()
@@ -273,10 +274,10 @@ def predict(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor
         queries: Points at whose coordinates the residual is wanted. None: every pixel.
     """
     if queries is not None:
-        features = _sample(residuals.features, queries)
+        features = _sample(residuals.features, queries)  # (M, 3 or 6)
         if _uses_all_points(residuals) or len(residuals.points) <= NEIGHBOURS:
             return _solve(residuals, _all_points(residuals), features[None])[0]
-        # Each query is a block of its own, predicted from its nearest points.
+        # Each query is predicted from its own nearest points: M blocks of one place each.
         _, near = nearest_points(residuals.points, queries.xy.double(), NEIGHBOURS)
         return _solve(residuals, near, features[:, None])[:, 0]
     # Every pixel's, on a grid with the mean features of several pixels.
@@ -296,10 +297,10 @@ def leave_one_out(
 ) -> tuple[Tensor, Tensor]:
     """Returns error and variance of points, each predicted from the others of its neighbourhood.
 
-    Both are (B, k), or (B, `_INNER`) of the points in the middle where there are several
-    neighbourhoods. The error is the residual minus the predicted one, the variance the predicted
-    one's, in units of the Gaussian process's. They are computed without solving again: Rasmussen
-    and Williams, eq. 5.12.
+    Both are (B, k) float64, or (B, `_INNER`) of the points in the middle where there are several
+    neighbourhoods. The error is the residual minus the predicted one. The variance is that of this
+    error, with a point's noise as if its weight were 1, in units of the variance of the Gaussian
+    process. They are computed without solving again: Rasmussen and Williams, eq. 5.12.
 
     Args:
         residuals: The residuals at N points, with the kernel of a Gaussian process.
@@ -354,15 +355,17 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
 
 
 def _predict_grid(residuals: Residuals) -> Tensor:
-    """The mean residual (H, W) at every pixel of `residuals.features`, each predicted by itself."""
+    """The mean residual (H, W) float32 at every pixel of `residuals.features`, without a grid."""
     height, width = residuals.points.size
     if _uses_all_points(residuals):
         queries = residuals.features.flatten(1).T.contiguous()[None]  # (1, HW, F)
         return _solve(residuals, _all_points(residuals), queries).reshape(height, width)
-    # Two layers of blocks, each of which counts where the other one has its seams.
+    # Square blocks of pixels, each predicted from the points nearest to it. There are two layers,
+    # half a block apart: the weight of a pixel falls towards the seams of its layer, and where one
+    # layer has seams the other counts.
     side = _block_side(residuals.points)
-    values, weight = _predict_blocks(residuals, side, 0)
-    shifted_values, shifted_weight = _predict_blocks(residuals, side, side // 2)
+    values, weight = _predict_blocks(residuals, side, shift=0)
+    shifted_values, shifted_weight = _predict_blocks(residuals, side, shift=side // 2)
     total = weight + shifted_weight
     return values * (weight / total) + shifted_values * (shifted_weight / total)
 

@@ -101,6 +101,7 @@ class ImageRegistration:
     """Shift downwards in pixels of the image."""
 
     def __str__(self) -> str:
+        """`zoom,right,down`, as messages show it."""
         return f"{self.zoom:.3f},{self.right:.1f},{self.down:.1f}"
 
     def apply_to(self, rgb: Image) -> Image:
@@ -206,7 +207,7 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     """
     telling = [frame for frame in frames if frame is not None]
     usable = [frame for frame in telling if frame.size == telling[0].size]
-    if not usable:
+    if not usable:  # no frame tells anything
         return None
     # Beside jumps of depth there must be points.
     jumps = sum(frame.jumps for frame in usable)

@@ -79,8 +79,8 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
 def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
     """Returns (N,) bool: points that agree with points around them, but not with a prediction.
 
-    As those seen in a mirror or through a pane. No geometry of the points tells these from a
-    corridor behind a door; a prediction that is right everywhere else does.
+    Such are the points seen in a mirror or through a pane. No geometry of the points tells these
+    from a corridor behind a door; a prediction that is right everywhere else does.
 
     They are all farther than predicted, or all nearer, whichever are more.
 
@@ -89,6 +89,7 @@ def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
         error: Errors (N,), log measured − log predicted depth.
         least: |Error| above which a point does not agree with the prediction.
     """
+    # Too few points have no neighbours; without an error no point is off.
     none = torch.zeros(len(points), dtype=torch.bool)
     if len(points) <= _AROUND or not bool((error.abs() > least).any()):
         return none
@@ -126,7 +127,7 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
         points: The N points.
         residual: Residual (N,) of the points, log measured − log predicted depth.
     """
-    if len(points) <= _AGREEING:
+    if len(points) <= _AGREEING:  # no point has neighbours enough to be contradicted
         return torch.ones_like(residual)
     near = neighbours_of(points, min(_COMPARED, len(points) - 1))
     # By how much a point differs from the neighbour that agrees with it second best.

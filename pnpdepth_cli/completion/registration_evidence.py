@@ -119,7 +119,8 @@ class Evidence:
         pixel = (y * map_columns + x)[inside]
         weights = np.bincount(pixel, self.weight[inside], map_rows * map_columns)
         template = weights.reshape(map_rows, map_columns).astype(np.float32)
-        # Their correlation with the edges at all shifts, from −most to +most.
+        # Their correlation with the edges at all shifts, from −most to +most. The map reaches over
+        # the image by `most` and moves by as much, so the edges need twice that border of zeros.
         top = 2 * most_down
         left = 2 * most_right
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
@@ -272,14 +273,15 @@ def _edges(rgb: Image) -> Image:
     # CIELAB over 100; OpenCV's own conversion takes 0.1 s when it is called first.
     channels = torch.from_numpy(np.clip(rgb, 0, 1)).permute(2, 0, 1)
     lab = np.ascontiguousarray(cielab(channels).permute(1, 2, 0)) / 100
-    # The length of the gradient, of all three channels; Sobel's weights sum to 8.
+    # The length of the gradient in x and y, of all three channels; Sobel's weights sum to 8.
     blurred = cv2.GaussianBlur(lab, (0, 0), _EDGE_SIGMA)
     gradients = [
         cv2.Sobel(blurred, cv2.CV_32F, dx, dy, scale=0.125, borderType=cv2.BORDER_REFLECT)
         for dx, dy in ((1, 0), (0, 1))
     ]
-    strength = np.sqrt(np.square(gradients).sum((0, 3)))
-    # Relative to the surroundings, whose mean is taken off.
+    strength = np.sqrt(np.square(gradients).sum((0, 3)))  # over (direction, h, w, channel)
+    # Relative to the surroundings, so that an edge of little contrast counts where it is alone. The
+    # mean around is taken off, so that even texture counts nothing.
     relative = strength / (cv2.GaussianBlur(strength, (0, 0), _EDGE_REACH) + _FAINT_EDGE)
     edges = relative - cv2.GaussianBlur(relative, (0, 0), _EDGE_BAND)
     return np.asarray(edges / (edges.std() + TINY), np.float32)
