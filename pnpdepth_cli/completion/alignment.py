@@ -167,10 +167,12 @@ class Alignment:
         x_space = _READINGS[self.reading].x_space
         if x_space == "depth":
             return -math.inf
-        # Where the line meets its limits, as log x or as 1/x.
+        # Where the line meets its limits, as log x or as 1/x. The least x is that of the lesser
+        # log x, or of the greater 1/x.
         ends = [(limit - self.shift) / self.scale for limit in self._limits]
         if x_space == "log":
-            return math.exp(min(max(min(ends), -_LARGEST_LOG), _LARGEST_LOG))
+            least_log = max(min(ends), -_LARGEST_LOG)
+            return math.exp(min(least_log, _LARGEST_LOG))
         return 1 / max(ends) if max(ends) > 0 else math.inf
 
     @property
@@ -366,7 +368,7 @@ def _has_kind(reading: str, kind: str) -> bool:
 
 
 def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
-    """The best alignment with a candidate's reading, parameters and sign; None where there is none.
+    """The best alignment with a candidate's reading, parameters and sign; None where none fits.
 
     Where the points contradict the sign, it is the one with the same depth everywhere.
 
@@ -376,7 +378,7 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
         candidate: The candidate.
     """
     line = _scale_and_shift(x, depth, candidate.reading, candidate.kind)
-    if line is None or not all(map(math.isfinite, line)):
+    if line is None or not all(map(math.isfinite, line)):  # such as in log x of numbers below 0
         return None
     scale, _ = line
     if candidate.sign and scale * candidate.sign <= 0:  # the points contradict the sign

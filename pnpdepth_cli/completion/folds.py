@@ -172,7 +172,7 @@ class _PixelAxis(NamedTuple):
 
 
 def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """All of the holes (R, C) if they have room, else whole ones in random order that still have.
+    """All of the holes (R, C) if they have room, else whole ones as they fit in random order.
 
     Args:
         holes: Where holes are, (R, C) bool. Pixels that touch, also by a corner, are one hole.

@@ -318,7 +318,10 @@ def leave_one_out(
     error = (inverse @ residuals.residual[near][..., None])[..., 0] * variance
     # Of several neighbourhoods the middle counts, as points at the edge have others outside.
     inner = _INNER if near.shape[0] > 1 else None
-    return error[:, :inner], (variance - extra_noise)[:, :inner]
+    # What a point counts for the others says nothing of its own error, so its extra noise is not
+    # in the variance.
+    variance = variance - extra_noise
+    return error[:, :inner], variance[:, :inner]
 
 
 def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:

@@ -290,12 +290,13 @@ def _edges(rgb: Image) -> Image:
 def _neighbours(positions: Floats) -> tuple[NDArray[np.intp], Floats]:
     """The pairs of neighbouring points, numbers (M, 2), and their distances (M,).
 
-    They are the sides of Delaunay's triangles of positions (N, 2), without the longest ones.
+    They are the sides of Delaunay's triangles of positions (N, 2), without the longest ones, which
+    are hardly neighbours, such as those along the hull.
     """
     # QJ: Qhull moves points at random, so that points on one line or circle have triangles, too.
     triangles = Delaunay(positions, qhull_options="QJ").simplices
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    sides = np.sort(sides)
+    sides = np.sort(sides)  # a side of two triangles is in both, in either order
     pairs = np.unique(sides, axis=0).astype(np.intp)
     length = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
     is_near = length <= np.quantile(length, _LONGEST_PAIR)

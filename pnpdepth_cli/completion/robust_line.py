@@ -108,7 +108,7 @@ class _LineFit:
         """
         if self._space == "log":
             return _weighted_least_squares(self._x, self._y, torch.ones_like(self._y))
-        return _weighted_least_squares(self._x, self._y, self._y**-2)
+        return _weighted_least_squares(self._x, self._y, self._y**-2)  # squares of errors over y
 
     def least_median(self) -> tuple[float, float] | None:
         """Returns scale and shift of the line through two points with the least median error.

@@ -128,6 +128,7 @@ class Split:
         replay.z = z
         if replay.complete:
             return self._run(replay)
+        # The first rear also learns which calls behind the cut can be cached.
         recorder = self._recorder(replay)
         output = self._run(replay, recorder)
         recorder.finish_rear()

@@ -246,7 +246,8 @@ class Recorder:
         self._replay = replay
         self._uncacheable = uncacheable
         self._saved = dict(replay.outputs)  # recorded calls, like `Replay.outputs`
-        self._calls_before = len(self._saved)  # this pass; in the rear's, those up to the cut
+        self._calls_before = len(self._saved)
+        """Number of calls recorded before this pass; in the rear's, those up to the cut."""
         self._is_inside_cached = False  # in a submodule that is to be cached as a whole
 
     def run_watched(self, module: nn.Module, run: Run) -> object:

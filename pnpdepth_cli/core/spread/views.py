@@ -52,6 +52,7 @@ def concatenate(call: Call) -> Spread:
         if tensor is call.source:
             axes = call.spread.axes()
             first, last = axes[axis]
+            # An empty box keeps its last index of −1; any larger first one leaves it empty.
             last = torch.where(call.spread.empty(), last, last + offset)
             axes[axis] = (first + offset, last)
             spread = Spread.from_axes(axes).joined(spread)
