@@ -548,7 +548,7 @@ def _relative_errors(fit: Alignment, x: Tensor, depth: Tensor) -> Tensor:
 
 def _bounds(depth: Tensor) -> Tensor:
     """(nearest, farthest) metres that aligned depth can have, from the depth (N,) of the points."""
-    factor = BEYOND * (1 + 1 / len(depth))
+    factor = BEYOND * (1 + 1 / len(depth))  # a few points do not show the range of the scene
     return torch.stack([depth.min() / factor, depth.max() * factor])
 
 

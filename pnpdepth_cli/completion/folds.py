@@ -25,12 +25,12 @@ from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines
 
-_GROWTH = 1.5  # of a cell's side from trial to trial
-_MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
+_GROWTH = 1.5  # factor on a cell's side from trial to trial
+_MAX_SIDE = 0.25  # of a cell, over the image's shorter side
 _SAMPLED = 2000  # pixels and points whose distances are measured
-_BOX_FROM = 0.02  # quantiles of the points' coordinates, between which pixels are sampled
-_BOX_TO = 0.98
-_SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
+_BOX_FROM = 0.02  # quantile of the points' coordinates from which on pixels are sampled
+_BOX_TO = 0.98  # quantile up to which they are
+_SLACK = 1.15  # wanted distance over that of a fold, up to which cells need not grow
 _MAX_PIXELS_A_POINT = 2.0  # of a depth map, of whose pixels at least half are known
 _MAX_ASPECT = 1.5  # longer over shorter side of a map's pixel; scan lines are farther apart
 _MIN_SURROUNDED = 0.5  # fraction of a map's known pixels whose four neighbours are known

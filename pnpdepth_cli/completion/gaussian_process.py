@@ -57,28 +57,28 @@ NEIGHBOURS = 48
 MIN_POINTS = 5
 """Fewer points do not determine the length scales."""
 
-# All points predict every pixel
-_MAX_EXACT = 128  # of so many points at most,
-_MAX_EXACT_SMALL = 256  # or so many where the image is small:
-_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels, at most
-_AT_ONCE = 1 << 19  # covariances computed at once: what bounds the memory
+# Whether all points predict every pixel.
+_MAX_EXACT = 128  # points up to which they do
+_MAX_EXACT_SMALL = 256  # points up to which they do in a small image
+_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels up to which an image is small
+_AT_ONCE = 1 << 19  # covariances computed at once, which bounds the memory
 
-# The kernel of many points is chosen
-_NEIGHBOURHOODS = 24  # in so many neighbourhoods,
-_INNER = 16  # by the points in the middle of each, left out one by one
-_MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+# How the kernel of many points is chosen.
+_NEIGHBOURHOODS = 24  # neighbourhoods whose points are left out one by one
+_INNER = 16  # points in the middle of each that are left out
+_MIN_SCORED_WEIGHT = 1e-6  # weight that stands for 0, whose noise would be infinite
 
-# A block of pixels
-_IN_BLOCK = 3  # contains at most 1/3 of the points that predict it,
-_CROWDED = 0.05  # except for blocks with this fraction of all points,
-_MIN_BLOCK_PX = 8  # and has at least this side
+# The blocks of pixels that are predicted from the same points.
+_IN_BLOCK = 3  # a block with more than 1/3 of the points that predict it is crowded
+_CROWDED = 0.05  # fraction of all points that crowded blocks may have
+_MIN_BLOCK_PX = 8  # least side of a block
 _BLOCK_SHRINKS = 1.4  # factor between sides that are tried
 
-# The grid on which the residual is predicted
-_WORTH_A_GRID = 1 << 16  # pixels; of fewer, every pixel is predicted
-_NODES_BETWEEN = 6  # nodes of the grid between two points,
-_NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
-_MAX_STEP_PX = 4  # most between two nodes: on real frames as good as every pixel
+# The grid on which the residual is predicted.
+_WORTH_A_GRID = 1 << 16  # pixels from which on there is one; of fewer, every pixel is predicted
+_NODES_BETWEEN = 6  # nodes between two points
+_NODES_BETWEEN_LINES = 2  # rows of nodes between two scan lines
+_MAX_STEP_PX = 4  # most from node to node: on real frames as good as every pixel
 
 LOG_DEPTH = 2
 """Index of the predicted log depth among the features."""
@@ -146,8 +146,8 @@ class Residuals:
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
     """Returns log measured − log predicted depth at the points in the image with a prediction.
 
-    Features and default kernel of a Gaussian process are with it. Of several points at the same
-    coordinates the one of least depth counts.
+    The features of the image and the default kernel of a Gaussian process come with it. Of several
+    points at the same coordinates the one of least depth counts.
 
     Args:
         prediction: Depth (H, W) in metres; not positive or not finite is unknown.
@@ -158,7 +158,7 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
         NoPointsError: No point has a prediction.
     """
     prediction = prediction.detach().cpu()
-    # The points that count.
+    # The points that count. Those on the right and the bottom edge of the image are inside, too.
     points = points.tensors()
     inside = in_frame(points.xy, points.size, closed=True)
     known, points = where_predicted(prediction, points.where(inside))
@@ -389,7 +389,8 @@ def _solve(residuals: Residuals, near: Tensor, queries: Tensor) -> Tensor:
     queries_at_once = max(1, _AT_ONCE // (blocks_at_once * count))
     for first in range(0, blocks, blocks_at_once):
         some_blocks = slice(first, first + blocks_at_once)
-        # α of these blocks, and from it the mean of β₀ and β₁, the constant and the slope over u.
+        # α of these blocks, and from it the means of β₀ and β₁, the constant and the slope over u:
+        # var β₀ · Σα and var β₁ · Σ u·α.
         systems = _systems(residuals, near[some_blocks])
         factor = torch.linalg.cholesky(systems.covariance)
         alpha = torch.cholesky_solve(residuals.residual[near[some_blocks]][..., None], factor)

@@ -131,9 +131,11 @@ def better_orientation(frames: Sequence[Evidence]) -> str | None:
     Args:
         frames: Evidence of one frame or more, all of one size.
     """
+    # An image that belongs to its points as it is has no other orientation.
     as_it_is = _orientation_factor(frames, _unchanged)
     if as_it_is > REGISTERED:
         return None
+    # The best of the others must have evidence of its own, and far more than the image as it is.
     factors = {
         words: _orientation_factor(frames, orient)
         for words, orient in _orientations(frames[0].size).items()

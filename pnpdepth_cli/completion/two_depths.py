@@ -17,7 +17,7 @@ FEWEST_PAIRS = 10
 _CLEAR = 0.5
 """Rank correlation, of either sign, from which the order of two depths is clear."""
 _STANDARD_ERRORS = 4.0
-"""Of the rank correlation, by which chance does not explain it."""
+"""Standard errors of a rank correlation above which chance does not explain it."""
 OTHER_UNIT = math.log(1.5)
 """Log ratio that noise does not explain."""
 TIGHT = 0.25
@@ -51,6 +51,7 @@ class Agreement(NamedTuple):
     @property
     def is_unit(self) -> bool:
         """Whether a factor, far from 1, explains the difference of the two, as of another unit."""
+        # Of few pairs the ratio says nothing, and near 1 it is noise.
         if self.pairs < FEWEST_PAIRS or abs(math.log(self.ratio)) <= OTHER_UNIT:
             return False
         # Both have one order. Of a wall the order is noise, but its ratio is the same everywhere.
@@ -72,7 +73,7 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
     count = pairs.shape[1]
     if not count:
         return Agreement(pairs=0, rank=0.0, ratio=math.nan, spread=math.nan)
-    # Of many pairs every second, third, …
+    # Of many pairs every second, third and so on, by the step of the slice.
     compared = pairs[:, :: max(1, count // _MOST)]
     log_ratio = np.log(compared[0]) - np.log(compared[1])
     low, middle, high = np.quantile(log_ratio, _QUANTILES).tolist()

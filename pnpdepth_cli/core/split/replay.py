@@ -351,6 +351,7 @@ class Recorder:
         """Whether the call of this submodule that has just run is the one to cut at."""
         if self._replay.cut_call is not None or module is not self._cut.module:
             return False
+        # Without a number the cut is the first call; if there are more, `finish_rear` raises.
         return self._cut.call in (None, self._replay.calls[module])
 
     def _may_be_cached(self, module: nn.Module) -> bool:

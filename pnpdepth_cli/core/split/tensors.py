@@ -143,6 +143,7 @@ class NetworkState:
     def __init__(self, network: nn.Module) -> None:
         modules = list(network.modules())
         parameters = list(network.parameters())
+        # The values, which are copied only where a `Watch` sees that they are about to change.
         self._originals = [*parameters, *network.buffers()]
         self.tensors = [SavedTensors(tensor) for tensor in self._originals]
         self._gradient_flags = [(parameter, parameter.requires_grad) for parameter in parameters]
