@@ -285,6 +285,7 @@ def _posterior(frames: Sequence[Evidence]) -> _Posterior:
         + ((down / height / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
         + ((right / width / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
+    # The last term is that constant, by which the prior sums to 1.
     logits = log_likelihood - penalty - logsumexp(-penalty)
     return _Posterior(logits, down, right)
 
@@ -310,9 +311,10 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
         right: Shift to the right in pixels of the reduced image.
         down: Shift downwards, likewise.
     """
-    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)  # of each part
+    # The gain of each part (P,), and by how many standard errors their sum exceeds chance.
+    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
     standard_errors = gains.sum() / (np.linalg.norm(gains) + TINY)
-    # Of more points, more is asked, and of fewer less.
+    # More points see more of chance, so that more is asked of them, and of fewer points less.
     points = np.mean([frame.points for frame in frames])
     more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
     return bool(standard_errors >= _LEAST_STANDING + more)

@@ -385,7 +385,7 @@ def _order(points: SparsePoints) -> SparsePoints:
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
     xy = points.xy.cpu().numpy()
     depth = points.depth.cpu().numpy()
-    order = np.lexsort(xy.T[::-1])  # faster than torch.unique
+    order = np.lexsort(xy.T[::-1])  # by x, then by y; faster than torch.unique
     xy = xy[order]
     depth = depth[order]
     # The first of each run of equal coordinates, and the least depth of the run.

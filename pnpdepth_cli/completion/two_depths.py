@@ -54,7 +54,8 @@ class Agreement(NamedTuple):
         # Of few pairs the ratio says nothing, and near 1 it is noise.
         if self.pairs < FEWEST_PAIRS or abs(math.log(self.ratio)) <= OTHER_UNIT:
             return False
-        # Both have one order. Of a wall the order is noise, but its ratio is the same everywhere.
+        # Two depths that differ by a unit have one order; of a wall the order is noise, but then
+        # the ratio is the same everywhere.
         is_alike = self.rank >= _CLEAR or self.spread < _EXACT
         return is_alike and self.spread <= TIGHT
 

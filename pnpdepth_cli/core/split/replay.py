@@ -341,7 +341,11 @@ class Recorder:
         self.finish(complete=True)
 
     def finish(self, *, complete: bool) -> None:
-        """Gives the replay the recorded calls; complete: also those behind the cut."""
+        """Gives the replay the recorded calls.
+
+        Args:
+            complete: Whether these are all calls, those behind the cut included.
+        """
         self._replay.outputs = self._saved
         self._replay.complete = complete
         # No value may reach Python in front of the cut or behind it.
