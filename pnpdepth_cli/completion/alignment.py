@@ -48,10 +48,10 @@ _UNTESTED = 0.2
 """Error of log depth that is assumed of a fit with as many parameters as points."""
 
 _GROSS = 0.05
-"""Errors of log depth below this are no outliers."""
+"""Error of log depth that an outlier exceeds."""
 
 _GROSS_STDS = 3.0
-"""Errors below so many standard deviations are none either."""
+"""Standard deviations of all errors that the error of an outlier exceeds, too."""
 
 _ALIKE = 1.0
 """Standard errors of the difference between two fits' criteria within which they are alike."""

@@ -83,7 +83,7 @@ _MAX_STEP_PX = 4  # most from node to node: on real frames as good as every pixe
 LOG_DEPTH = 2
 """Index of the predicted log depth among the features."""
 _FLAT_DEPTH = 1e-3  # added to the standard deviation of log depth: a flat one has no edges
-_FLAT_COLOUR = 1.0  # added to that of CIELAB, likewise
+_FLAT_COLOUR = 1.0  # added to the standard deviation of CIELAB: a plain image has no edges
 _LEAST_XYZ = 1e-6  # of which the cube root is taken: below it is not used, and below 0 is NaN
 _XYZ_OF_RGB = (
     (0.4124564, 0.3575761, 0.1804375),
@@ -434,7 +434,7 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
 
     Args:
         a: Features (B, Q, F) of Q places in each of B blocks, over their length scales.
-        b: Features (B, k, F) of k points in each block, likewise.
+        b: Features (B, k, F) of k points in each block, over their length scales.
     """
     # Small numbers, so that the squares cancel well in |a|² + |b|² − 2a·b.
     middle = b.mean(dim=1, keepdim=True)

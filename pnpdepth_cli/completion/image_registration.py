@@ -39,9 +39,10 @@ It is the evidence that an image belongs to its points: the log of the Bayes fac
 unrelated one."""
 
 CHANCE = 3.0
-"""Evidence, likewise, that an unrelated image reaches by chance somewhere.
+"""Evidence that an unrelated image reaches by chance at some registration.
 
-So the best of all registrations must have it for one frame, and twice it for more."""
+It is a log of the Bayes factor, too. So the best of all registrations must have it for one frame,
+and twice it for more."""
 
 _LEAST_MOVED = 0.02
 """Root mean square, over the image's longer side, by which a registration moves pixels at least.
@@ -51,10 +52,10 @@ moves the images of a registered camera by 0.01 to 0.02, rarely 0.034, another w
 (TUM fr1_rpy)."""
 
 _TURNED = 4.0
-"""Evidence for another orientation, at least."""
+"""Evidence that another orientation must have, at least."""
 
 _TURNED_MORE = 5.0
-"""By how much it must exceed the evidence for the image as it is."""
+"""By how much the evidence for another orientation must exceed that for the image as it is."""
 
 _LEAST_SHORT = 1 / 3
 """Share of the jumps that lie between points nearer to each other than half of all neighbours are.
@@ -76,14 +77,15 @@ _SHIFT_SIGMA = 0.025
 _LEAST_STANDING = 2.4
 """Standard errors of the gain of a registration, at least, with `_POINTS_OF_STANDING` a frame."""
 _MORE_STANDING = 1.66
-"""By how much it is more for each e-fold of more points, which see more of chance as well."""
+"""Standard errors that are added for each e-fold of more points, which see more of chance."""
 _POINTS_OF_STANDING = 500
+"""Points of a frame for which none are added."""
 
 # What the likelihood of an image's own place tells.
 _NO_EVIDENCE = 25
-"""Points that tell nothing."""
+"""Points of a frame up to which an image's own place is like any other."""
 _EVIDENCE = 0.85
-"""Standard deviations that each e-fold of more points tells."""
+"""Standard deviations that the likelihood of that place rises by each e-fold of more points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +311,7 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
         frames: Evidence of the frames.
         zoom: Zoom of the registration.
         right: Shift to the right in pixels of the reduced image.
-        down: Shift downwards, likewise.
+        down: Shift downwards in pixels of the reduced image.
     """
     # The gain of each part (P,), and by how many standard errors their sum exceeds chance.
     gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)

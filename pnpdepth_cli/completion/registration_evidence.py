@@ -28,7 +28,7 @@ _LONGEST_PX = 320
 _MIN_POINTS = 10
 """Fewer points tell nothing."""
 _MOST_POINTS = 2000
-"""Of more points, so many evenly spaced ones are used."""
+"""Points that are used at most; of more, evenly spaced ones in their order."""
 _LEAST_HULL = 0.5
 """Area of the points' hull over the image's, at least: points of one part say little of the zoom"""
 _MOST_AT_EDGES = 4.0
@@ -44,19 +44,19 @@ _SMALLEST_CHANGE = 0.03
 _LENGTH_OFFSET = 0.1
 """Pixels of the reduced image that are added to a length, so that it has a logarithm."""
 _LEAST_SPREAD = 0.4
-"""Standard deviation of the log of that change, at least; a noisy wall has 0.4, rooms 0.6."""
+"""Standard deviation of the log of the changes, at least; a noisy wall has 0.4, rooms 0.6."""
 _LARGEST_EVIDENCE = 2.5
-"""Standard deviations of that log beyond which a pair counts no more."""
+"""Standard deviations of the log of the changes beyond which a pair counts no more."""
 _LEAST_CONTRAST = 0.02
 """Range of the values 0…1 of an image with edges."""
 
 # Edges of the image: standard deviations of Gaussians in pixels of the reduced image.
 _EDGE_SIGMA = 1.0
-"""Of the blur before the gradient is taken."""
+"""Standard deviation of the blur before the gradient is taken."""
 _EDGE_REACH = 8.0
-"""Of the surroundings that an edge's strength is relative to."""
+"""Standard deviation of the surroundings that an edge's strength is relative to."""
 _EDGE_BAND = 6.0
-"""Of the mean that is taken off."""
+"""Standard deviation of the surroundings whose mean relative strength is taken off."""
 _FAINT_EDGE = 0.01
 """Strength that is added to the surroundings': where there is nothing, noise is no edge."""
 TINY = 1e-9
@@ -134,7 +134,7 @@ class Evidence:
         Args:
             zoom: Zoom of the registration.
             right: Shift to the right in pixels of the reduced image.
-            down: Shift downwards, likewise.
+            down: Shift downwards in pixels of the reduced image.
         """
         of_samples = self._sample_likelihoods(zoom, right, down)
         of_samples = of_samples - self._sample_likelihoods(1.0, 0, 0)
@@ -155,7 +155,7 @@ class Evidence:
         Args:
             zoom: Zoom of the registration.
             right: Shift to the right in pixels of the reduced image.
-            down: Shift downwards, likewise.
+            down: Shift downwards in pixels of the reduced image.
         """
         rows, columns = self.edges.shape
         x, y = (self._zoomed_pixels(zoom) + np.array([right, down])).T

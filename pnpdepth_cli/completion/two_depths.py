@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MOST = 20_000
-"""Pairs that are compared, up to twice as many; more tell no more."""
+"""Pairs that are compared at least, where there are as many; always fewer than twice this."""
 _QUANTILES = (0.16, 0.5, 0.84)
-"""Of normal values: one standard deviation below the mean, the mean, and one above."""
+"""Quantiles at which normal values are a standard deviation below the mean, at it, and above."""
 FEWEST_PAIRS = 10
 """Fewer pairs decide nothing."""
 _CLEAR = 0.5
@@ -91,7 +91,7 @@ def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) 
 
 
 def is_reversed(rank: float, pairs: int) -> bool:
-    """Returns whether a rank correlation of so many pairs is clearly below 0, not by chance."""
+    """Returns whether a rank correlation, −1…1, of some pairs is clearly below 0, not by chance."""
     # Without any order the standard error is 1 / √(pairs − 1).
     standard_errors = -rank * math.sqrt(max(pairs - 1, 0))
     return rank < -_CLEAR and standard_errors > _STANDARD_ERRORS
