@@ -48,10 +48,10 @@ _UNTESTED = 0.2
 """Error of log depth that is assumed of a fit with as many parameters as points."""
 
 _GROSS = 0.05
-"""Errors of log depth below this are no outliers."""
+"""Error of log depth that an outlier exceeds."""
 
 _GROSS_STDS = 3.0
-"""Errors below so many standard deviations are none either."""
+"""Standard deviations of all errors that the error of an outlier exceeds, too."""
 
 _ALIKE = 1.0
 """Standard errors of the difference between two fits' criteria within which they are alike."""
@@ -134,6 +134,7 @@ class Alignment:
             x: The network's numbers.
         """
         low, high = self._limits
+        # x, too, is clamped: a line in 1/x or log x needs it above 0.
         line = self._line(_clamp_value(x, low=self._least_x))
         return from_space(_clamp_value(line, low, high), _READINGS[self.reading].depth_space)
 
@@ -166,10 +167,12 @@ class Alignment:
         x_space = _READINGS[self.reading].x_space
         if x_space == "depth":
             return -math.inf
-        # Where the line meets its limits, as log x or as 1/x.
+        # Where the line meets its limits, as log x or as 1/x. The least x is that of the lesser
+        # log x, or of the greater 1/x.
         ends = [(limit - self.shift) / self.scale for limit in self._limits]
         if x_space == "log":
-            return math.exp(min(max(min(ends), -_LARGEST_LOG), _LARGEST_LOG))
+            least_log = max(min(ends), -_LARGEST_LOG)
+            return math.exp(min(least_log, _LARGEST_LOG))
         return 1 / max(ends) if max(ends) > 0 else math.inf
 
     @property
@@ -230,7 +233,8 @@ def candidates(
     # What is stated; the scale of a power is its exponent, which is negative for a disparity.
     sign = 0 if reading == "power" else 1
     fits = [Candidate(reading, kind, sign) for kind in kinds if _has_kind(reading, kind)]
-    # Networks stretch or compress the range, which a power of what they state shows.
+    # A network may stretch or compress the range of depth; then it gives a power of what is stated.
+    # Log depth has none, as it may be below 0.
     if align_setting == "auto" and reading != "log":
         fits.append(Candidate("power", "affine", -1 if reading == "disparity" else 1))
     return tuple(fits)
@@ -291,7 +295,7 @@ def alignments(x: Tensor, points: SparsePoints, tried: Sequence[Candidate]) -> l
     if best_of_reading:
         best, *others = best_of_reading.values()
         return [best, *(fit for fit in others if _is_alike(fit, best, x, depth))]
-    # There is none.
+    # No candidate fits; the error is that of the first.
     stated = tried[0]
     if len(x) < 2:
         raise NoPointsError(
@@ -364,7 +368,7 @@ def _has_kind(reading: str, kind: str) -> bool:
 
 
 def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
-    """The best alignment with a candidate's reading, parameters and sign; None where there is none.
+    """The best alignment with a candidate's reading, parameters and sign; None where none fits.
 
     Where the points contradict the sign, it is the one with the same depth everywhere.
 
@@ -374,10 +378,10 @@ def _fit(x: Tensor, depth: Tensor, candidate: Candidate) -> Alignment | None:
         candidate: The candidate.
     """
     line = _scale_and_shift(x, depth, candidate.reading, candidate.kind)
-    if line is None or not all(map(math.isfinite, line)):
+    if line is None or not all(map(math.isfinite, line)):  # such as in log x of numbers below 0
         return None
     scale, _ = line
-    if candidate.sign and scale * candidate.sign <= 0:
+    if candidate.sign and scale * candidate.sign <= 0:  # the points contradict the sign
         # Depth that is the same everywhere needs a shift, and says something of two points or more.
         has_level = candidate.kind == "affine" and len(x) > 1
         return _level(x, depth, candidate) if has_level else None
@@ -505,7 +509,7 @@ def _bic(fit: Alignment) -> float:
     Errors of log depth are taken as distributed by Laplace, whose log likelihood of N of them is
     −N·log(mean error) and a constant.
     """
-    parameters = {"none": 0, "affine": 2}.get(fit.kind, 1)
+    parameters = {"none": 0, "scale": 1, "median": 1, "affine": 2}[fit.kind]
     error = max(fit.misfit, _LEAST_ERROR)
     if fit.points <= parameters:  # it goes through all points, which says nothing of its error
         error = _UNTESTED
@@ -544,7 +548,7 @@ def _relative_errors(fit: Alignment, x: Tensor, depth: Tensor) -> Tensor:
 
 def _bounds(depth: Tensor) -> Tensor:
     """(nearest, farthest) metres that aligned depth can have, from the depth (N,) of the points."""
-    factor = BEYOND * (1 + 1 / len(depth))
+    factor = BEYOND * (1 + 1 / len(depth))  # a few points do not show the range of the scene
     return torch.stack([depth.min() / factor, depth.max() * factor])
 
 

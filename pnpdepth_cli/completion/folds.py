@@ -25,16 +25,16 @@ from pnpdepth_cli.completion.interpolation import nearest_points
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.scan_pattern import scan_lines
 
-_GROWTH = 1.5  # of a cell's side from trial to trial
-_MAX_SIDE = 0.25  # of a cell, as a fraction of the image's shorter side
+_GROWTH = 1.5  # factor on a cell's side from trial to trial
+_MAX_SIDE = 0.25  # of a cell, over the image's shorter side
 _SAMPLED = 2000  # pixels and points whose distances are measured
-_BOX_FROM = 0.02  # quantiles of the points' coordinates, between which pixels are sampled
-_BOX_TO = 0.98
-_SLACK = 1.15  # a cell need not be larger for the last few per cent of distance
-_CELLS = 2.0  # a point, at most, of a depth map: of its pixels at least half are known
-_SQUARE = 1.5  # height of a map's pixel over its width, at most; lines are farther apart
-_SURROUNDED = 0.5  # of its points, at least, whose four neighbours are known
-_COPIES = 8  # of the holes, at most
+_BOX_FROM = 0.02  # quantile of the points' coordinates from which on pixels are sampled
+_BOX_TO = 0.98  # quantile up to which they are
+_SLACK = 1.15  # wanted distance over that of a fold, up to which cells need not grow
+_MAX_PIXELS_A_POINT = 2.0  # of a depth map, of whose pixels at least half are known
+_MAX_ASPECT = 1.5  # longer over shorter side of a map's pixel; scan lines are farther apart
+_MIN_SURROUNDED = 0.5  # fraction of a map's known pixels whose four neighbours are known
+_MAX_COPIES = 8  # of the holes
 _AROUND = np.ones((3, 3), np.bool_)  # a pixel and its eight neighbours: one hole
 
 
@@ -63,6 +63,7 @@ def spatial_folds(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor:
     fold = _folds_of_cells(points, side_px, folds, generator)
     while _distance_held_out(points, fold, generator) * _SLACK < wanted_px:
         side_px = side_px * _GROWTH if side_px else max(1.0, wanted_px)
+        # Cells that large would make folds of whole parts of the image; the last ones stay.
         if side_px > _MAX_SIDE * min(points.size):
             break
         fold = _folds_of_cells(points, side_px, folds, generator)
@@ -91,19 +92,21 @@ def under_holes(points: SparsePoints, folds: int, *, seed: int = 0) -> Tensor | 
         return None
     known = np.zeros(grid.shape, np.bool_)
     known[grid.row, grid.column] = True
+    # Without a hole there is nothing to copy. Where most pixels have an unknown neighbour, as of
+    # random pixels, there are gaps everywhere instead of holes.
     is_surrounded = ndimage.binary_erosion(known)
-    if known.all() or is_surrounded.sum() < _SURROUNDED * known.sum():
+    if known.all() or is_surrounded.sum() < _MIN_SURROUNDED * known.sum():
         return None
     # Copies of the holes, until enough pixels are under them.
     rng = np.random.default_rng(seed)
     is_under = np.zeros_like(known)
     room = int(known.sum()) // folds  # pixels that may still come under holes
-    for _ in range(_COPIES):
+    for _ in range(_MAX_COPIES):
         moved = np.roll(~known, rng.integers(grid.shape), axis=(0, 1))
         copy = _some_holes(moved & known & ~is_under, room, rng)
         is_under |= copy
         room -= int(copy.sum())
-    if not is_under.any():
+    if not is_under.any():  # no copied hole has room among the known pixels
         return None
     label, _ = ndimage.label(is_under, _AROUND)
     return torch.from_numpy(label[grid.row, grid.column])
@@ -129,12 +132,12 @@ class _PixelGrid(NamedTuple):
         height, width = points.size
         rows = _PixelAxis.of(y, height)
         columns = _PixelAxis.of(x, width)
-        if rows is None or columns is None:
+        if rows is None or columns is None:  # all points are on one line
             return None
         smaller, larger = sorted([rows.spacing, columns.spacing])
-        if larger > _SQUARE * smaller:
+        if larger > _MAX_ASPECT * smaller:  # scan lines
             return None
-        if rows.pixels * columns.pixels > _CELLS * len(points):
+        if rows.pixels * columns.pixels > _MAX_PIXELS_A_POINT * len(points):  # mostly unknown
             return None
         return cls((rows.pixels, columns.pixels), rows.number, columns.number)
 
@@ -169,7 +172,7 @@ class _PixelAxis(NamedTuple):
 
 
 def _some_holes(holes: NDArray[np.bool_], room: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """All of the holes (R, C) if they have room, else whole ones in random order that still have.
+    """All of the holes (R, C) if they have room, else whole ones as they fit in random order.
 
     Args:
         holes: Where holes are, (R, C) bool. Pixels that touch, also by a corner, are one hole.
@@ -222,6 +225,10 @@ def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> flo
 
     The pixels are in the box around the middle 96 % of the points: a LiDAR has no points in the
     sky.
+
+    Args:
+        points: The points.
+        generator: Source of the pixels.
     """
     low = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_FROM, dim=0)
     high = torch.quantile(_sample(points.xy.cpu(), generator), _BOX_TO, dim=0)
@@ -233,7 +240,12 @@ def _distance_of_pixels(points: SparsePoints, generator: torch.Generator) -> flo
 def _distance_held_out(points: SparsePoints, fold: Tensor, generator: torch.Generator) -> float:
     """The median distance in pixels from points of the first fold to the nearest of another.
 
-    ∞ if all points are in the first fold (N,).
+    ∞ if all points are in the first fold.
+
+    Args:
+        points: The N points.
+        fold: Fold (N,) of each point, of which 0 is the first.
+        generator: Source of the points whose distance is measured, where they are many.
     """
     held_out = fold == 0
     if bool(held_out.all()):

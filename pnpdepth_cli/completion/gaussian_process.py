@@ -57,33 +57,33 @@ NEIGHBOURS = 48
 MIN_POINTS = 5
 """Fewer points do not determine the length scales."""
 
-# All points predict every pixel
-_MAX_EXACT = 128  # of so many points at most,
-_MAX_EXACT_SMALL = 256  # or so many where the image is small:
-_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels, at most
-_AT_ONCE = 1 << 19  # covariances computed at once: what bounds the memory
+# Whether all points predict every pixel.
+_MAX_EXACT = 128  # points up to which they do
+_MAX_EXACT_SMALL = 256  # points up to which they do in a small image
+_MAX_EXACT_PRODUCT = 40_000_000  # points × pixels up to which an image is small
+_AT_ONCE = 1 << 19  # covariances computed at once, which bounds the memory
 
-# The kernel of many points is chosen
-_NEIGHBOURHOODS = 24  # in so many neighbourhoods,
-_INNER = 16  # by the points in the middle of each, left out one by one
-_MIN_SCORED_WEIGHT = 1e-6  # the weight of a point that predicts nothing
+# How the kernel of many points is chosen.
+_NEIGHBOURHOODS = 24  # neighbourhoods whose points are left out one by one
+_INNER = 16  # points in the middle of each that are left out
+_MIN_SCORED_WEIGHT = 1e-6  # weight that stands for 0, whose noise would be infinite
 
-# A block of pixels
-_IN_BLOCK = 3  # contains at most 1/3 of the points that predict it,
-_CROWDED = 0.05  # except for blocks with this fraction of all points,
-_MIN_BLOCK_PX = 8  # and has at least this side
+# The blocks of pixels that are predicted from the same points.
+_IN_BLOCK = 3  # a block with more than 1/3 of the points that predict it is crowded
+_CROWDED = 0.05  # fraction of all points that crowded blocks may have
+_MIN_BLOCK_PX = 8  # least side of a block
 _BLOCK_SHRINKS = 1.4  # factor between sides that are tried
 
-# The grid on which the residual is predicted
-_WORTH_A_GRID = 1 << 16  # pixels; of fewer, every pixel is predicted
-_NODES_BETWEEN = 6  # nodes of the grid between two points,
-_NODES_BETWEEN_LINES = 2  # or rows of nodes between two scan lines,
-_MAX_STEP_PX = 4  # most between two nodes: on real frames as good as every pixel
+# The grid on which the residual is predicted.
+_WORTH_A_GRID = 1 << 16  # pixels from which on there is one; of fewer, every pixel is predicted
+_NODES_BETWEEN = 6  # nodes between two points
+_NODES_BETWEEN_LINES = 2  # rows of nodes between two scan lines
+_MAX_STEP_PX = 4  # most from node to node: on real frames as good as every pixel
 
 LOG_DEPTH = 2
 """Index of the predicted log depth among the features."""
 _FLAT_DEPTH = 1e-3  # added to the standard deviation of log depth: a flat one has no edges
-_FLAT_COLOUR = 1.0  # added to that of CIELAB, likewise
+_FLAT_COLOUR = 1.0  # added to the standard deviation of CIELAB: a plain image has no edges
 _LEAST_XYZ = 1e-6  # of which the cube root is taken: below it is not used, and below 0 is NaN
 _XYZ_OF_RGB = (
     (0.4124564, 0.3575761, 0.1804375),
@@ -146,8 +146,8 @@ class Residuals:
 def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -> Residuals:
     """Returns log measured − log predicted depth at the points in the image with a prediction.
 
-    Features and default kernel of a Gaussian process are with it. Of several points at the same
-    coordinates the one of least depth counts.
+    The features of the image and the default kernel of a Gaussian process come with it. Of several
+    points at the same coordinates the one of least depth counts.
 
     Args:
         prediction: Depth (H, W) in metres; not positive or not finite is unknown.
@@ -158,7 +158,7 @@ def residuals_of(prediction: Tensor, points: SparsePoints, rgb: Tensor | None) -
         NoPointsError: No point has a prediction.
     """
     prediction = prediction.detach().cpu()
-    # The points that count.
+    # The points that count. Those on the right and the bottom edge of the image are inside, too.
     points = points.tensors()
     inside = in_frame(points.xy, points.size, closed=True)
     known, points = where_predicted(prediction, points.where(inside))
@@ -192,6 +192,7 @@ def features_of(log_depth: Tensor, rgb: Tensor | None) -> Tensor:
     known = log_depth.isfinite()
     known_values = log_depth if bool(known.all()) else log_depth[known]  # picking pixels is slow
     known_values = known_values.double().flatten()
+    # The standard deviation by a dot product, which is faster than `Tensor.std`.
     mean = known_values.mean()
     mean_square = known_values.dot(known_values) / len(known_values)
     std = (mean_square - mean.square()).clamp_min(0).sqrt()
@@ -273,10 +274,10 @@ def predict(residuals: Residuals, queries: SparsePoints | None = None) -> Tensor
         queries: Points at whose coordinates the residual is wanted. None: every pixel.
     """
     if queries is not None:
-        features = _sample(residuals.features, queries)
+        features = _sample(residuals.features, queries)  # (M, 3 or 6)
         if _uses_all_points(residuals) or len(residuals.points) <= NEIGHBOURS:
             return _solve(residuals, _all_points(residuals), features[None])[0]
-        # Each query is a block of its own, predicted from its nearest points.
+        # Each query is predicted from its own nearest points: M blocks of one place each.
         _, near = nearest_points(residuals.points, queries.xy.double(), NEIGHBOURS)
         return _solve(residuals, near, features[:, None])[:, 0]
     # Every pixel's, on a grid with the mean features of several pixels.
@@ -296,10 +297,10 @@ def leave_one_out(
 ) -> tuple[Tensor, Tensor]:
     """Returns error and variance of points, each predicted from the others of its neighbourhood.
 
-    Both are (B, k), or (B, `_INNER`) of the points in the middle where there are several
-    neighbourhoods. The error is the residual minus the predicted one, the variance the predicted
-    one's, in units of the Gaussian process's. They are computed without solving again: Rasmussen
-    and Williams, eq. 5.12.
+    Both are (B, k) float64, or (B, `_INNER`) of the points in the middle where there are several
+    neighbourhoods. The error is the residual minus the predicted one. The variance is that of this
+    error, with a point's noise as if its weight were 1, in units of the variance of the Gaussian
+    process. They are computed without solving again: Rasmussen and Williams, eq. 5.12.
 
     Args:
         residuals: The residuals at N points, with the kernel of a Gaussian process.
@@ -317,7 +318,10 @@ def leave_one_out(
     error = (inverse @ residuals.residual[near][..., None])[..., 0] * variance
     # Of several neighbourhoods the middle counts, as points at the edge have others outside.
     inner = _INNER if near.shape[0] > 1 else None
-    return error[:, :inner], (variance - extra_noise)[:, :inner]
+    # What a point counts for the others says nothing of its own error, so its extra noise is not
+    # in the variance.
+    variance = variance - extra_noise
+    return error[:, :inner], variance[:, :inner]
 
 
 def neighbourhoods(residuals: Residuals, max_exact: int) -> Tensor:
@@ -354,15 +358,17 @@ def _steps(points: SparsePoints) -> tuple[int, int]:
 
 
 def _predict_grid(residuals: Residuals) -> Tensor:
-    """The mean residual (H, W) at every pixel of `residuals.features`, each predicted by itself."""
+    """The mean residual (H, W) float32 at every pixel of `residuals.features`, without a grid."""
     height, width = residuals.points.size
     if _uses_all_points(residuals):
         queries = residuals.features.flatten(1).T.contiguous()[None]  # (1, HW, F)
         return _solve(residuals, _all_points(residuals), queries).reshape(height, width)
-    # Two layers of blocks, each of which counts where the other one has its seams.
+    # Square blocks of pixels, each predicted from the points nearest to it. There are two layers,
+    # half a block apart: the weight of a pixel falls towards the seams of its layer, and where one
+    # layer has seams the other counts.
     side = _block_side(residuals.points)
-    values, weight = _predict_blocks(residuals, side, 0)
-    shifted_values, shifted_weight = _predict_blocks(residuals, side, side // 2)
+    values, weight = _predict_blocks(residuals, side, shift=0)
+    shifted_values, shifted_weight = _predict_blocks(residuals, side, shift=side // 2)
     total = weight + shifted_weight
     return values * (weight / total) + shifted_values * (shifted_weight / total)
 
@@ -383,7 +389,8 @@ def _solve(residuals: Residuals, near: Tensor, queries: Tensor) -> Tensor:
     queries_at_once = max(1, _AT_ONCE // (blocks_at_once * count))
     for first in range(0, blocks, blocks_at_once):
         some_blocks = slice(first, first + blocks_at_once)
-        # α of these blocks, and from it the mean of β₀ and β₁, the constant and the slope over u.
+        # α of these blocks, and from it the means of β₀ and β₁, the constant and the slope over u:
+        # var β₀ · Σα and var β₁ · Σ u·α.
         systems = _systems(residuals, near[some_blocks])
         factor = torch.linalg.cholesky(systems.covariance)
         alpha = torch.cholesky_solve(residuals.residual[near[some_blocks]][..., None], factor)
@@ -427,7 +434,7 @@ def _covariance(a: Tensor, b: Tensor) -> Tensor:
 
     Args:
         a: Features (B, Q, F) of Q places in each of B blocks, over their length scales.
-        b: Features (B, k, F) of k points in each block, likewise.
+        b: Features (B, k, F) of k points in each block, over their length scales.
     """
     # Small numbers, so that the squares cancel well in |a|² + |b|² − 2a·b.
     middle = b.mean(dim=1, keepdim=True)

@@ -39,9 +39,10 @@ It is the evidence that an image belongs to its points: the log of the Bayes fac
 unrelated one."""
 
 CHANCE = 3.0
-"""Evidence, likewise, that an unrelated image reaches by chance somewhere.
+"""Evidence that an unrelated image reaches by chance at some registration.
 
-So the best of all registrations must have it for one frame, and twice it for more."""
+It is a log of the Bayes factor, too. So the best of all registrations must have it for one frame,
+and twice it for more."""
 
 _LEAST_MOVED = 0.02
 """Root mean square, over the image's longer side, by which a registration moves pixels at least.
@@ -51,10 +52,10 @@ moves the images of a registered camera by 0.01 to 0.02, rarely 0.034, another w
 (TUM fr1_rpy)."""
 
 _TURNED = 4.0
-"""Evidence for another orientation, at least."""
+"""Evidence that another orientation must have, at least."""
 
 _TURNED_MORE = 5.0
-"""By how much it must exceed the evidence for the image as it is."""
+"""By how much the evidence for another orientation must exceed that for the image as it is."""
 
 _LEAST_SHORT = 1 / 3
 """Share of the jumps that lie between points nearer to each other than half of all neighbours are.
@@ -76,14 +77,15 @@ _SHIFT_SIGMA = 0.025
 _LEAST_STANDING = 2.4
 """Standard errors of the gain of a registration, at least, with `_POINTS_OF_STANDING` a frame."""
 _MORE_STANDING = 1.66
-"""By how much it is more for each e-fold of more points, which see more of chance as well."""
+"""Standard errors that are added for each e-fold of more points, which see more of chance."""
 _POINTS_OF_STANDING = 500
+"""Points of a frame for which none are added."""
 
 # What the likelihood of an image's own place tells.
 _NO_EVIDENCE = 25
-"""Points that tell nothing."""
+"""Points of a frame up to which an image's own place is like any other."""
 _EVIDENCE = 0.85
-"""Standard deviations that each e-fold of more points tells."""
+"""Standard deviations that the likelihood of that place rises by each e-fold of more points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +103,7 @@ class ImageRegistration:
     """Shift downwards in pixels of the image."""
 
     def __str__(self) -> str:
+        """`zoom,right,down`, as messages show it."""
         return f"{self.zoom:.3f},{self.right:.1f},{self.down:.1f}"
 
     def apply_to(self, rgb: Image) -> Image:
@@ -130,9 +133,11 @@ def better_orientation(frames: Sequence[Evidence]) -> str | None:
     Args:
         frames: Evidence of one frame or more, all of one size.
     """
+    # An image that belongs to its points as it is has no other orientation.
     as_it_is = _orientation_factor(frames, _unchanged)
     if as_it_is > REGISTERED:
         return None
+    # The best of the others must have evidence of its own, and far more than the image as it is.
     factors = {
         words: _orientation_factor(frames, orient)
         for words, orient in _orientations(frames[0].size).items()
@@ -206,7 +211,7 @@ def estimate_registration(frames: Iterable[Evidence | None]) -> ImageRegistratio
     """
     telling = [frame for frame in frames if frame is not None]
     usable = [frame for frame in telling if frame.size == telling[0].size]
-    if not usable:
+    if not usable:  # no frame tells anything
         return None
     # Beside jumps of depth there must be points.
     jumps = sum(frame.jumps for frame in usable)
@@ -282,6 +287,7 @@ def _posterior(frames: Sequence[Evidence]) -> _Posterior:
         + ((down / height / _SHIFT_SIGMA) ** 2 / 2)[None, :, None]
         + ((right / width / _SHIFT_SIGMA) ** 2 / 2)[None, None, :]
     )
+    # The last term is that constant, by which the prior sums to 1.
     logits = log_likelihood - penalty - logsumexp(-penalty)
     return _Posterior(logits, down, right)
 
@@ -305,11 +311,12 @@ def _is_spread(frames: Sequence[Evidence], zoom: float, right: int, down: int) -
         frames: Evidence of the frames.
         zoom: Zoom of the registration.
         right: Shift to the right in pixels of the reduced image.
-        down: Shift downwards, likewise.
+        down: Shift downwards in pixels of the reduced image.
     """
-    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)  # of each part
+    # The gain of each part (P,), and by how many standard errors their sum exceeds chance.
+    gains = np.sum([frame.gain(zoom, right, down) for frame in frames], axis=0)
     standard_errors = gains.sum() / (np.linalg.norm(gains) + TINY)
-    # Of more points, more is asked, and of fewer less.
+    # More points see more of chance, so that more is asked of them, and of fewer points less.
     points = np.mean([frame.points for frame in frames])
     more = _MORE_STANDING * np.log(points / _POINTS_OF_STANDING)
     return bool(standard_errors >= _LEAST_STANDING + more)

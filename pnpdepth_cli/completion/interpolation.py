@@ -35,9 +35,9 @@ from pnpdepth_cli.points import SparsePoints
 _HULL_MARGIN_PX = 0.25
 """Pixels; a pixel that is no farther outside the points' hull still counts as inside."""
 _NODES = 2
-"""Nodes for each point, at most, of a grid on whose nodes points are sought."""
+"""Nodes for each point, at most, of a grid that points lie on: at least half have a point."""
 _FEW = 50
-"""Points for each position, at least, where only the triangles at the positions are made."""
+"""Points for each position, at least, from which on only the triangles at positions are made."""
 _CHUNK = 1 << 18
 """Positions that are interpolated at once, which bounds the memory."""
 
@@ -181,10 +181,11 @@ class Triangulation:
         Args:
             xy: The coordinates (M, 2).
             triangles: Triangles (T, 3) that are looked in, numbers of the points at the corners.
-            positions: The coordinates without repetition, as triangles are sought.
-            number: Number (M,) of the position that each of the coordinates is; without it, they
-                are all positions in their order.
+            positions: The coordinates without repetition.
+            number: Number (M,) of the one among `positions` that each coordinate is. Without it,
+                they are the coordinates themselves, in their order.
         """
+        # The number of the triangle of each, or what stands for a square or for outside.
         triangle = cover(self._xy[triangles], positions)[number]
         if self._grid is not None:
             triangle = np.where(self._grid.squares(xy).inside, _IN_SQUARE, triangle)
@@ -193,6 +194,7 @@ class Triangulation:
         if len(outside):
             _, near = nearest_points(self._points, outside, 1)
             nearest = near[:, 0].numpy()
+        # Kept for the next call, in half of the memory.
         return _Located(triangles, triangle.astype(np.int32), nearest)
 
     def _depth(self, xy: Floats, located: _Located, space: str) -> Tensor:
@@ -205,7 +207,7 @@ class Triangulation:
         """
         depth = self._points.depth.cpu().double()
         value = to_space(depth, space).numpy()
-        # Means of the values at the corners of triangles and squares.
+        # Means of the values at the corners of triangles and squares; any number outside both.
         means = np.empty(len(xy))
         for first in range(0, len(means), _CHUNK):
             chunk = slice(first, first + _CHUNK)
@@ -218,7 +220,7 @@ class Triangulation:
             if self._grid is not None:
                 squares = self._grid.squares(xy[chunk])
                 mean[squares.inside] = (squares.weights * value[squares.corners]).sum(axis=1)
-        # As depth, which outside is that of the nearest point.
+        # As depth; outside, the depth of the nearest point takes the place of that number.
         dense = from_space(torch.from_numpy(means), space)
         is_outside = torch.from_numpy(located.number == _OUTSIDE)
         dense[is_outside] = depth[torch.from_numpy(located.nearest)]
@@ -268,7 +270,7 @@ class _Grid(NamedTuple):
         # Every x of a point is a column of nodes, every y a row.
         columns, column = np.unique(xy[:, 0], return_inverse=True)
         rows, row = np.unique(xy[:, 1], return_inverse=True)
-        if len(columns) * len(rows) > _NODES * len(xy):
+        if len(columns) * len(rows) > _NODES * len(xy):  # most nodes have no point
             return None
         number = np.full((len(rows), len(columns)), -1)
         number[row, column] = np.arange(len(xy))
@@ -383,7 +385,7 @@ def _order(points: SparsePoints) -> SparsePoints:
         raise NoPointsError("there is no sparse point to interpolate; give at least one")
     xy = points.xy.cpu().numpy()
     depth = points.depth.cpu().numpy()
-    order = np.lexsort(xy.T[::-1])  # faster than torch.unique
+    order = np.lexsort(xy.T[::-1])  # by x, then by y; faster than torch.unique
     xy = xy[order]
     depth = depth[order]
     # The first of each run of equal coordinates, and the least depth of the run.

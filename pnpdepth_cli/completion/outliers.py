@@ -26,14 +26,14 @@ _LEAST_DEPTH = 1e-6
 _COMPARED = 8
 """Neighbours that a point is compared with."""
 _AGREEING = 2
-"""Of these, so many must agree with it."""
+"""Of these neighbours, how many must agree with it, at least."""
 _MIN_DISAGREEMENT = 0.005
-"""Of log depth; less is none."""
+"""Difference of log depth that is taken as usual between neighbours, at least."""
 
 _ALIKE = 0.15
-"""Difference of these differences up to which neighbours agree with each other."""
+"""Difference of two points' errors of log depth below which they are off together."""
 _AGREE_AROUND = 3
-"""Of `_AROUND` neighbours, so many must agree with a point that is off with others."""
+"""Of `_AROUND` neighbours, how many must be off together with a point, at least."""
 
 _PASSES = 3
 """Times that outliers are sought: without the worst ones, others stand out."""
@@ -44,15 +44,17 @@ _MAX_EXACT = 256
 _CUTOFFS = (4.0, 4.0, 5.0, 6.0, 8.0)
 """Times the typical error at which a weight is 0, in turn."""
 _MIN_ERROR = 1e-3
-"""Typical error over its standard deviation; less is none."""
+"""Typical error, over its standard deviation, that is assumed at least."""
 _MIN_WEIGHT = 0.05
 """Points with less weight are suspected."""
 _AROUND = 6
 """Neighbours among which suspected points are counted."""
 _MOST_SUSPECTED = 4
-"""Of these; with a fifth of outliers, 2 % of the points have 4 suspected neighbours."""
+"""Suspected ones among these neighbours, at least, of a point that is suspected together with them.
+
+With a fifth of outliers, 2 % of the points have 4."""
 _HALF_SUSPECTED = 3
-"""Of these; beside points that are suspected together, so many are enough."""
+"""Those among them, at least, that are suspected together, for a point beside these to join."""
 _FAR_BETTER = 0.5
 """The others' errors without the suspected points must fall to this fraction."""
 _FAR_BETTER_MANY = 0.65
@@ -79,8 +81,8 @@ def far_points(prediction: Tensor, points: SparsePoints) -> Tensor:
 def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
     """Returns (N,) bool: points that agree with points around them, but not with a prediction.
 
-    As those seen in a mirror or through a pane. No geometry of the points tells these from a
-    corridor behind a door; a prediction that is right everywhere else does.
+    Such are the points seen in a mirror or through a pane. No geometry of the points tells these
+    from a corridor behind a door; a prediction that is right everywhere else does.
 
     They are all farther than predicted, or all nearer, whichever are more.
 
@@ -89,9 +91,10 @@ def off_together(points: SparsePoints, error: Tensor, least: float) -> Tensor:
         error: Errors (N,), log measured − log predicted depth.
         least: |Error| above which a point does not agree with the prediction.
     """
-    none = torch.zeros(len(points), dtype=torch.bool)
+    # Of so few points none has neighbours enough; and without a larger error none is off.
     if len(points) <= _AROUND or not bool((error.abs() > least).any()):
-        return none
+        return torch.zeros(len(points), dtype=torch.bool)
+    # Points that are off to one side, with neighbours that are off by about as much.
     near = neighbours_of(points, _AROUND)
     alike = (error[near] - error[:, None]).abs() < _ALIKE  # (N, _AROUND)
     groups = list[Tensor]()
@@ -126,7 +129,7 @@ def inlier_weights(points: SparsePoints, residual: Tensor) -> Tensor:
         points: The N points.
         residual: Residual (N,) of the points, log measured − log predicted depth.
     """
-    if len(points) <= _AGREEING:
+    if len(points) <= _AGREEING:  # no point has neighbours enough to be contradicted
         return torch.ones_like(residual)
     near = neighbours_of(points, min(_COMPARED, len(points) - 1))
     # By how much a point differs from the neighbour that agrees with it second best.
@@ -186,6 +189,7 @@ def _suspected_together(points: SparsePoints, suspected: Tensor) -> Tensor:
         points: The N points.
         suspected: Whether each point, (N,) bool, may be an outlier.
     """
+    # Of so few points none has neighbours enough.
     together = torch.zeros_like(suspected)
     if len(points) <= _AROUND or not bool(suspected.any()):
         return together

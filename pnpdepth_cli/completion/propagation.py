@@ -71,7 +71,7 @@ def local_lines(
     nodes = torch.cartesian_prod(rows, columns).flip(1)  # x, y
     lines = torch.stack(_lines_at(nodes, points, residual, regressor, inlier_weight))
     lines = lines.reshape(1, 2, len(rows), len(columns))
-    if step > 1:
+    if step > 1:  # the outer nodes are at the corners
         lines = F.interpolate(lines, points.size, mode="bilinear", align_corners=True)
     return lines[0, 0], lines[0, 1]
 

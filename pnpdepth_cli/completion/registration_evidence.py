@@ -28,7 +28,7 @@ _LONGEST_PX = 320
 _MIN_POINTS = 10
 """Fewer points tell nothing."""
 _MOST_POINTS = 2000
-"""Of more points, so many evenly spaced ones are used."""
+"""Points that are used at most; of more, evenly spaced ones in their order."""
 _LEAST_HULL = 0.5
 """Area of the points' hull over the image's, at least: points of one part say little of the zoom"""
 _MOST_AT_EDGES = 4.0
@@ -44,19 +44,19 @@ _SMALLEST_CHANGE = 0.03
 _LENGTH_OFFSET = 0.1
 """Pixels of the reduced image that are added to a length, so that it has a logarithm."""
 _LEAST_SPREAD = 0.4
-"""Standard deviation of the log of that change, at least; a noisy wall has 0.4, rooms 0.6."""
+"""Standard deviation of the log of the changes, at least; a noisy wall has 0.4, rooms 0.6."""
 _LARGEST_EVIDENCE = 2.5
-"""Standard deviations of that log beyond which a pair counts no more."""
+"""Standard deviations of the log of the changes beyond which a pair counts no more."""
 _LEAST_CONTRAST = 0.02
 """Range of the values 0…1 of an image with edges."""
 
 # Edges of the image: standard deviations of Gaussians in pixels of the reduced image.
 _EDGE_SIGMA = 1.0
-"""Of the blur before the gradient is taken."""
+"""Standard deviation of the blur before the gradient is taken."""
 _EDGE_REACH = 8.0
-"""Of the surroundings that an edge's strength is relative to."""
+"""Standard deviation of the surroundings that an edge's strength is relative to."""
 _EDGE_BAND = 6.0
-"""Of the mean that is taken off."""
+"""Standard deviation of the surroundings whose mean relative strength is taken off."""
 _FAINT_EDGE = 0.01
 """Strength that is added to the surroundings': where there is nothing, noise is no edge."""
 TINY = 1e-9
@@ -119,7 +119,8 @@ class Evidence:
         pixel = (y * map_columns + x)[inside]
         weights = np.bincount(pixel, self.weight[inside], map_rows * map_columns)
         template = weights.reshape(map_rows, map_columns).astype(np.float32)
-        # Their correlation with the edges at all shifts, from −most to +most.
+        # Their correlation with the edges at all shifts, from −most to +most. The map reaches over
+        # the image by `most` and moves by as much, so the edges need twice that border of zeros.
         top = 2 * most_down
         left = 2 * most_right
         padded = cv2.copyMakeBorder(self.edges, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
@@ -133,7 +134,7 @@ class Evidence:
         Args:
             zoom: Zoom of the registration.
             right: Shift to the right in pixels of the reduced image.
-            down: Shift downwards, likewise.
+            down: Shift downwards in pixels of the reduced image.
         """
         of_samples = self._sample_likelihoods(zoom, right, down)
         of_samples = of_samples - self._sample_likelihoods(1.0, 0, 0)
@@ -154,7 +155,7 @@ class Evidence:
         Args:
             zoom: Zoom of the registration.
             right: Shift to the right in pixels of the reduced image.
-            down: Shift downwards, likewise.
+            down: Shift downwards in pixels of the reduced image.
         """
         rows, columns = self.edges.shape
         x, y = (self._zoomed_pixels(zoom) + np.array([right, down])).T
@@ -272,14 +273,15 @@ def _edges(rgb: Image) -> Image:
     # CIELAB over 100; OpenCV's own conversion takes 0.1 s when it is called first.
     channels = torch.from_numpy(np.clip(rgb, 0, 1)).permute(2, 0, 1)
     lab = np.ascontiguousarray(cielab(channels).permute(1, 2, 0)) / 100
-    # The length of the gradient, of all three channels; Sobel's weights sum to 8.
+    # The length of the gradient in x and y, of all three channels; Sobel's weights sum to 8.
     blurred = cv2.GaussianBlur(lab, (0, 0), _EDGE_SIGMA)
     gradients = [
         cv2.Sobel(blurred, cv2.CV_32F, dx, dy, scale=0.125, borderType=cv2.BORDER_REFLECT)
         for dx, dy in ((1, 0), (0, 1))
     ]
-    strength = np.sqrt(np.square(gradients).sum((0, 3)))
-    # Relative to the surroundings, whose mean is taken off.
+    strength = np.sqrt(np.square(gradients).sum((0, 3)))  # over (direction, h, w, channel)
+    # Relative to the surroundings, so that an edge of little contrast counts where it is alone. The
+    # mean around is taken off, so that even texture counts nothing.
     relative = strength / (cv2.GaussianBlur(strength, (0, 0), _EDGE_REACH) + _FAINT_EDGE)
     edges = relative - cv2.GaussianBlur(relative, (0, 0), _EDGE_BAND)
     return np.asarray(edges / (edges.std() + TINY), np.float32)
@@ -288,12 +290,13 @@ def _edges(rgb: Image) -> Image:
 def _neighbours(positions: Floats) -> tuple[NDArray[np.intp], Floats]:
     """The pairs of neighbouring points, numbers (M, 2), and their distances (M,).
 
-    They are the sides of Delaunay's triangles of positions (N, 2), without the longest ones.
+    They are the sides of Delaunay's triangles of positions (N, 2), without the longest ones, which
+    are hardly neighbours, such as those along the hull.
     """
     # QJ: Qhull moves points at random, so that points on one line or circle have triangles, too.
     triangles = Delaunay(positions, qhull_options="QJ").simplices
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
-    sides = np.sort(sides)
+    sides = np.sort(sides)  # a side of two triangles is in both, in either order
     pairs = np.unique(sides, axis=0).astype(np.intp)
     length = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
     is_near = length <= np.quantile(length, _LONGEST_PAIR)

@@ -27,7 +27,9 @@ _STEPS = 20
 """Most steps of a minimisation. It converges in about six."""
 
 _CONVERGED = 1e-6
-"""Fraction of the loss by which a step must lower it for another one to follow."""
+"""Fraction of the loss by which a step must lower it for another one to follow.
+
+Of a location it is how far a step must move it, in the unit of the values."""
 
 _HALVINGS = 8
 """Most halvings of a step that does not lower the loss."""
@@ -106,7 +108,7 @@ class _LineFit:
         """
         if self._space == "log":
             return _weighted_least_squares(self._x, self._y, torch.ones_like(self._y))
-        return _weighted_least_squares(self._x, self._y, self._y**-2)
+        return _weighted_least_squares(self._x, self._y, self._y**-2)  # squares of errors over y
 
     def least_median(self) -> tuple[float, float] | None:
         """Returns scale and shift of the line through two points with the least median error.

@@ -30,9 +30,9 @@ _THIN_PX = 1e-3
 _SPANS = 1 << 19
 """Spans that are made at once, about, which bounds the memory."""
 _NEAREST = 16
-"""Points around a position whose triangles are tried first, and by which there are more then."""
+"""Points around a position that are triangulated in the first trial; later ones add as many."""
 _TRIALS = 8
-"""Trials, at most; then all points are triangulated."""
+"""Trials with some of the points, at most; then all are triangulated."""
 _EMPTY = 1e-10
 """Fraction of a circle's radius by which a point may be inside through rounding."""
 

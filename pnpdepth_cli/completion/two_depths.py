@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MOST = 20_000
-"""Pairs that are compared, up to twice as many; more tell no more."""
+"""Pairs that are compared at least, where there are as many; always fewer than twice this."""
 _QUANTILES = (0.16, 0.5, 0.84)
-"""Of normal values: one standard deviation below the mean, the mean, and one above."""
+"""Quantiles at which normal values are a standard deviation below the mean, at it, and above."""
 FEWEST_PAIRS = 10
 """Fewer pairs decide nothing."""
 _CLEAR = 0.5
 """Rank correlation, of either sign, from which the order of two depths is clear."""
 _STANDARD_ERRORS = 4.0
-"""Of the rank correlation, by which chance does not explain it."""
+"""Standard errors of a rank correlation above which chance does not explain it."""
 OTHER_UNIT = math.log(1.5)
 """Log ratio that noise does not explain."""
 TIGHT = 0.25
@@ -51,9 +51,11 @@ class Agreement(NamedTuple):
     @property
     def is_unit(self) -> bool:
         """Whether a factor, far from 1, explains the difference of the two, as of another unit."""
+        # Of few pairs the ratio says nothing, and near 1 it is noise.
         if self.pairs < FEWEST_PAIRS or abs(math.log(self.ratio)) <= OTHER_UNIT:
             return False
-        # Both have one order. Of a wall the order is noise, but its ratio is the same everywhere.
+        # Two depths that differ by a unit have one order; of a wall the order is noise, but then
+        # the ratio is the same everywhere.
         is_alike = self.rank >= _CLEAR or self.spread < _EXACT
         return is_alike and self.spread <= TIGHT
 
@@ -72,7 +74,7 @@ def compare_depths(first: NDArray[np.floating], second: NDArray[np.floating]) ->
     count = pairs.shape[1]
     if not count:
         return Agreement(pairs=0, rank=0.0, ratio=math.nan, spread=math.nan)
-    # Of many pairs every second, third, …
+    # Of many pairs every second, third and so on, by the step of the slice.
     compared = pairs[:, :: max(1, count // _MOST)]
     log_ratio = np.log(compared[0]) - np.log(compared[1])
     low, middle, high = np.quantile(log_ratio, _QUANTILES).tolist()
@@ -89,7 +91,7 @@ def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) 
 
 
 def is_reversed(rank: float, pairs: int) -> bool:
-    """Returns whether a rank correlation of so many pairs is clearly below 0, not by chance."""
+    """Returns whether a rank correlation, −1…1, of some pairs is clearly below 0, not by chance."""
     # Without any order the standard error is 1 / √(pairs − 1).
     standard_errors = -rank * math.sqrt(max(pairs - 1, 0))
     return rank < -_CLEAR and standard_errors > _STANDARD_ERRORS

@@ -280,7 +280,10 @@ class _Follower(TorchDispatchMode):
 
 
 def _geometry(tensor: Tensor) -> _Geometry:
-    """Where in its storage a tensor lies; of a sparse tensor its shape alone."""
+    """Where in its storage a tensor lies: offset, shape and strides.
+
+    A sparse tensor has no storage: its offset is 0, and it has no strides.
+    """
     if tensor.layout != torch.strided:
         return 0, tensor.shape, ()
     return int(tensor.storage_offset()), tensor.shape, tensor.stride()

@@ -128,7 +128,14 @@ def refine(
 
 
 def _with_pass(so_far: Refinement | None, depth: Tensor, loss: float, step: float) -> Refinement:
-    """The refinement with one more pass of the rear; None so far: this is the pass of z_0."""
+    """The refinement with one more pass of the rear, f_rear(z_k).
+
+    Args:
+        so_far: The refinement by the passes before; None if this is the pass of z_0.
+        depth: Depth (1, 1, h, w) in metres of this pass.
+        loss: Its loss L(z_k).
+        step: α as a number.
+    """
     if so_far is None:
         return Refinement(before=depth, after=depth, losses=(loss,), step=step)
     return replace(so_far, after=depth, losses=(*so_far.losses, loss))

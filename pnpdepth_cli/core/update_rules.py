@@ -81,11 +81,12 @@ def adam(beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-12) -> Update
         """The unbiased mean gradient over the root of the unbiased mean square, elementwise."""
         nonlocal mean, mean_square, step
         step += 1
-        mean = (1 - beta1) * gradient + (0 if mean is None else beta1 * mean)
-        mean_square = (1 - beta2) * gradient.square() + (
-            0 if mean_square is None else beta2 * mean_square
-        )
-        # Both begin at 0, which the division takes out (bias correction).
+        if mean is None or mean_square is None:
+            mean = torch.zeros_like(gradient)
+            mean_square = torch.zeros_like(gradient)
+        mean = (1 - beta1) * gradient + beta1 * mean
+        mean_square = (1 - beta2) * gradient.square() + beta2 * mean_square
+        # Both began at 0, which the division takes out (bias correction).
         unbiased_mean = mean / (1 - beta1**step)
         unbiased_square = mean_square / (1 - beta2**step)
         return unbiased_mean / (unbiased_square.sqrt() + eps)

@@ -65,6 +65,7 @@ class Split:
         self._replay: Replay | None = None
 
     def __enter__(self) -> Self:
+        """Opens the split: calls of submodules are intercepted, in eval mode, without gradients."""
         # If a step of opening fails, those before it are undone.
         with ExitStack() as opening:
             self._state = NetworkState(self._network)
@@ -76,6 +77,7 @@ class Split:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Restores the network, and frees the tensors of the last frame."""
         self._open.close()
         self._replay = None
 
@@ -126,6 +128,7 @@ class Split:
         replay.z = z
         if replay.complete:
             return self._run(replay)
+        # The first rear also learns which calls behind the cut can be cached.
         recorder = self._recorder(replay)
         output = self._run(replay, recorder)
         recorder.finish_rear()

@@ -60,6 +60,7 @@ def _stand_in(
 
     @functools.wraps(original)
     def forward(*args: object, **kwargs: object) -> object:
+        """What the handler returns for a call of the module with these arguments."""
         return handler(module, (args, kwargs), lambda: original(*args, **kwargs))
 
     return forward
@@ -179,15 +180,18 @@ class Replay:
         return self._output_with_z(run) if in_backward and is_cut else run()
 
     def _saved_output(self, call: Call, run: Run) -> object:
-        """The output of a recorded call: a call that may be saved runs once a frame, others always.
+        """The output of a recorded call, which runs only once a frame if its output may be saved.
 
-        Calls inside the one that runs are not replayed meanwhile (`_fills`).
+        Args:
+            call: The call.
+            run: Function that runs it.
         """
         saved = self.outputs[call]
-        if saved is None:  # it may not be saved
+        if saved is None:  # its output may not be saved
             return run()
         if saved.value is not None:  # it has run for this frame
             return saved.fresh()
+        # It runs as a whole: calls inside it are not looked up meanwhile.
         self._fills = True
         try:
             output = run()
@@ -242,7 +246,8 @@ class Recorder:
         self._replay = replay
         self._uncacheable = uncacheable
         self._saved = dict(replay.outputs)  # recorded calls, like `Replay.outputs`
-        self._calls_before = len(self._saved)  # this pass; in the rear's, those up to the cut
+        self._calls_before = len(self._saved)
+        """Number of calls recorded before this pass; in the rear's, those up to the cut."""
         self._is_inside_cached = False  # in a submodule that is to be cached as a whole
 
     def run_watched(self, module: nn.Module, run: Run) -> object:
@@ -267,6 +272,7 @@ class Recorder:
             PnpDepthError: The call is the cut, where the front ends (`Replay.end_of_front`).
             ModelError: It is the cut, and its output has no tensor that can be z, or several.
         """
+        # Inside a call that is cached as a whole there is nothing to record but the cut.
         if self._is_inside_cached and module is not self._cut.module:
             return run()
         self.ran.add(module)
@@ -289,15 +295,17 @@ class Recorder:
             self._is_inside_cached = was_inside_cached
         if self._replay.has_front:  # the network has caught the end of the front
             return output
-        # Its output is saved if that is all that it did, and nothing in it listens by a hook.
-        is_all = self.watch.can_stand_for(since, inputs, output)
+        # Its output is saved if to return it is all that the call did: no tensor was changed, nor a
+        # list or dict among the inputs, and no hook inside waits to be called.
+        changes_no_tensor = self.watch.can_stand_for(since, inputs, output)
         keeps_inputs = _ids(tensors_before) == _ids(list(tensors_in(inputs)))
-        if is_all and keeps_inputs and module not in self._cut.around_hooks:
-            self._drop_from(first_inside)
+        has_submodules = next(module.children(), None) is not None
+        if changes_no_tensor and keeps_inputs and module not in self._cut.around_hooks:
+            self._drop_from(first_inside)  # the saved output stands for the calls inside, too
             saved = SavedTensors.of(output)
             self._saved[call] = saved
             self.watch.protect(saved)
-        elif may_be_cached and next(module.children(), None) is not None:
+        elif may_be_cached and has_submodules:
             self._uncacheable.add(module)  # the next pass records what is in it
         # The front ends at the cut.
         if self._is_cut(module):
@@ -333,7 +341,11 @@ class Recorder:
         self.finish(complete=True)
 
     def finish(self, *, complete: bool) -> None:
-        """Gives the replay the recorded calls; complete: also those behind the cut."""
+        """Gives the replay the recorded calls.
+
+        Args:
+            complete: Whether these are all calls, those behind the cut included.
+        """
         self._replay.outputs = self._saved
         self._replay.complete = complete
         # No value may reach Python in front of the cut or behind it.
@@ -343,6 +355,7 @@ class Recorder:
         """Whether the call of this submodule that has just run is the one to cut at."""
         if self._replay.cut_call is not None or module is not self._cut.module:
             return False
+        # Without a number the cut is the first call; if there are more, `finish_rear` raises.
         return self._cut.call in (None, self._replay.calls[module])
 
     def _may_be_cached(self, module: nn.Module) -> bool:

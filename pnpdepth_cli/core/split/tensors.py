@@ -117,6 +117,7 @@ class SavedTensors:
         """Returns the tensors of an output in new containers, clones if they are `copied`."""
 
         def clone_if_copied(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            """The tensor to save, wherever its path leads to."""
             return tensor.clone() if copied else tensor
 
         return cls(map_tensors(output, clone_if_copied), copied)
@@ -125,6 +126,7 @@ class SavedTensors:
         """Returns the tensors in new containers, for the network to use; `value` stays as it is."""
 
         def clone_if_needed(path: tuple[str, ...], tensor: Tensor) -> Tensor:
+            """The tensor for the network to use, wherever its path leads to."""
             # One of inference mode cannot be saved for a backward pass.
             return tensor.clone() if self.copied or tensor.is_inference() else tensor
 
@@ -141,6 +143,7 @@ class NetworkState:
     def __init__(self, network: nn.Module) -> None:
         modules = list(network.modules())
         parameters = list(network.parameters())
+        # The values, which are copied only where a `Watch` sees that they are about to change.
         self._originals = [*parameters, *network.buffers()]
         self.tensors = [SavedTensors(tensor) for tensor in self._originals]
         self._gradient_flags = [(parameter, parameter.requires_grad) for parameter in parameters]

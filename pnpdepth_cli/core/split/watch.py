@@ -70,7 +70,7 @@ class Watch(TorchDispatchMode):
         return False
 
     def __init__(self, saved: Iterable[SavedTensors], *, escapes: bool) -> None:
-        """Nothing has happened yet.
+        """A watch of a pass that has not begun.
 
         Args:
             saved: Tensors to protect from in-place operations.
@@ -92,8 +92,8 @@ class Watch(TorchDispatchMode):
         self._twins: tuple[Tensor, ...] = ()  # z, and the tensor of the network it stands for
         self._stale: set[int] = set()  # the storage of one twin after the other was changed
         self._function_mode = _EscapeMode(self)
-        self._notes_escapes = escapes
-        self._sees_escapes = False  # whether the function mode is active
+        self._notes_escapes = escapes  # whether values that reach Python matter
+        self._sees_escapes = False  # whether they are noted at the moment: the function mode is on
         for tensors in saved:
             self.protect(tensors)
 
@@ -162,8 +162,9 @@ class Watch(TorchDispatchMode):
         seen_outside = self._sees_escapes
         is_fused = getattr(type(module), "forward", None) in _FUSED
         self._sees_escapes = self._notes_escapes and not is_fused
-        # The function mode is entered, or left for a while, where that differs from outside. Only
-        # the innermost mode can be left, which is another one where the network uses its own.
+        # The function mode (`_EscapeMode`) notes them while it is active. It is entered, or left
+        # for a while, where that differs from outside. Only the innermost mode can be left, which
+        # is another one where the network uses its own.
         innermost = overrides._get_current_function_mode()  # type: ignore[no-untyped-call]
         change: AbstractContextManager[object] = nullcontext()
         if self._sees_escapes and not seen_outside:
@@ -199,6 +200,7 @@ class Watch(TorchDispatchMode):
         effects = _effects_of(func)
         self._operations += 1
         inputs = [tensor for _, tensor in tensors_in((*args, *kwargs.values()))]
+        # Reading a tensor that without a cut would have been changed with its twin is an error.
         if self._stale and any(storage_of(tensor) in self._stale for tensor in inputs):
             self.torn = True
         # Saved tensors are cloned before the operation changes them.

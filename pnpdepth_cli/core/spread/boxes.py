@@ -107,6 +107,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     """Returns a decorator that enters a function in `RULES` for operations of these names."""
 
     def enter(function: Rule) -> Rule:
+        """Returns the function itself, after it was entered."""
         RULES.update(dict.fromkeys(names, function))
         return function
 

@@ -30,12 +30,24 @@ def part_of(call: Call, number: int) -> Spread:
         number: Number of this part, from 0.
     """
     if call.name == "unbind":  # parts are `tensor[number]` along an axis
-        axis = call.args[1] if len(call.args) > 1 else 0
+        axis = _stated_axis(call, 1, call.source.ndim)
         return select(call._replace(args=(call.source, axis, number)))
-    axis = (call.args[2] if len(call.args) > 2 else 0) % call.source.ndim
+    axis = _stated_axis(call, 2, call.source.ndim)
     sizes = call.args[1]  # one size of all parts, or the size of each
     start = number * sizes if isinstance(sizes, int) else sum(sizes[:number])
     return Spread.from_axes(_crop(call, axis, start, 1, call.shape[axis]))
+
+
+def _stated_axis(call: Call, number: int, axes: int) -> int:
+    """The axis that an argument states, counted from 0; 0 where it is left out, as torch has it.
+
+    Args:
+        call: The operation.
+        number: Number of the argument.
+        axes: How many axes the tensor has, from whose end a negative axis is counted.
+    """
+    stated = call.args[number] if len(call.args) > number else 0
+    return int(stated % axes)
 
 
 @rule("cat")
@@ -45,13 +57,14 @@ def concatenate(call: Call) -> Spread:
     They are shifted to where the input lies in the result. If it is given several times, they reach
     over all its places.
     """
-    axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
+    axis = _stated_axis(call, 1, len(call.shape))
     offset = 0  # elements along the axis in front of the tensor at hand
     spread: Spread | None = None
     for tensor in call.args[0]:
         if tensor is call.source:
             axes = call.spread.axes()
             first, last = axes[axis]
+            # An empty box keeps its last index of −1; any larger first one leaves it empty.
             last = torch.where(call.spread.empty(), last, last + offset)
             axes[axis] = (first + offset, last)
             spread = Spread.from_axes(axes).joined(spread)
@@ -67,7 +80,7 @@ def stack(call: Call) -> Spread:
     Along it the boxes reach from the first to the last place of the input, which may be given
     several times.
     """
-    axis = (call.args[1] if len(call.args) > 1 else 0) % len(call.shape)
+    axis = _stated_axis(call, 1, len(call.shape))
     places = [place for place, tensor in enumerate(call.args[0]) if tensor is call.source]
     if not places:  # it came another way, such as through a keyword
         return everywhere(call)

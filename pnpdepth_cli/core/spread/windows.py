@@ -125,7 +125,7 @@ def pool(call: Call) -> Spread:
     # A list of one number holds for both axes.
     for number in range(2):
         axis = call.source.ndim - 2 + number
-        # A window's maximum is 1 where it holds the row's 1: so far a mean's window reaches, too.
+        # A window's maximum is 1 where it holds the row's 1; the window of a mean reaches as far.
         output = F.max_pool1d(
             _unit_rows(call, axis),
             kernels[number % len(kernels)],
