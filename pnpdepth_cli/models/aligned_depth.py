@@ -19,6 +19,7 @@ from pnpdepth_cli.completion.alignment import (
     candidates,
 )
 from pnpdepth_cli.completion.outliers import off_together
+from pnpdepth_cli.completion.robust_line import MAX_ERROR
 from pnpdepth_cli.completion.two_depths import is_reversed, rank_correlation
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
@@ -49,9 +50,9 @@ _FITS_WELL = 0.05
 """Error of log depth over the best 70 % of the points up to which a network fits them."""
 _STANDS_OUT = 10.0
 """A point stands out if its error of log depth is this many times that of the best 70 %."""
-_LEAST_THAT_STANDS_OUT = 0.2
+_NEVER_STANDS_OUT = 0.2
 """Error of log depth below which no point stands out."""
-_MOST_THAT_DOES_NOT = 0.35
+_ALWAYS_STANDS_OUT = 0.35
 """Error of log depth above which every point stands out."""
 _ORDERED = 0.9
 """Rank correlation with the points that do not stand out, from which on a network knows which is
@@ -124,8 +125,9 @@ class AlignedDepth:
         self.alignment = fits[0]
         self.notes += _fit_notes(self.alignment, self._align, prediction)
         self.notes += _misfit_notes(self.alignment, definition, points)
-        stated = {self._align, READING_OF_KIND.get(definition.output_kind)}
-        if self.alignment.reading not in stated:
+        # Where neither option nor definition says what the output is, it may be something else.
+        stated_readings = {self._align, READING_OF_KIND.get(definition.output_kind)}
+        if self.alignment.reading not in stated_readings:
             self.notes += _ambiguity_notes(fits, prediction)
         self.notes += _group_notes(self.alignment, definition, at_points, points)
 
@@ -176,8 +178,9 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
 def _order_notes(
     definition: ModelDefinition, align: str, at_points: Tensor, points: SparsePoints
 ) -> tuple[str, ...]:
-    """Returns a warning if what the points have as nearer is farther by the network; else none.
+    """Returns a warning if the network has near and far the other way round than the points.
 
+    Else none.
     Then the points may hold disparity, or the network's output is not what it is said to be.
 
     Args:
@@ -216,7 +219,13 @@ def _metric_notes(at_points: Tensor, points: SparsePoints) -> tuple[str, ...]:
 
 
 def _fit_notes(fit: Alignment, align: str, prediction: Tensor) -> tuple[str, ...]:
-    """Returns notes on how the output is aligned, and on pixels (1, 1, h, w) out of its bounds."""
+    """Returns a note on how the output is aligned, and one if pixels are out of the fit's bounds.
+
+    Args:
+        fit: Alignment of the network's output with the points.
+        align: One of `choices.ALIGNMENTS`.
+        prediction: (1, 1, h, w) the network's own numbers, NaN where unknown.
+    """
     decided = " (decided from the points)" if align not in FITS else ""
     alignment_note = (
         f"alignment: {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
@@ -258,7 +267,7 @@ def _misfit_notes(
         )
     # What the misfit would be if the prediction were the median depth of the points everywhere.
     log_depth = points.depth.cpu().double().log()
-    of_median = float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
+    of_median = float((log_depth - log_depth.median()).abs().clamp(max=MAX_ERROR).mean())
     if len(points) >= _ENOUGH_POINTS and fit.misfit > _NO_BETTER * of_median:
         warnings.append(
             f"warning: network {definition.name!r} says nothing about this scene:"
@@ -309,18 +318,21 @@ def _group_notes(
         at_points: (N,) the network's output at the points.
         points: The N points.
     """
+    # The output of a network that takes the points follows them, and only many points that it fits
+    # well tell a good network.
     takes_points = "sparse" in definition.input_kind
     if takes_points or len(points) < _ENOUGH_POINTS or fit.error > _FITS_WELL:
         return ()
-    # Neighbours that are off by about the same factor.
-    points = points.tensors()
+    # Neighbours that are off by about the same factor, by log measured − log predicted depth.
+    points = points.tensors()  # on the CPU
     log_error = points.depth.log() - fit.depth(at_points.cpu().double()).log().float()
-    least = max(_STANDS_OUT * fit.error, _LEAST_THAT_STANDS_OUT)
-    in_group = off_together(points, log_error, min(least, _MOST_THAT_DOES_NOT))
+    least = max(_STANDS_OUT * fit.error, _NEVER_STANDS_OUT)
+    least = min(least, _ALWAYS_STANDS_OUT)
+    in_group = off_together(points, log_error, least)
     count = int(in_group.sum())
     if count < _LARGE_GROUP * len(points):
         return ()
-    # The network must be right about all the others.
+    # The network must order all other points by depth, with numbers that grow or shrink.
     outside = ~in_group
     numbers = at_points.cpu().double()[outside].numpy()
     if abs(rank_correlation(numbers, points.depth[outside].double().numpy())) < _ORDERED:

@@ -156,7 +156,8 @@ def _load_external(model: ModelProto, folder: Path) -> bool:
         for tensor in external._get_all_tensors(model)
         if external.uses_external_data(tensor)
     ]
-    # All of them together claim no more than the files have.
+    # All of them together claim no more than the files have; one without a length claims the whole
+    # file.
     sizes = dict[str, int]()
     for location in dict.fromkeys(claim.location for claim in claims):
         check_network_file(folder / location, "its file")

@@ -36,6 +36,9 @@ MAX_STEPS = 3_000_000
 MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
+_MAX_REASON = 160
+"""Characters of a reader's message that are shown."""
+
 _MAX_EXPANDED = 1 << 28
 """Elements of a tensor with strides of 0; nothing is allocated for them."""
 
@@ -124,7 +127,7 @@ def wrap_content_errors(what: str, *more: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (*CONTENT_ERRORS, *more) as error:
-        reason = describe(error).removeprefix("InputError: ")[:160]
+        reason = describe(error).removeprefix("InputError: ")[:_MAX_REASON]
         raise ModelError(f"{what}: {reason}") from None
 
 
@@ -335,4 +338,6 @@ def view_of(storage: Tensor, offset: int, shape: Sequence[int], stride: Sequence
     count = math.prod(shape)
     most = max(len(storage), _MAX_EXPANDED)
     check_claim(f"a tensor has {count:.6g} elements", count, most)
-    return storage.as_strided(shape, stride, int(offset) if count else 0)
+    # A tensor without elements reads nothing, so its offset does not matter.
+    start = int(offset) if count else 0
+    return storage.as_strided(shape, stride, start)
