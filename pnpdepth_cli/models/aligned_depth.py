@@ -163,14 +163,14 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
         prediction: (1, 1, h, w), NaN where the network says nothing, such as of the sky.
         is_predicted: (N,) bool, whether the prediction is known at each point.
     """
-    unknown = float(prediction.isnan().cpu().double().mean())
-    lost = int((~is_predicted).sum())
-    if lost == 0 and unknown < _FEW_UNKNOWN:
+    unknown_fraction = float(prediction.isnan().cpu().double().mean())
+    lost_points = int((~is_predicted).sum())
+    if lost_points == 0 and unknown_fraction < _FEW_UNKNOWN:
         return ()
-    note = f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there"
-    if lost:
-        note += f"; {lost:,} of {len(is_predicted):,} sparse points are there, and not in the loss"
-    if lost > _MOST_LOST * len(is_predicted):
+    note = f"prediction: {unknown_fraction:.2%} of the image is inf or NaN, so it is unknown there"
+    if lost_points:
+        note += f"; {lost_points:,} of {len(is_predicted):,} sparse points are there, and not in the loss"
+    if lost_points > _MOST_LOST * len(is_predicted):
         return (f"warning: {note}; are the network's weights and input range (`normalise`) right?",)
     return (note,)
 
@@ -178,9 +178,8 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
 def _order_notes(
     definition: ModelDefinition, align: str, at_points: Tensor, points: SparsePoints
 ) -> tuple[str, ...]:
-    """Returns a warning if the network has near and far the other way round than the points.
+    """Returns a warning if what is nearer by the points is farther by the network; else none.
 
-    Else none.
     Then the points may hold disparity, or the network's output is not what it is said to be.
 
     Args:
@@ -231,12 +230,12 @@ def _fit_notes(fit: Alignment, align: str, prediction: Tensor) -> tuple[str, ...
         f"alignment: {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
         f" over the best 70 %, {fit.outliers:.0%} outliers"
     )
-    beyond = fit.beyond(prediction)
-    if beyond == 0:
+    fraction_beyond = fit.beyond(prediction)
+    if fraction_beyond == 0:
         return (alignment_note,)
     near, far = fit.bounds
     bounds_note = (
-        f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
+        f"alignment: {fraction_beyond:.2%} of the image came out nearer than {near:.3g} m or"
         f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
     )
     return (alignment_note, bounds_note)
@@ -337,11 +336,11 @@ def _group_notes(
     numbers = at_points.cpu().double()[outside].numpy()
     if abs(rank_correlation(numbers, points.depth[outside].double().numpy())) < _ORDERED:
         return ()
-    times = math.exp(float(log_error[in_group].median()))
+    times_as_far = math.exp(float(log_error[in_group].median()))
     column, row = points.xy[in_group].median(dim=0).values.tolist()
     return (
         f"warning: {count:,} of {len(points):,} points, around ({column:.0f}, {row:.0f}), agree"
-        f" with each other but are {times:.2g} times as far as network"
+        f" with each other but are {times_as_far:.2g} times as far as network"
         f" {definition.name!r} says, which fits the others to {fit.error:.1%}: a"
         " mirror, or a surface behind a pane? They count as depth; --sparse-mask leaves points"
         " out",

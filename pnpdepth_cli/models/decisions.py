@@ -108,6 +108,7 @@ def recall_or_decide_layers(
     names = {name for name, _ in module.named_modules()}
 
     def are_layers(answer: list[str]) -> bool:
+        """Whether a kept answer names layers, all of which the network has."""
         return bool(answer) and names.issuperset(answer)
 
     file = definition.checkpoint if definition.complete else None

@@ -146,7 +146,8 @@ class FileGraph(nn.Module):
                 one that nothing reads.
             is_layer: Whether the operation is a submodule, at which the network can be cut.
         """
-        while hasattr(self, name) or name in self._modules:  # as of a node named `to`
+        # A node of the file may be called `to`, as a method of every module is.
+        while hasattr(self, name) or name in self._modules:
             name += "_"
         # fx calls a submodule by its name, and a function itself.
         if is_layer:
@@ -184,8 +185,8 @@ class FileGraph(nn.Module):
         if sizes in self._checked_sizes:
             return _Runner(self, math.inf).run(*inputs)
         # The first run of a size is under limits that follow from inputs and weights.
-        held = _elements([*inputs, *self.parameters(), *self.buffers()])
-        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * held)
+        stored_elements = _elements([*inputs, *self.parameters(), *self.buffers()])
+        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * stored_elements)
         pixels = max([tensor.shape[-2:].numel() for tensor in inputs], default=0)
         work = _WORK_PER_PIXEL * max(pixels, _LEAST_PIXELS)
         with SizeLimit(largest, work=work, work_is="of any published depth network"):

@@ -278,11 +278,13 @@ def _verify(
         return [_AGREES]
 
     def is_agreement(answer: list[str]) -> bool:
+        """Whether a kept answer is this note."""
         return answer == [_AGREES]
 
     sizes = [(tuple(tensor.shape), tensor.device.type) for tensor in arguments]
-    known_file = file if is_whole else None
-    recall_or_decide(module, known_file, f"agrees for {sizes}", compare, is_agreement)
+    # Without a file, no agreement is kept.
+    kept_by = file if is_whole else None
+    recall_or_decide(module, kept_by, f"agrees for {sizes}", compare, is_agreement)
     return _AGREES
 
 

@@ -65,6 +65,7 @@ def operator(*names: str, host_inputs: tuple[int, ...] = ()) -> Callable[[Operat
     """
 
     def enter(function: Operator) -> Operator:
+        """Enters the function in both tables, and returns it as it is."""
         for name in names:
             OPERATORS[name] = function
             HOST_INPUTS[name] = host_inputs
