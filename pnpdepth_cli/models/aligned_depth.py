@@ -169,7 +169,10 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
         return ()
     note = f"prediction: {unknown_fraction:.2%} of the image is inf or NaN, so it is unknown there"
     if lost_points:
-        note += f"; {lost_points:,} of {len(is_predicted):,} sparse points are there, and not in the loss"
+        note += (
+            f"; {lost_points:,} of {len(is_predicted):,} sparse points are there, and not in the"
+            " loss"
+        )
     if lost_points > _MOST_LOST * len(is_predicted):
         return (f"warning: {note}; are the network's weights and input range (`normalise`) right?",)
     return (note,)
@@ -196,6 +199,7 @@ def _order_notes(
     direction = 1 if align == "none" else _FARTHER.get(stated, 0)
     farness = direction * at_points.cpu().double().numpy()
     rank = rank_correlation(farness, points.depth.cpu().double().numpy())
+    # Few points may have any order by chance.
     if rank > _REVERSED or not is_reversed(rank, len(points)):
         return ()
     return (

@@ -241,6 +241,7 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
+        # Fields with a list of choices, then the types of others, and those that are called.
         _check_choice(self, "input_kind", InputKind)
         _check_choice(self, "output_kind", OutputKind)
         _check_choice(self, "output_scale", OutputScale)

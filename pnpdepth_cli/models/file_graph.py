@@ -312,7 +312,7 @@ def _result_without_memory(
     Raises:
         ModelError: The size of the result follows from values.
     """
-    # An operation that makes a tensor of none is told the device.
+    # An operation that gets no tensor, or a device, makes a tensor; it is told the meta device.
     makes_tensor = "device" in kwargs or not _tensors_in((args, kwargs))
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
     if makes_tensor:

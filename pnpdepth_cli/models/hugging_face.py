@@ -195,7 +195,7 @@ def _check_settings(value: object, *, is_attention: bool = False) -> None:
         value: Content of config.json, or any value in it.
         is_attention: Whether a text in it names an implementation of attention.
     """
-    # NaN is larger than any number, too.
+    # Written so that NaN is refused, too.
     if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
         raise InputError(f"{str(value)[:_MAX_DIGITS]} is larger than any part of a network")
     if is_attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:

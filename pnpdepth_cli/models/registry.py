@@ -237,6 +237,7 @@ def importing_beside(spec: str) -> Iterator[None]:
     The file itself runs inside this context, and so must a `build` that imports when it is called.
     If `spec` names no Python file, nothing changes.
     """
+    # FILE.py, or FILE.py:ATTRIBUTE.
     file = Path(spec if spec.endswith(".py") else spec.rpartition(":")[0])
     if file.suffix != ".py":
         yield

@@ -315,7 +315,7 @@ def _compare(
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
         expected = torch.from_numpy(session.run(None, feed)[0]).float()
     deviation = _deviation(actual, expected)
-    if not deviation <= MISMATCH:  # NaN is none
+    if not deviation <= MISMATCH:  # written so that NaN is refused, too
         raise ModelError(
             f"ONNX file {file}: its reading by torch differs from onnxruntime's by {deviation:.2g}"
             " of the output's range"
@@ -489,7 +489,8 @@ def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
 def _layer_name(proto: NodeProto) -> str:
     """Returns the name of a node for --layer; of one without a name, its operator and output.
 
-    Characters with a meaning in the names of layers become underscores.
+    A name of digits and dots alone gets the operator in front. Characters with a meaning in the
+    names of layers become underscores.
     """
     name = proto.name or f"{proto.op_type}_{''.join(proto.output[:1])}"
     if name.replace(".", "").isdigit():

@@ -98,7 +98,8 @@ def conv(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
-    if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
+    # torch would copy the pixels below each kernel position.
+    if x.dtype == torch.float64:
         raise ModelError("double precision")
     stride, dilation, pads = _window(node, x, weight.shape[2:])
     # torch pads both ends of an axis alike; unlike ends are padded before.

@@ -137,7 +137,7 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
             fact = f"{chosen!r} is read, not {others}; {path.name}:KEY chooses"
             notes.append(f"checkpoint {path.name}: {fact}")
         return states[chosen]
-    # Or the entry has it in it, beside other things.
+    # Or the named entry has the state dict in it, beside other things.
     if key in content:
         return _state_in(content[key], path, "", notes)
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"

@@ -179,7 +179,7 @@ class _Unpickler(pickle._Unpickler):
         }
 
     def _step(self, handler: Callable[[], None], _: object) -> None:
-        """Handles one opcode; the machine calls this."""
+        """Handles one opcode; the machine calls this with itself, to which the handler is bound."""
         self._charge(1)
         try:
             handler()
@@ -200,7 +200,9 @@ class _Unpickler(pickle._Unpickler):
         return StandIn(f"{module}.{name}")
 
     def persistent_load(self, pid: object) -> object:
-        """Returns the storage, or the class without its source text, that a torch file's id names.
+        """Returns what an id in a torch file names: a storage as a tensor, or a class.
+
+        The source text that the id has of a class is left out.
 
         Raises:
             InputError: The id names anything else.
