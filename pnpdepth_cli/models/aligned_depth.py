@@ -19,6 +19,7 @@ from pnpdepth_cli.completion.alignment import (
     candidates,
 )
 from pnpdepth_cli.completion.outliers import off_together
+from pnpdepth_cli.completion.robust_line import MAX_ERROR
 from pnpdepth_cli.completion.two_depths import is_reversed, rank_correlation
 from pnpdepth_cli.models.definition import ModelDefinition
 from pnpdepth_cli.models.network import Network
@@ -49,9 +50,9 @@ _FITS_WELL = 0.05
 """Error of log depth over the best 70 % of the points up to which a network fits them."""
 _STANDS_OUT = 10.0
 """A point stands out if its error of log depth is this many times that of the best 70 %."""
-_LEAST_THAT_STANDS_OUT = 0.2
+_NEVER_STANDS_OUT = 0.2
 """Error of log depth below which no point stands out."""
-_MOST_THAT_DOES_NOT = 0.35
+_ALWAYS_STANDS_OUT = 0.35
 """Error of log depth above which every point stands out."""
 _ORDERED = 0.9
 """Rank correlation with the points that do not stand out, from which on a network knows which is
@@ -124,8 +125,9 @@ class AlignedDepth:
         self.alignment = fits[0]
         self.notes += _fit_notes(self.alignment, self._align, prediction)
         self.notes += _misfit_notes(self.alignment, definition, points)
-        stated = {self._align, READING_OF_KIND.get(definition.output_kind)}
-        if self.alignment.reading not in stated:
+        # Where neither option nor definition says what the output is, it may be something else.
+        stated_readings = {self._align, READING_OF_KIND.get(definition.output_kind)}
+        if self.alignment.reading not in stated_readings:
             self.notes += _ambiguity_notes(fits, prediction)
         self.notes += _group_notes(self.alignment, definition, at_points, points)
 
@@ -161,14 +163,17 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
         prediction: (1, 1, h, w), NaN where the network says nothing, such as of the sky.
         is_predicted: (N,) bool, whether the prediction is known at each point.
     """
-    unknown = float(prediction.isnan().cpu().double().mean())
-    lost = int((~is_predicted).sum())
-    if lost == 0 and unknown < _FEW_UNKNOWN:
+    unknown_fraction = float(prediction.isnan().cpu().double().mean())
+    lost_points = int((~is_predicted).sum())
+    if lost_points == 0 and unknown_fraction < _FEW_UNKNOWN:
         return ()
-    note = f"prediction: {unknown:.2%} of the image is inf or NaN, so it is unknown there"
-    if lost:
-        note += f"; {lost:,} of {len(is_predicted):,} sparse points are there, and not in the loss"
-    if lost > _MOST_LOST * len(is_predicted):
+    note = f"prediction: {unknown_fraction:.2%} of the image is inf or NaN, so it is unknown there"
+    if lost_points:
+        note += (
+            f"; {lost_points:,} of {len(is_predicted):,} sparse points are there, and not in the"
+            " loss"
+        )
+    if lost_points > _MOST_LOST * len(is_predicted):
         return (f"warning: {note}; are the network's weights and input range (`normalise`) right?",)
     return (note,)
 
@@ -176,7 +181,7 @@ def _unknown_notes(prediction: Tensor, is_predicted: Tensor) -> tuple[str, ...]:
 def _order_notes(
     definition: ModelDefinition, align: str, at_points: Tensor, points: SparsePoints
 ) -> tuple[str, ...]:
-    """Returns a warning if what the points have as nearer is farther by the network; else none.
+    """Returns a warning if what is nearer by the points is farther by the network; else none.
 
     Then the points may hold disparity, or the network's output is not what it is said to be.
 
@@ -194,6 +199,7 @@ def _order_notes(
     direction = 1 if align == "none" else _FARTHER.get(stated, 0)
     farness = direction * at_points.cpu().double().numpy()
     rank = rank_correlation(farness, points.depth.cpu().double().numpy())
+    # Few points may have any order by chance.
     if rank > _REVERSED or not is_reversed(rank, len(points)):
         return ()
     return (
@@ -216,18 +222,24 @@ def _metric_notes(at_points: Tensor, points: SparsePoints) -> tuple[str, ...]:
 
 
 def _fit_notes(fit: Alignment, align: str, prediction: Tensor) -> tuple[str, ...]:
-    """Returns notes on how the output is aligned, and on pixels (1, 1, h, w) out of its bounds."""
+    """Returns a note on how the output is aligned, and one if pixels are out of the fit's bounds.
+
+    Args:
+        fit: Alignment of the network's output with the points.
+        align: One of `choices.ALIGNMENTS`.
+        prediction: (1, 1, h, w) the network's own numbers, NaN where unknown.
+    """
     decided = " (decided from the points)" if align not in FITS else ""
     alignment_note = (
         f"alignment: {fit}{decided}; {fit.points:,} points, off by {fit.error:.1%} of depth"
         f" over the best 70 %, {fit.outliers:.0%} outliers"
     )
-    beyond = fit.beyond(prediction)
-    if beyond == 0:
+    fraction_beyond = fit.beyond(prediction)
+    if fraction_beyond == 0:
         return (alignment_note,)
     near, far = fit.bounds
     bounds_note = (
-        f"alignment: {beyond:.2%} of the image came out nearer than {near:.3g} m or"
+        f"alignment: {fraction_beyond:.2%} of the image came out nearer than {near:.3g} m or"
         f" farther than {far:.3g} m, or at no depth at all, and reads as these bounds"
     )
     return (alignment_note, bounds_note)
@@ -258,7 +270,7 @@ def _misfit_notes(
         )
     # What the misfit would be if the prediction were the median depth of the points everywhere.
     log_depth = points.depth.cpu().double().log()
-    of_median = float((log_depth - log_depth.median()).abs().clamp(max=1.0).mean())
+    of_median = float((log_depth - log_depth.median()).abs().clamp(max=MAX_ERROR).mean())
     if len(points) >= _ENOUGH_POINTS and fit.misfit > _NO_BETTER * of_median:
         warnings.append(
             f"warning: network {definition.name!r} says nothing about this scene:"
@@ -309,27 +321,30 @@ def _group_notes(
         at_points: (N,) the network's output at the points.
         points: The N points.
     """
+    # The output of a network that takes the points follows them, and only many points that it fits
+    # well tell a good network.
     takes_points = "sparse" in definition.input_kind
     if takes_points or len(points) < _ENOUGH_POINTS or fit.error > _FITS_WELL:
         return ()
-    # Neighbours that are off by about the same factor.
-    points = points.tensors()
+    # Neighbours that are off by about the same factor, by log measured − log predicted depth.
+    points = points.tensors()  # on the CPU
     log_error = points.depth.log() - fit.depth(at_points.cpu().double()).log().float()
-    least = max(_STANDS_OUT * fit.error, _LEAST_THAT_STANDS_OUT)
-    in_group = off_together(points, log_error, min(least, _MOST_THAT_DOES_NOT))
+    least = max(_STANDS_OUT * fit.error, _NEVER_STANDS_OUT)
+    least = min(least, _ALWAYS_STANDS_OUT)
+    in_group = off_together(points, log_error, least)
     count = int(in_group.sum())
     if count < _LARGE_GROUP * len(points):
         return ()
-    # The network must be right about all the others.
+    # The network must order all other points by depth, with numbers that grow or shrink.
     outside = ~in_group
     numbers = at_points.cpu().double()[outside].numpy()
     if abs(rank_correlation(numbers, points.depth[outside].double().numpy())) < _ORDERED:
         return ()
-    times = math.exp(float(log_error[in_group].median()))
+    times_as_far = math.exp(float(log_error[in_group].median()))
     column, row = points.xy[in_group].median(dim=0).values.tolist()
     return (
         f"warning: {count:,} of {len(points):,} points, around ({column:.0f}, {row:.0f}), agree"
-        f" with each other but are {times:.2g} times as far as network"
+        f" with each other but are {times_as_far:.2g} times as far as network"
         f" {definition.name!r} says, which fits the others to {fit.error:.1%}: a"
         " mirror, or a surface behind a pane? They count as depth; --sparse-mask leaves points"
         " out",

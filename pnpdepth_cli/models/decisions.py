@@ -49,7 +49,7 @@ _DIGESTS = WeakKeyDictionary["nn.Module", str]()
 
 
 def cache_folder() -> Path:
-    """Returns the folder of the networks' files, which need not be there."""
+    """Returns the folder of the cache files, one for each network; it need not exist."""
     stated = os.environ.get(FOLDER)
     if stated:
         return Path(stated)
@@ -108,6 +108,7 @@ def recall_or_decide_layers(
     names = {name for name, _ in module.named_modules()}
 
     def are_layers(answer: list[str]) -> bool:
+        """Whether a kept answer names layers, all of which the network has."""
         return bool(answer) and names.issuperset(answer)
 
     file = definition.checkpoint if definition.complete else None
@@ -115,12 +116,12 @@ def recall_or_decide_layers(
 
 
 def kept_files() -> list[Path]:
-    """Returns the paths of all networks' files."""
+    """Returns the paths of the cache files of all networks."""
     return sorted(cache_folder().glob("*.json"))
 
 
 def forget() -> None:
-    """Removes the files of all networks, and what interrupted runs have left of them.
+    """Removes the cache files of all networks, and what interrupted runs have left of such.
 
     Raises:
         OutputError: A file cannot be removed.
@@ -210,7 +211,7 @@ def _read(path: Path) -> dict[str, list[str]]:
 
 
 def _write(path: Path, answers: dict[str, list[str]]) -> None:
-    """Replaces a file by these answers, of many the first ones; or leaves it if it cannot."""
+    """Replaces a file by the first `_MOST_ANSWERS` of the answers; leaves it if that fails."""
     first_answers = dict(list(answers.items())[:_MOST_ANSWERS])
     content = json.dumps({"versions": _versions(), "answers": first_answers}, indent=1)
     # Without the file, the next run decides again.

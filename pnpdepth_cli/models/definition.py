@@ -34,6 +34,7 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
+_MAX_SHAPES = 80  # characters of the shapes of a file's inputs that are shown
 
 
 def _check(owner: object, field: str, is_valid: bool, wanted: str) -> None:
@@ -240,6 +241,7 @@ class ModelDefinition:
     """What was assumed where no definition was given; it is printed."""
 
     def __post_init__(self) -> None:
+        # Fields with a list of choices, then the types of others, and those that are called.
         _check_choice(self, "input_kind", InputKind)
         _check_choice(self, "output_kind", OutputKind)
         _check_choice(self, "output_scale", OutputScale)
@@ -271,6 +273,7 @@ class ModelDefinition:
         """How the output is aligned if no option says it, one of `choices.ALIGNMENTS`."""
         if self.defaults.align:
             return self.defaults.align
+        # Numbers that are said to be metres, as such or as their inverse or log, need no fit.
         is_metric = self.output_scale == "metric" and self.output_kind != "unknown"
         return "none" if is_metric else "auto"
 
@@ -284,6 +287,7 @@ class ModelDefinition:
             sparse: Sparse depth (1, 1, H, W) in metres with 0 = unknown; None if it takes none.
             intrinsics: Camera matrix (1, 3, 3) in pixels of the image; None if it takes none.
         """
+        # By the definition's own function; without one, in the order of `input_kind`.
         if self.arguments is not None and self.takes_intrinsics:
             return self.arguments(rgb, sparse, intrinsics)
         if self.arguments is not None:
@@ -328,7 +332,7 @@ def graph_definition(
         **read: Fields that were read in the file; `build` must be among them.
 
     Raises:
-        ModelError: The inputs are others than those stated, or without that one rgb image.
+        ModelError: The inputs are not those that are stated, or, where none are, not one rgb image.
     """
     # As many inputs as are stated, one rgb image where nothing is.
     kind = str(stated.get("input_kind", "rgb"))
@@ -340,8 +344,9 @@ def graph_definition(
     if size is None or len(shapes) != len(wanted):
         listed = ", ".join("×".join(map(str, shape)) for shape in shapes)
         raise ModelError(
-            f"{file} has {len(shapes)} input(s), {listed[:80]}, where {' and '.join(wanted)} is"
-            " expected, the image as 1×3×H×W or 1×H×W×3; `input_kind` of a definition says others"
+            f"{file} has {len(shapes)} input(s), {listed[:_MAX_SHAPES]}, where"
+            f" {' and '.join(wanted)} is expected, the image as 1×3×H×W or 1×H×W×3;"
+            " `input_kind` of a definition says others"
         )
     height, width = size
 

@@ -146,7 +146,8 @@ class FileGraph(nn.Module):
                 one that nothing reads.
             is_layer: Whether the operation is a submodule, at which the network can be cut.
         """
-        while hasattr(self, name) or name in self._modules:  # as of a node named `to`
+        # A node of the file may be called `to`, as a method of every module is.
+        while hasattr(self, name) or name in self._modules:
             name += "_"
         # fx calls a submodule by its name, and a function itself.
         if is_layer:
@@ -177,14 +178,15 @@ class FileGraph(nn.Module):
         """Returns the output, or a tuple of several.
 
         Raises:
-            ModelError: A result is too large, all at a time are, or it is too much arithmetic.
+            ModelError: One result is too large, all values at a time are, or there is too much
+                arithmetic.
         """
         sizes = tuple(tensor.shape for tensor in inputs)
         if sizes in self._checked_sizes:
             return _Runner(self, math.inf).run(*inputs)
         # The first run of a size is under limits that follow from inputs and weights.
-        held = _elements([*inputs, *self.parameters(), *self.buffers()])
-        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * held)
+        stored_elements = _elements([*inputs, *self.parameters(), *self.buffers()])
+        largest = max(_ACTIVATION_ELEMENTS, _ACTIVATION_GROWTH * stored_elements)
         pixels = max([tensor.shape[-2:].numel() for tensor in inputs], default=0)
         work = _WORK_PER_PIXEL * max(pixels, _LEAST_PIXELS)
         with SizeLimit(largest, work=work, work_is="of any published depth network"):
@@ -198,13 +200,13 @@ class _Runner(fx.Interpreter):
 
     Args:
         module: The graph.
-        most: Elements that all values may have together at a time; infinite for no limit.
+        most_elements: Elements that all values may have together at a time; infinite for no limit.
     """
 
-    def __init__(self, module: FileGraph, most: float) -> None:
+    def __init__(self, module: FileGraph, most_elements: float) -> None:
         super().__init__(module, graph=module._graph)
         self.extra_traceback = False  # errors are shown by the operation's title
-        self._most = most
+        self._most_elements = most_elements
 
     def call_module(
         self, target: Target, args: tuple[Argument, ...], kwargs: dict[str, object]
@@ -222,10 +224,11 @@ class _Runner(fx.Interpreter):
         """
         args, kwargs = self.fetch_args_kwargs_from_env(node)
         result = getattr(self, node.op)(node.target, args, kwargs)
-        if self._most < math.inf and _elements([*self.env.values(), result]) > self._most:
+        is_limited = self._most_elements < math.inf
+        if is_limited and _elements([*self.env.values(), result]) > self._most_elements:
             raise ModelError(
-                f"operation {node.name!r}: more than {self._most:,} elements at a time, far more"
-                " than image and weights"
+                f"operation {node.name!r}: more than {self._most_elements:,} elements at a time,"
+                " far more than image and weights"
             )
         return result
 
@@ -309,7 +312,7 @@ def _result_without_memory(
     Raises:
         ModelError: The size of the result follows from values.
     """
-    # An operation that makes a tensor of none is told the device.
+    # An operation that gets no tensor, or a device, makes a tensor; it is told the meta device.
     makes_tensor = "device" in kwargs or not _tensors_in((args, kwargs))
     args, kwargs = tree_map_only(Tensor, lambda tensor: tensor.to("meta"), (args, kwargs))
     if makes_tensor:
@@ -355,7 +358,7 @@ def result_without_values(
 def _is_elementwise(func: OpOverload) -> bool:
     """Whether an operation makes one new tensor, each element from one element of each argument.
 
-    And of the arguments' type: those that make true or false are none.
+    Those whose results are true or false do not count: the result has the arguments' type.
     """
     if torch.Tag.pointwise not in func.tags or func._schema.is_mutable:
         return False

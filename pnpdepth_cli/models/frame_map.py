@@ -120,7 +120,7 @@ def _shrink(image: tuple[int, int], longest: int | None) -> tuple[int, int]:
     """
     height, width = image
     longer_side = max(height, width)
-    factor = min(1.0, (longest or longer_side) / longer_side)
+    factor = 1.0 if longest is None else min(1.0, longest / longer_side)
     return max(1, round(height * factor)), max(1, round(width * factor))
 
 

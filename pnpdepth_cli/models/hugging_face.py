@@ -34,6 +34,10 @@ _LARGEST_NUMBER = 1e6
 """Largest number in a config.json; no network has more of any part."""
 _MAX_SHOWN = 60
 """Characters of a wrong value that are shown."""
+_MAX_DIGITS = 20
+"""Characters of a wrong number that are shown."""
+_SHOWN_NAMES = 4
+"""Names of missing weights that are shown."""
 _PLAIN_ATTENTION = ("eager", "sdpa")
 """Attention that is torch's own code; any other name may be that of a package to fetch."""
 
@@ -191,9 +195,9 @@ def _check_settings(value: object, *, is_attention: bool = False) -> None:
         value: Content of config.json, or any value in it.
         is_attention: Whether a text in it names an implementation of attention.
     """
-    # NaN is larger than any number, too.
+    # Written so that NaN is refused, too.
     if isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
-        raise InputError(f"{str(value)[:20]} is larger than any part of a network")
+        raise InputError(f"{str(value)[:_MAX_DIGITS]} is larger than any part of a network")
     if is_attention and isinstance(value, str) and value not in _PLAIN_ATTENTION:
         raise InputError(
             f"attn_implementation {value[:_MAX_SHOWN]!r} may fetch and run code; only"
@@ -264,7 +268,7 @@ def _build(folder: Path, kind: str) -> nn.Module:
     if missing:
         raise ModelError(
             f"{folder}: its weights leave {len(missing)} of the network's out or of another shape"
-            f" ({', '.join(sorted(missing)[:4])}); take both files from one page"
+            f" ({', '.join(sorted(missing)[:_SHOWN_NAMES])}); take both files from one page"
         )
     network: nn.Module = module.float()
     return network

@@ -293,7 +293,7 @@ def _load(spec: str | ModelDefinition, checkpoint: Path | None, device: str) -> 
     torch_device = find_device(device)
     definition = find_definition(spec) if isinstance(spec, str) else spec
     title = f"network {definition.name!r}"
-    # The module, as large as may be.
+    # The module, unless its images would be larger than is allowed.
     module = _build(definition, spec if isinstance(spec, str) else None)
     _check_image_size(definition)
     # Its weights.

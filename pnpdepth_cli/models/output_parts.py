@@ -30,11 +30,16 @@ class NamedOutput(NamedTuple):
 
 
 def split_parts(spec: str) -> NamedOutput:
-    """Returns `net.onnx:points` and ("z",) of `net.onnx:points[z]`."""
+    """Returns a network as it is named without brackets, and the names in these; () without any.
+
+    `net.onnx:points[z]` gives `net.onnx:points` and ("z",); `net.pt2:[1]` gives `net.pt2` and
+    ("1",).
+    """
     match = _NETWORK_AND_PARTS.fullmatch(spec)
     if match is None:
         return NamedOutput(spec, ())
     network, brackets = match.groups()
+    # FILE: before brackets names no output.
     return NamedOutput(network.removesuffix(":"), tuple(_PART.findall(brackets)))
 
 

@@ -88,7 +88,8 @@ def find_definition(spec: str) -> ModelDefinition:
     Raises:
         ModelError: There is no such name or file, or it does not define a network.
     """
-    # A network is mostly named FAMILY or FAMILY-VARIANT; then no other family is loaded.
+    # A network is mostly named FAMILY or FAMILY-VARIANT; then no other family is loaded. Of several
+    # families that the name begins with, the longest is tried first.
     families = [
         family for family in choices.NETWORKS if spec == family or spec.startswith(f"{family}-")
     ]
@@ -236,6 +237,7 @@ def importing_beside(spec: str) -> Iterator[None]:
     The file itself runs inside this context, and so must a `build` that imports when it is called.
     If `spec` names no Python file, nothing changes.
     """
+    # FILE.py, or FILE.py:ATTRIBUTE.
     file = Path(spec if spec.endswith(".py") else spec.rpartition(":")[0])
     if file.suffix != ".py":
         yield

@@ -44,6 +44,8 @@ _KEYWORD = 2
 
 _MAX_SHOWN = 80
 """Characters of a wrong name that are shown."""
+_MAX_KIND = 40
+"""Characters of the kind of an argument or a result that are shown."""
 
 _Json = Mapping[str, Any]
 """An object of the archive's JSON; what is not as expected in it raises one of CONTENT_ERRORS."""
@@ -119,7 +121,7 @@ def _graph(program: _Json, tensors: Mapping[str, Tensor]) -> FileGraph:
         elif kind in ("parameter", "buffer", "tensor_constant"):
             graph.add_tensor(value["arg"]["name"], tensors[value[f"{kind}_name"]])
         else:
-            raise InputError(f"its input is a {str(kind)[:40]!r}")
+            raise InputError(f"its input is a {str(kind)[:_MAX_KIND]!r}")
     # Operations. One without a result only checks what the exporter saw.
     for node in module["graph"]["nodes"]:
         if node["outputs"]:
@@ -199,7 +201,8 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
     Raises:
         InputError: The argument is of a kind that is not taken, such as a computed size.
     """
-    # An optional and a symbolic value are written as the plain one.
+    # The kind without what says that it may be None or computed: "tensors" of
+    # "as_optional_tensors", and "int" of "as_sym_int".
     ((kind, value),) = dict(stated).items()
     match kind.removeprefix("as_").replace("optional_", "").replace("sym_", ""):
         case "none":
@@ -210,14 +213,16 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return float(value)  # JSON has a text for an infinite one
         case "tensor" | "int" | "float" | "bool" | "string":
             return _argument(value, values) if isinstance(value, Mapping) else value
-        # A list, whose entries may be stated or computed.
+        # A list. Its entries are plain values, nodes by `name`, or state their own kind, as where
+        # only some of them are None.
         case "tensors" | "ints" | "floats" | "bools":
-            kind = kind.removesuffix("s")
-            entries = [
-                entry if isinstance(entry, Mapping) and "name" not in entry else {kind: entry}
-                for entry in value
-            ]
-            return [_argument(entry, values) for entry in entries]
+            kind_of_entry = kind.removesuffix("s")
+            entries = list[Argument]()
+            for entry in value:
+                states_kind = isinstance(entry, Mapping) and "name" not in entry
+                stated_entry = entry if states_kind else {kind_of_entry: entry}
+                entries.append(_argument(stated_entry, values))
+            return entries
         # Names of torch's own constants.
         case "scalar_type":
             return _DTYPES[value]
@@ -227,7 +232,7 @@ def _argument(stated: _Json, values: Mapping[str, fx.Node]) -> Argument:
             return torch.device(value["type"])
         case "layout" if value == _STRIDED:
             return torch.strided
-    raise InputError(f"it has an argument {str(kind)[:40]!r}")
+    raise InputError(f"it has an argument {str(kind)[:_MAX_KIND]!r}")
 
 
 def _output_names(stated: _Json) -> list[str | None]:
@@ -246,4 +251,4 @@ def _output_names(stated: _Json) -> list[str | None]:
             return [tensor["name"] for tensor in tensors]
         case {"as_none": _}:
             return [None]
-    raise InputError(f"it computes {str([*stated])[:40]}; export it with fixed sizes")
+    raise InputError(f"it computes {str([*stated])[:_MAX_KIND]}; export it with fixed sizes")

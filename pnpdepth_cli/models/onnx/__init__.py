@@ -156,7 +156,8 @@ def _load_external(model: ModelProto, folder: Path) -> bool:
         for tensor in external._get_all_tensors(model)
         if external.uses_external_data(tensor)
     ]
-    # All of them together claim no more than the files have.
+    # All of them together claim no more than the files have; one without a length claims the whole
+    # file.
     sizes = dict[str, int]()
     for location in dict.fromkeys(claim.location for claim in claims):
         check_network_file(folder / location, "its file")
@@ -277,11 +278,13 @@ def _verify(
         return [_AGREES]
 
     def is_agreement(answer: list[str]) -> bool:
+        """Whether a kept answer is this note."""
         return answer == [_AGREES]
 
     sizes = [(tuple(tensor.shape), tensor.device.type) for tensor in arguments]
-    known_file = file if is_whole else None
-    recall_or_decide(module, known_file, f"agrees for {sizes}", compare, is_agreement)
+    # Without a file, no agreement is kept.
+    kept_by = file if is_whole else None
+    recall_or_decide(module, kept_by, f"agrees for {sizes}", compare, is_agreement)
     return _AGREES
 
 
@@ -312,7 +315,7 @@ def _compare(
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
         expected = torch.from_numpy(session.run(None, feed)[0]).float()
     deviation = _deviation(actual, expected)
-    if not deviation <= MISMATCH:  # NaN is none
+    if not deviation <= MISMATCH:  # written so that NaN is refused, too
         raise ModelError(
             f"ONNX file {file}: its reading by torch differs from onnxruntime's by {deviation:.2g}"
             " of the output's range"
@@ -486,7 +489,8 @@ def _check_operators(nodes: Sequence[NodeProto], path: Path) -> None:
 def _layer_name(proto: NodeProto) -> str:
     """Returns the name of a node for --layer; of one without a name, its operator and output.
 
-    Characters with a meaning in the names of layers become underscores.
+    A name of digits and dots alone gets the operator in front. Characters with a meaning in the
+    names of layers become underscores.
     """
     name = proto.name or f"{proto.op_type}_{''.join(proto.output[:1])}"
     if name.replace(".", "").isdigit():

@@ -98,7 +98,8 @@ def conv(node: Node, inputs: Inputs) -> Tensor:
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
-    if x.dtype == torch.float64:  # computed with a copy of the pixels below each kernel position
+    # torch would copy the pixels below each kernel position.
+    if x.dtype == torch.float64:
         raise ModelError("double precision")
     stride, dilation, pads = _window(node, x, weight.shape[2:])
     # torch pads both ends of an axis alike; unlike ends are padded before.
@@ -173,7 +174,7 @@ def _pooling(node: Node, x: Tensor) -> tuple[dict[str, Any], list[int]]:
 
 @operator("MaxPool")
 def max_pool(node: Node, inputs: Inputs) -> Tensor:
-    """Returns the largest value under each position of the kernel; what is padded never is."""
+    """Returns the largest value of the input under each position of the kernel, without padding."""
     x = inputs[0]
     arguments, pads = _pooling(node, x)
     if pads:
@@ -184,7 +185,9 @@ def max_pool(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("AveragePool")
 def average_pool(node: Node, inputs: Inputs) -> Tensor:
-    """Returns the mean under each position of the kernel, of padded zeros too if it says so.
+    """Returns the mean under each position of the kernel.
+
+    Padded zeros count if the node's `count_include_pad` is 1.
 
     Raises:
         ModelError: The input has other than two spatial axes, or the kernel is dilated.
@@ -222,7 +225,7 @@ def batch_norm(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("LayerNormalization")
 def layer_norm(node: Node, inputs: Inputs) -> Tensor:
-    """Returns the input normalised over all axes from one on, scaled and shifted."""
+    """Returns the input normalised over an axis and all behind it, scaled and shifted."""
     x = inputs[0]
     weight = inputs[1]
     bias = optional(inputs, 2)
@@ -269,7 +272,7 @@ def resize(node: Node, inputs: Inputs) -> Tensor:
         return resized
     for axis, (size, factor) in enumerate(zip(sizes, factors, strict=True)):
         if factor != 1:
-            x = _along(x, axis, _weights(node, x.shape[axis], size, factor))
+            x = _weighted_sums(x, axis, _weights(node, x.shape[axis], size, factor))
     return x
 
 
@@ -309,7 +312,7 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
     are_whole = all(factor >= 1 and factor == int(factor) for factor in factors)
     if mode == "nearest" and are_whole and node.get("nearest_mode") == "floor":
         return F.interpolate(x, size) if coordinates == "asymmetric" else None
-    # Bilinear interpolation; of one pixel, the two kinds of half pixels differ.
+    # Bilinear interpolation. The two kinds of half pixels differ where a side becomes one pixel.
     by_corners = coordinates == "align_corners"
     by_half_pixels = coordinates in ("half_pixel", "pytorch_half_pixel") and min(size) > 1
     if mode == "linear" and (by_half_pixels or by_corners):
@@ -317,17 +320,18 @@ def _by_torch(x: Tensor, node: Node, factors: list[float], sizes: list[int]) -> 
     return None
 
 
-def _along(x: Tensor, axis: int, weights: Tensor) -> Tensor:
-    """Returns the weighted sums of a tensor's entries along an axis.
+def _weighted_sums(x: Tensor, axis: int, weights: Tensor) -> Tensor:
+    """Returns a tensor whose entries along an axis are weighted sums of those of another.
 
     Args:
-        x: The tensor, whose axis has `size` entries.
+        x: The other tensor, of `size` entries along the axis.
         axis: Number of the axis.
         weights: (out, size): entry n of the result is the sum over k of weights[n, k] · x[k].
     """
     weights_shape = [1] * x.ndim
     weights_shape[axis] = -1
-    # Only weights that are not 0 count. Each row has few, (out, count) with their numbers.
+    # Each row has few weights that are not 0, at most `count`: (out, count) weights and the numbers
+    # k of their entries. A row with fewer is filled with weights of 0.
     count = int(weights.ne(0).sum(1).max())
     indices = weights.abs().topk(count, dim=1).indices
     largest = weights.gather(1, indices).to(x)

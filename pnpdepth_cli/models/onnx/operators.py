@@ -65,6 +65,7 @@ def operator(*names: str, host_inputs: tuple[int, ...] = ()) -> Callable[[Operat
     """
 
     def enter(function: Operator) -> Operator:
+        """Enters the function in both tables, and returns it as it is."""
         for name in names:
             OPERATORS[name] = function
             HOST_INPUTS[name] = host_inputs
@@ -74,7 +75,7 @@ def operator(*names: str, host_inputs: tuple[int, ...] = ()) -> Callable[[Operat
 
 
 def register(functions: Mapping[str, Operator], host_inputs: tuple[int, ...] = ()) -> None:
-    """Enters the functions of operators by their names, for those that are one expression.
+    """Enters functions as those of operators, as the decorator `operator` does for one.
 
     Args:
         functions: Functions by the name of the operator.
@@ -207,7 +208,10 @@ def clip(node: Node, inputs: Inputs) -> Tensor:
 
 @operator("Softmax", "LogSoftmax")
 def softmax(node: Node, inputs: Inputs) -> Tensor:
-    """Returns the softmax, or its logarithm, over an axis; before opset 13 over all from it on."""
+    """Returns the softmax, or its logarithm, over an axis.
+
+    Before opset 13, it is over that axis and all behind it, as if they were one.
+    """
     x = inputs[0]
     function = torch.softmax if node.op == "Softmax" else torch.log_softmax
     if node.opset >= 13:

@@ -67,7 +67,7 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
     if path.is_dir():
         return _read_folder(path, notes)
     check_network_file(path, "checkpoint")
-    # Its reader gives named tensors, or what a torch file holds.
+    # The reader gives named tensors; that of torch files gives all that the file holds.
     kind, read = _READERS.get(path.suffix, ("torch file", read_torch_file))
     what = f"checkpoint {path} cannot be read as a {kind}"
     with wrap_content_errors(what, SafetensorError):
@@ -76,7 +76,7 @@ def read_checkpoint(path: Path, notes: list[str] | None = None) -> dict[str, Ten
         if key:
             raise ModelError(f"checkpoint {path} is a {kind}, which has no {key!r} to choose")
         return content
-    # The state dict in that.
+    # The state dict in all that a torch file holds.
     whole, names = content
     if names:
         notes.append(f"checkpoint {path.name}: its pickle names {_some(names)}; none of it was run")
@@ -137,7 +137,7 @@ def _state_in(content: object, path: Path, key: str, notes: list[str]) -> dict[s
             fact = f"{chosen!r} is read, not {others}; {path.name}:KEY chooses"
             notes.append(f"checkpoint {path.name}: {fact}")
         return states[chosen]
-    # Or the entry has it in it, beside other things.
+    # Or the named entry has the state dict in it, beside other things.
     if key in content:
         return _state_in(content[key], path, "", notes)
     fact = f"no state dict {key!r}" if key else "no state dict of plain tensors"

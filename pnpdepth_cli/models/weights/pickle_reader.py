@@ -36,6 +36,9 @@ MAX_STEPS = 3_000_000
 MAX_NAME = 1_000
 """Characters of a name in a pickle."""
 
+_MAX_REASON = 160
+"""Characters of a reader's message that are shown."""
+
 _MAX_EXPANDED = 1 << 28
 """Elements of a tensor with strides of 0; nothing is allocated for them."""
 
@@ -124,7 +127,7 @@ def wrap_content_errors(what: str, *more: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (*CONTENT_ERRORS, *more) as error:
-        reason = describe(error).removeprefix("InputError: ")[:160]
+        reason = describe(error).removeprefix("InputError: ")[:_MAX_REASON]
         raise ModelError(f"{what}: {reason}") from None
 
 
@@ -176,7 +179,7 @@ class _Unpickler(pickle._Unpickler):
         }
 
     def _step(self, handler: Callable[[], None], _: object) -> None:
-        """Handles one opcode; the machine calls this."""
+        """Handles one opcode; the machine calls this with itself, to which the handler is bound."""
         self._charge(1)
         try:
             handler()
@@ -197,7 +200,9 @@ class _Unpickler(pickle._Unpickler):
         return StandIn(f"{module}.{name}")
 
     def persistent_load(self, pid: object) -> object:
-        """Returns the storage, or the class without its source text, that a torch file's id names.
+        """Returns what an id in a torch file names: a storage as a tensor, or a class.
+
+        The source text that the id has of a class is left out.
 
         Raises:
             InputError: The id names anything else.
@@ -335,4 +340,6 @@ def view_of(storage: Tensor, offset: int, shape: Sequence[int], stride: Sequence
     count = math.prod(shape)
     most = max(len(storage), _MAX_EXPANDED)
     check_claim(f"a tensor has {count:.6g} elements", count, most)
-    return storage.as_strided(shape, stride, int(offset) if count else 0)
+    # A tensor without elements reads nothing, so its offset does not matter.
+    start = int(offset) if count else 0
+    return storage.as_strided(shape, stride, start)

@@ -38,6 +38,10 @@ _MAX_ENTRIES = 10_000
 """Arrays in a .npy file."""
 _MAX_KEY = 20
 """Characters of a storage's key that a message shows."""
+_MAX_KIND = 40
+"""Characters of the name of a storage's type that a message shows."""
+_COUNT_BYTES = 8
+"""Bytes of the number of elements that stands before a storage's bytes in a row of pickles."""
 _DTYPES: dict[str, torch.dtype] = {
     f"{name}Storage": getattr(torch, dtype)
     for name, dtype in {
@@ -132,6 +136,7 @@ def _read_archive(path: Path) -> tuple[object, list[str]]:
             raise InputError("it was written on a big-endian machine")
 
         def read_storage(key: str, _: int) -> bytearray:
+            """Returns all bytes of a storage; the archive itself knows how many."""
             return bytearray(archive.read(entries[f"{folder}data/{key}"]))
 
         load = functools.partial(_load_storage, {}, read_storage)
@@ -188,7 +193,7 @@ def _read_row_of_pickles(file: mmap) -> tuple[object, list[str]]:
         raise InputError("its storages are not those that its pickle names")
     for key in keys:
         memory = storages[key].view(torch.uint8).numpy()
-        element_count = int.from_bytes(file.read(8), "little")
+        element_count = int.from_bytes(file.read(_COUNT_BYTES), "little")
         stored = file.read(len(memory))
         if not element_count * storages[key].itemsize == len(memory) == len(stored):
             raise InputError(f"storage {key[:_MAX_KEY]} is shorter than it should be")
@@ -219,7 +224,7 @@ def _load_storage(
         InputError: The type is not known, or the storage is shorter.
     """
     if kind not in _DTYPES:
-        raise InputError(f"a storage of type {kind[:40]}")
+        raise InputError(f"a storage of type {kind[:_MAX_KIND]}")
     dtype = _DTYPES[kind]
     if key not in storages:
         content = read(key, count * dtype.itemsize)
@@ -308,7 +313,8 @@ def _tensor_of_array(value: object, name: str, most: int) -> Tensor:
         case StandIn(
             state=(_, tuple(shape), StandIn(_, (str(code), *_), (_, str(order), *_)), fortran, data)
         ) if isinstance(data, bytes | str):
-            number = np.dtype(f"{order[:1]}{code[:8]}")
+            # Byte order, kind and bytes of a number, as in "<f4".
+            dtype = np.dtype(f"{order[:1]}{code[:8]}")
             data = data.encode("latin-1") if isinstance(data, str) else data  # of Python 2
         case _:
             kind = value.path if isinstance(value, StandIn) else type(value).__name__
@@ -317,8 +323,9 @@ def _tensor_of_array(value: object, name: str, most: int) -> Tensor:
     shape = tuple(map(int, shape))
     if any(side < 0 for side in shape):
         raise InputError(f"{name} has a shape of {shape}")
-    if number.kind not in "fiub":
-        raise InputError(f"{name} is an array of {number.str}, not of numbers")
-    array = np.frombuffer(data, number) if data else np.empty(0, number)
+    if dtype.kind not in "fiub":  # floats, integers with and without a sign, truth values
+        raise InputError(f"{name} is an array of {dtype.str}, not of numbers")
+    array = np.frombuffer(data, dtype) if data else np.empty(0, dtype)
     array = array.reshape(shape, order="F" if fortran else "C")
-    return torch.from_numpy(array.astype(number.newbyteorder("="), order="C"))
+    # torch takes the byte order of the machine only.
+    return torch.from_numpy(array.astype(dtype.newbyteorder("="), order="C"))

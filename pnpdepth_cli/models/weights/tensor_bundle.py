@@ -33,6 +33,8 @@ _TEXT = 7
 """The type of text, such as the graph of objects that TensorFlow 2 puts beside the variables."""
 _MAX_NAME = 1_000
 """Bytes of a variable's name."""
+_MAX_SHAPE = 80
+"""Characters of a variable's shape that a message shows."""
 
 # Numbers of fields in TensorFlow's tensor_bundle.proto and tensor_shape.proto.
 # Of the header:
@@ -114,10 +116,11 @@ def _tensor(name: str, fields: _Fields, content: bytes) -> Tensor:
     size = _last_number(fields, _SIZE)
     if kind not in _TYPES:
         raise InputError(f"{name} is of TensorFlow's type {kind}, not of numbers")
+    # The shape is a message with one for each side in it; a scalar has none.
     sides = _fields_of(fields[_SHAPE][-1]).get(_SIDES, []) if _SHAPE in fields else []
     shape = [_last_number(_fields_of(side), _SIDE_LENGTH) for side in sides]
     if math.prod(shape) * _TYPES[kind].itemsize != size or offset + size > len(content):
-        raise InputError(f"{name} of shape {str(shape)[:80]} goes beyond its {size} bytes")
+        raise InputError(f"{name} of shape {str(shape)[:_MAX_SHAPE]} goes beyond its {size} bytes")
     if not size:  # torch.frombuffer takes no empty buffer
         return torch.empty(shape, dtype=_TYPES[kind])
     values = bytearray(content[offset : offset + size])
@@ -185,14 +188,17 @@ def _block_entries(index: bytes, handle: bytes) -> Iterator[tuple[bytes, bytes]]
 
 
 def _fields_of(message: bytes) -> _Fields:
-    """Returns the fields of a protocol buffer's message; fields of four bytes are left out.
+    """Returns a protocol buffer's fields by number, each a list of int or bytes, as it may recur.
+
+    Fields of four bytes are left out.
 
     Raises:
-        InputError: It is no such message.
+        InputError: The message is no protocol buffer.
     """
     fields: _Fields = {}
     position = 0
     while position < len(message):
+        # A field begins with its number, and in the lowest three bits its kind.
         tag, position = _varint(message, position)
         number = tag >> 3
         kind = tag & 7
