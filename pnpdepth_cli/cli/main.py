@@ -135,7 +135,7 @@ def run(arguments: list[str]) -> int:
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
         with warnings.catch_warnings():
-            # What NumPy says of inf and NaN is no sentence for a user; own checks say theirs.
+            # NumPy's warnings of inf and NaN tell a user nothing; the program's own checks do.
             warnings.simplefilter("ignore", RuntimeWarning)
             return cli.main(arguments, prog_name="pnpdepth", standalone_mode=False) or 0
     except click.ClickException as error:

@@ -59,7 +59,8 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     scores[:, ~in_all_runs] = math.nan
     # Sets of frames that count as independent in what is tested: the differences from the first.
     groups = groups_of(names, [runs[0].frames[name].group for name in names])
-    differences = np.concatenate([*(scores[1:] - scores[0])], axis=1)  # a column a run and measure
+    # (frames, others · measures), a column for each other run and measure.
+    differences = np.concatenate([*(scores[1:] - scores[0])], axis=1)
     clusters = find_clusters(groups, differences)
     # Mean of each run by measure, and gains of each but the first.
     means = [_means(of_run.tolist(), keys) for of_run in scores]
@@ -162,7 +163,7 @@ def _gains(
     measures: Sequence[Measure],
     clusters: Clusters,
 ) -> Iterator[dict[str, Gain]]:
-    """Yields the gains of each run over the first, by the key of the measure; none of the first.
+    """Yields the gains over the first run of each other run, by the key of the measure.
 
     Args:
         scores: (runs, frames, measures), NaN in all runs where one has none.
@@ -259,7 +260,7 @@ def _notes_on_power(comparison: Comparison) -> Iterator[str]:
     """Yields a line if frames are not independent, and one if too few of them are for any test."""
     yield from comparison.clusters.notes()
     # p is the fraction of the 2^G swaps of G clusters after which the runs differ as much as they
-    # do. That are at least two of them: no cluster swapped, and all of them. Holm's correction
+    # do. At least two swaps do that: that of no cluster, and that of all. Holm's correction
     # multiplies the smallest p by the number of tests.
     smallest = 2.0 ** (1 - comparison.clusters.count)
     tests = len(comparison.measures) * (len(comparison.runs) - 1)

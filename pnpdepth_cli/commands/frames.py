@@ -60,9 +60,9 @@ _COMPARED_FRAMES = 5
 
 
 def _identity(request: FramesRequest) -> dict[str, object]:
-    """The beginning of the record, which is the same for the same frames.
+    """What decides the frames: the user's request, and size and time of change of the bag's files.
 
-    It has what the user asks for, and size and time of the bag's files.
+    The record begins with it. Where it is the same as in a record, the frames are, too.
     """
     bag = request.bag
     paths = sorted(bag.iterdir()) if bag.is_dir() else [bag]

@@ -39,7 +39,7 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
         **{name: getattr(definition, name) for name in stated},
-        "size": _size(definition.size),
+        "size": _size_text(definition.size),
         "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
         "layer": definition.default_layer,
@@ -47,13 +47,19 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     }
 
 
-def _size(size: Fixed | Multiple | Near) -> str:
-    """The sizes of images that a network takes, in a few words."""
+def _size_text(size: Fixed | Multiple | Near) -> str:
+    """The sizes (rows × columns) of images that a network takes, in a few words."""
     if isinstance(size, Fixed):
         return f"{size.height}×{size.width} ({size.fit})"
     if isinstance(size, Near):
-        return f"any, resized to {size.height}×{size.width}" if size.height else "any, resized"
-    return "any" if size.longest is None else f"any, shrunk to {size.longest}"
+        # Without a size to approach, images keep about their own.
+        if size.height is None:
+            return "any, resized"
+        return f"any, resized to {size.height}×{size.width}"
+    # Images whose sides are multiples of a number; those with a longer side than this are shrunk.
+    if size.longest is None:
+        return "any"
+    return f"any, shrunk to {size.longest}"
 
 
 def _parameters_of(module: torch.nn.Module) -> int:

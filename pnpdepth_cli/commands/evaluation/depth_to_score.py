@@ -75,7 +75,7 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
     if factor is not None:
         file = depth_of_inverse(file, factor, scale)
         scale = None
-    # Depth in metres, as all numbers of sensors pass one gate; then the part that is used.
+    # Depth in metres, which `plausible_map` checks; then the part that is used.
     reading = file.reading
     masked = apply_masks(file.values, frame.masks)
     # A scale that only the layout knows may not be of these very numbers.
@@ -109,7 +109,7 @@ def _depth_of_distances(
         whole: (H, W) of the whole frame, to which a calibration belongs.
 
     Raises:
-        InputError: Neither has a camera, or the record's is of another size.
+        InputError: Neither data set nor record has a camera, or the record's is of another size.
     """
     # A calibration is of the whole frame. A record's camera is of the prediction's pixels, so it
     # fits only ground truth of that size.
