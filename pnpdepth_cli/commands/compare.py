@@ -171,7 +171,7 @@ def _gains(
         measures: What the runs are compared by.
         clusters: Sets of the frames that count as independent.
     """
-    # p of each run and measure, and the same adjusted for all of these tests.
+    # p of each other run and measure, and the same adjusted for all of these tests.
     reference, *others = scores.transpose(0, 2, 1)  # of each run (measures, frames)
     p_values = np.empty((len(others), len(measures)))
     for run, of_run in enumerate(others):
@@ -181,11 +181,11 @@ def _gains(
             )
     adjusted = statistics.holm(p_values)
     # The gains, with their intervals.
-    for run, of_run in enumerate(others):
+    for run, (of_run, means_of_run) in enumerate(zip(others, means[1:], strict=True)):
         gains = {}
         for place, measure in enumerate(measures):
             percent_of = functools.partial(statistics.gain, sign=measure.sign)  # of two means
-            pair = [means[0][measure.key], means[run + 1][measure.key]]
+            pair = [means[0][measure.key], means_of_run[measure.key]]
             mean_of_first, mean = np.array(pair, float)  # None becomes NaN
             low, high = statistics.interval(percent_of, (reference[place], of_run[place]), clusters)
             gains[measure.key] = Gain(

@@ -137,7 +137,8 @@ def unpack(request: BatchRequest, say: Say) -> BatchRequest:
         OutputError: The folder holds files that may not be replaced.
     """
     folder = request.output.with_name(f"{request.output.name}_frames")
-    # A batch of the first frames needs no others, unless it chooses by names, which come later.
+    # A batch of the first frames needs no others: `limit` frames, each the `every`-th. One that
+    # chooses by names needs all, as the names are those of the written files.
     between = None
     if request.limit is not None and request.names is None:
         between = (0, request.every * request.limit - 1)

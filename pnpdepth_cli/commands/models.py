@@ -34,11 +34,12 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting parameters needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
+    # The defaults, with the paper's values where the definition leaves one open.
     defaults = definition.defaults.closed()
     path = definition.checkpoint
-    stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
+    copied_fields = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
-        **{name: getattr(definition, name) for name in stated},
+        **{name: getattr(definition, name) for name in copied_fields},
         "size": _size_text(definition.size),
         "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
@@ -127,13 +128,13 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
 
 
 def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
-    """ "ok", or why the network cannot be cut at the layer.
+    """The text "ok", or why the network cannot be cut at the layer.
 
     Args:
         network: The network.
         name: Name of the layer.
         arguments: What the network takes for a frame.
-        whole: (1, 1, h, w) what it returns for them without a cut, as it returns it.
+        whole: (1, 1, h, w) what it returns for them without a cut.
     """
     try:
         with Split(network.module, name) as split:

@@ -170,7 +170,8 @@ def read_prediction(path: Path, size: Size, request: EvalRequest) -> DepthToScor
             "; --resize scales predictions if both show the same view",
         )
     if values.shape != size:
-        # Of known pixels alone: their interpolated sum over their interpolated weight.
+        # Only known pixels count: the interpolated depth, in which unknown ones are 0, is divided
+        # by the interpolated fraction of known ones.
         is_known = (values > 0).astype(np.float32)
         total, weight = (cv2.resize(image, (size[1], size[0])) for image in (values, is_known))
         values = np.where(

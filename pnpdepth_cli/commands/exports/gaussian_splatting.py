@@ -62,7 +62,8 @@ def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
 
     It can be made if all poses are known and no image is distorted, as 3DGS has no lenses.
     """
-    if not all(frame.pose is not None and not frame.camera.has_lens for frame in frames):
+    can_be_made = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
+    if not can_be_made:
         return False
     present = model_files(_model(folder))
     return not present or present[0].read_bytes().startswith(_OURS)
@@ -103,10 +104,10 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     # What was changed, and what the program lacks.
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
-        depth = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
+        content = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
         if frames[0].unknown == "zero":  # the same for all frames
-            depth = "0, which 3DGS reads as infinitely far"
-        notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
+            content = "0, which 3DGS reads as infinitely far"
+        notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {content}")
     if not model_files(_model(folder)):
         notes.append(
             "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"

@@ -54,7 +54,7 @@ _LATEX = str.maketrans(
 _NAMED = 5
 """Names of a long list that are shown."""
 _SEPARATOR = re.compile(r"([_/\-])")
-"""Of the parts of a frame's name."""
+"""What stands between the parts of a frame's name, such as the slash of a folder."""
 _LEAST_SAVED = 8
 """Characters for which a name is shortened."""
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
@@ -188,9 +188,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def bases_of(errors: Errors) -> list[str]:
-    """Returns on which points errors are shown: ground truth and held-out points, else the best.
+    """Returns what errors are shown on: ground truth and held-out points, else the best basis.
 
-    They are keys of `measures.BASES`. The list is empty without any error.
+    They are keys of `measures.BASES`, which names the best first. The list is empty without any
+    error.
     """
     bases = [basis for basis in BASES if errors.get(basis)]
     return [basis for basis in bases if basis in (GT, HELD_OUT)] or bases[:1]
