@@ -228,6 +228,7 @@ def _notes_on_unshared(
         comparison: The runs on the frames that all scored.
         in_all_runs: (frames, measures) where all runs have a value.
     """
+    # Frames that other runs lack.
     for run in runs:
         unshared = [name for name in run.frames if name not in comparison.frames]
         if unshared:
@@ -248,6 +249,7 @@ def _notes_on_unshared(
             f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
             " no ranking"
         )
+    # Measures that a run lacks on some frames.
     for measure, has_value in zip(comparison.measures, in_all_runs.T, strict=True):
         if not has_value.all():
             yield (

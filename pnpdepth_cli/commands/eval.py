@@ -268,6 +268,7 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         scored: Records of the frames with scores.
         request: The rules.
     """
+    # Pixels without prediction, and pixels whose depth the network was given.
     with_truth = sum(_numbers(scored, "known"))
     empty = with_truth - sum(_numbers(scored, "predicted"))
     if empty:

@@ -77,7 +77,7 @@ def export_results(
         for frame in copied:
             frame.copy_image()
         notes = export.write(output, frames, on_frame)
-    # In which unit, as the files themselves do not say it.
+    # The unit of the depths, which the files themselves do not say.
     unit = frames[0].result.record.unit
     if export.in_model_units and frames[0].unit_scale != 1:
         unit = MODEL_UNITS

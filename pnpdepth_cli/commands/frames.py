@@ -254,7 +254,7 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset_s: f
         if number < first or (number - first) % request.every:
             continue
         try:
-            values, counts = measurement(sensors, scan)
+            measured, counts = measurement(sensors, scan)
         except NoPointsError:
             lost += 1
             continue
@@ -262,14 +262,14 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset_s: f
         times.append(time_s)
         # The image as it is in the bag, and its depth map or cloud.
         name = f"{time_s:.6f}".replace(".", "_")
-        suffix, data = messages.image_file(image, sensors.images)
+        suffix, image_bytes = messages.image_file(image, sensors.images)
         with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
-            temporary.write_bytes(data)
+            temporary.write_bytes(image_bytes)
         sparse = request.output / "sparse" / name
         if sensors.is_map:
-            write_depth(sparse.with_suffix(".exr"), values)
+            write_depth(sparse.with_suffix(".exr"), measured)
         else:
-            write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
+            write_cloud(sparse.with_suffix(".ply"), [(measured, None, None)])
     return _Pairs(times, lost, dropped)
 
 

@@ -144,7 +144,7 @@ def read_prediction(path: Path, size: Size, request: EvalRequest) -> DepthToScor
     file = _read_depth(path, request.pred_scale, request)
     values = file.values
     notes = list[str]()
-    # Of a prediction that is known up to scale and shift, numbers below 0 are values. They are made
+    # In a prediction that is known up to scale and shift, numbers below 0 are values. They are made
     # positive, as 0 stands for unknown.
     added = 0.0
     stored = load_stored(path).values

@@ -207,9 +207,12 @@ def scores_of(record: FrameRecord) -> Scores:
 
 
 def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
-    """The request's measures, by key, of depth (H, W) against ground truth (H, W) in metres.
+    """The request's measures of depth against ground truth, by key.
 
-    Ground truth is 0 where it is not scored.
+    Args:
+        depth: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where it is not scored.
+        request: The rules, which say what is measured.
     """
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}

@@ -192,7 +192,7 @@ def _settings_of(request: RefineRequest) -> dict[str, object]:
         else:
             fields[name] = value
     settings = {name: value for name, value in fields.items() if name not in _NO_SETTINGS}
-    # Of neighbours and scans, what is no file.
+    # Neighbours and scans name files besides their settings; only the settings are taken.
     neighbours = request.files.neighbours
     if neighbours:
         settings["neighbours"] = [(neighbour.motion, neighbour.apart) for neighbour in neighbours]
