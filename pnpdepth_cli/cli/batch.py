@@ -234,15 +234,16 @@ def _finishing_on_interrupt() -> Iterator[Callable[[], bool]]:
 def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _Combination]:
     """The combinations of the values of `--vary`, by the name of their folder.
 
-    Without `--vary` there is one: of no values, with an empty name. Combinations that give the same
-    result, as they differ in what has no effect, are one.
+    Without `--vary`, the one combination has no values and an empty name. Combinations that differ
+    only in settings without effect are one.
 
     Args:
         context: Context of the command.
-        varied: Texts NAME=VALUE,VALUE,… of one option each.
+        varied: The text NAME=VALUE,VALUE,… of each `--vary`.
 
     Raises:
-        UsageError: An option cannot be varied, the option refuses a value, or one comes twice.
+        UsageError: An option cannot be varied or refuses a value, an option or a value comes twice,
+            a value is empty, or two combinations have one folder.
     """
     # The options, and the values of each.
     varying = [_option(context, text.partition("=")[0]) for text in varied]
@@ -251,20 +252,24 @@ def _combinations(context: click.Context, varied: Sequence[str]) -> dict[str, _C
         raise UsageError("--vary must be NAME=VALUE,VALUE with no value empty")
     if any(len({*axis}) < len(axis) for axis in axes) or len({*varying}) < len(varying):
         raise UsageError("--vary: an option or a value comes twice; leave one out")
-    # Every value of each with every value of the others.
+    # Every value of each option with every value of the others.
     names = [option.opts[-1].removeprefix("--") for option in varying]
     combinations = dict[str, _Combination]()
     for words in itertools.product(*axes):
         texts = dict(zip(names, words, strict=True))
-        # Without updates of z, runs that differ in their settings are one.
+        # Without updates of z, the settings of updates have no effect and are left out.
         if texts.get("iterations") == "0":
             texts = {name: word for name, word in texts.items() if name not in OF_UPDATES}
+        # The values as the command takes them. An option that is left out, or has the value
+        # `default`, stays as it is without `--vary`.
         parameters = dict[str, object]()
         for name, option in zip(names, varying, strict=True):
             if texts.get(name, DEFAULT) != DEFAULT:
                 value = (texts[name],) if option.multiple else texts[name]
                 parameters[str(option.name)] = option.type_cast_value(context, value)
         combination = _Combination(texts, parameters)
+        # The folder is named after the values; those that differ only in characters that names
+        # cannot have would share it.
         folder = ",".join(f"{name}={_NOT_IN_NAMES.sub('-', word)}" for name, word in texts.items())
         if combinations.get(folder, combination) != combination:
             raise UsageError(f"--vary: two values have the folder {folder}; leave one out")

@@ -131,13 +131,15 @@ def run(arguments: list[str]) -> int:
     Args:
         arguments: Words of the command line behind `pnpdepth`.
     """
+    # The command.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal without σ still shows the rest
     try:
         with warnings.catch_warnings():
-            # What NumPy says of inf and NaN is no sentence for a user; own checks say theirs.
+            # NumPy's warnings of inf and NaN tell a user nothing; the program's own checks do.
             warnings.simplefilter("ignore", RuntimeWarning)
             return cli.main(arguments, prog_name="pnpdepth", standalone_mode=False) or 0
+    # Errors that have a message of their own, and ends that are no errors.
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -147,6 +149,7 @@ def run(arguments: list[str]) -> int:
         return 0
     except click.Abort:
         return _end("interrupted", INTERRUPTED)
+    # What the operating system refuses: of a disk that takes no more, else of an input.
     except OSError as error:
         reason = error.strerror or str(error)
         if error.filename is not None:
@@ -154,6 +157,7 @@ def run(arguments: list[str]) -> int:
         is_of_output = error.errno in _OUTPUT_ERRORS
         error_class = errors.OutputError if is_of_output else errors.InputError
         return _end(reason, error_class.exit_code)
+    # Memory, or a bug.
     except Exception as error:
         if errors.is_out_of_memory(error):
             return _end("memory is exhausted; use a smaller image", errors.DeviceError.exit_code)

@@ -86,7 +86,7 @@ def _type_of(declared: Field[Any]) -> Any:
         "tuple[float, float]": (float, float),
         "tuple[int, int]": (int, int),
     }
-    # Of several types the last but None, as in `float | str | None`; a text can hold each of them.
+    # Of several types, as in `float | str | None`, the last but None: a text can hold each of them.
     name = str(declared.type).removesuffix(" | None").rpartition(" | ")[2]
     return types.get(name)
 

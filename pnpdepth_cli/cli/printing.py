@@ -104,15 +104,15 @@ def print_refinement(record: FrameRecord) -> None:
     if record.worse_than_linear:
         print_notes(["warning: this depth is worse than linear interpolation of the points"])
     if result.improved_fraction is not None:
-        where = "scored pixels" if GT in record.errors else "held-out points"
-        say(f"improved: {result.improved_fraction:.1%} of the {where}")
+        compared = "scored pixels" if GT in record.errors else "held-out points"
+        say(f"improved: {result.improved_fraction:.1%} of the {compared}")
     # Updates, times and memory, on one line.
     facts = []
     updates = len(result.loss) - 1  # the first loss is that before any update
     if updates > 0:
         settings = result.settings
-        how = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
-        facts.append(f"{tables.count_of(updates, 'update')} of z ({how})")
+        rule = f"{settings['update']}, {settings['loss']}, step {settings['step']:.3g}"
+        facts.append(f"{tables.count_of(updates, 'update')} of z ({rule})")
     facts.append(_times(result.seconds))
     facts.append(f"peak {result.peak_memory_mb['process']:,.0f} MB")
     say(" · ".join(facts))
@@ -171,12 +171,12 @@ def print_batch(summary: BatchSummary, printed: set[str]) -> None:
     say(", ".join(texts))
     # A warning or note of several frames is one line, which names the first of them.
     for note, names in summary.frame_notes.items():
-        some = ", ".join(tables.short_names(names[:_NAMED]))
+        first_names = ", ".join(tables.short_names(names[:_NAMED]))
         if len(names) > _NAMED:
-            some += ", …"
+            first_names += ", …"
         kind = "warning" if note.startswith("warning") else "note"
         count = tables.count_of(len(names), "frame")
-        line = f"{kind} in {count} ({some}): {note.removeprefix(f'{kind}: ')}"
+        line = f"{kind} in {count} ({first_names}): {note.removeprefix(f'{kind}: ')}"
         if line not in printed:
             say(line)
         printed.add(line)

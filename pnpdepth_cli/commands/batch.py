@@ -113,7 +113,12 @@ def _refine_missing(
 
 
 def _follow(records: Iterable[FrameRecord], listener: Listener) -> None:
-    """Tells the listener of each record, and of the first result how it was made."""
+    """Tells the listener of each record, and of the first result how it was made.
+
+    Args:
+        records: The records of frames, each when its frame is done.
+        listener: Receives the records and notes.
+    """
     is_told = False
     for record in records:
         listener.frame(record)

@@ -60,7 +60,7 @@ def write_depth_cloud(
     if request.voxel is not None:
         clouds = [point_cloud.merge_in_voxels(clouds, request.voxel)]
     points = write_cloud(request.output, clouds)
-    # Why it has no colours: the first image that there is not.
+    # Why it has no colours: the first frame without an image says it.
     lost = next((frame.lost_image for frame in frames if not frame.image), "")
     colours = "coloured" if is_coloured else f"without colours ({lost})"
     return f"{points:,} points, {colours}", notes

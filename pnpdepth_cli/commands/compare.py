@@ -59,7 +59,8 @@ def compare(paths: Sequence[str], *, columns: Sequence[str] | None = None) -> Co
     scores[:, ~in_all_runs] = math.nan
     # Sets of frames that count as independent in what is tested: the differences from the first.
     groups = groups_of(names, [runs[0].frames[name].group for name in names])
-    differences = np.concatenate([*(scores[1:] - scores[0])], axis=1)  # a column a run and measure
+    # (frames, others · measures), a column for each other run and measure.
+    differences = np.concatenate([*(scores[1:] - scores[0])], axis=1)
     clusters = find_clusters(groups, differences)
     # Mean of each run by measure, and gains of each but the first.
     means = [_means(of_run.tolist(), keys) for of_run in scores]
@@ -162,7 +163,7 @@ def _gains(
     measures: Sequence[Measure],
     clusters: Clusters,
 ) -> Iterator[dict[str, Gain]]:
-    """Yields the gains of each run over the first, by the key of the measure; none of the first.
+    """Yields the gains over the first run of each other run, by the key of the measure.
 
     Args:
         scores: (runs, frames, measures), NaN in all runs where one has none.
@@ -170,7 +171,7 @@ def _gains(
         measures: What the runs are compared by.
         clusters: Sets of the frames that count as independent.
     """
-    # p of each run and measure, and the same adjusted for all of these tests.
+    # p of each other run and measure, and the same adjusted for all of these tests.
     reference, *others = scores.transpose(0, 2, 1)  # of each run (measures, frames)
     p_values = np.empty((len(others), len(measures)))
     for run, of_run in enumerate(others):
@@ -180,11 +181,11 @@ def _gains(
             )
     adjusted = statistics.holm(p_values)
     # The gains, with their intervals.
-    for run, of_run in enumerate(others):
+    for run, (of_run, means_of_run) in enumerate(zip(others, means[1:], strict=True)):
         gains = {}
         for place, measure in enumerate(measures):
             percent_of = functools.partial(statistics.gain, sign=measure.sign)  # of two means
-            pair = [means[0][measure.key], means[run + 1][measure.key]]
+            pair = [means[0][measure.key], means_of_run[measure.key]]
             mean_of_first, mean = np.array(pair, float)  # None becomes NaN
             low, high = statistics.interval(percent_of, (reference[place], of_run[place]), clusters)
             gains[measure.key] = Gain(
@@ -227,6 +228,7 @@ def _notes_on_unshared(
         comparison: The runs on the frames that all scored.
         in_all_runs: (frames, measures) where all runs have a value.
     """
+    # Frames that other runs lack.
     for run in runs:
         unshared = [name for name in run.frames if name not in comparison.frames]
         if unshared:
@@ -247,6 +249,7 @@ def _notes_on_unshared(
             f" (coverage: {shares}), and a run that leaves hard pixels empty looks better; this is"
             " no ranking"
         )
+    # Measures that a run lacks on some frames.
     for measure, has_value in zip(comparison.measures, in_all_runs.T, strict=True):
         if not has_value.all():
             yield (
@@ -259,7 +262,7 @@ def _notes_on_power(comparison: Comparison) -> Iterator[str]:
     """Yields a line if frames are not independent, and one if too few of them are for any test."""
     yield from comparison.clusters.notes()
     # p is the fraction of the 2^G swaps of G clusters after which the runs differ as much as they
-    # do. That are at least two of them: no cluster swapped, and all of them. Holm's correction
+    # do. At least two swaps do that: that of no cluster, and that of all. Holm's correction
     # multiplies the smallest p by the number of tests.
     smallest = 2.0 ** (1 - comparison.clusters.count)
     tests = len(comparison.measures) * (len(comparison.runs) - 1)

@@ -48,7 +48,7 @@ def examine(*, clear_cache: bool = False) -> dict[str, list[str]]:
 
 
 def _packages() -> Iterator[str]:
-    """Yields a text for each required package and each of an extra, with its version."""
+    """Yields a text for each package that is required or of a user's extra, with its version."""
     # A line of the package's metadata is such as `rosbags>=0.10; extra == "ros"`.
     for line in metadata.requires("pnpdepth") or []:
         name = re.split(r"[^\w.-]", line)[0]

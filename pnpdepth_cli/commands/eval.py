@@ -154,14 +154,14 @@ class _Means(NamedTuple):
 def _means_of(
     scored: Sequence[FrameRecord], all_measures: Sequence[Measure], request: EvalRequest
 ) -> _Means:
-    """The means over frames that were scored.
+    """The means over frames that were scored, their intervals, and notes on these.
 
     Args:
         scored: Records of frames with scores, at least one.
-        all_measures: Measures, of which those are taken that any frame has.
-        request: The rules.
+        all_measures: Measures in the order of tables; one that no frame has is left out.
+        request: The rules, which say whether means are those of KITTI's development kit.
     """
-    # The values of each frame (frames, measures), NaN where it has none.
+    # The values (frames, measures), NaN where a frame has none.
     scores = [scores_of(record) for record in scored]
     measures = tuple(
         measure for measure in all_measures if any(measure.key in of_frame for of_frame in scores)
@@ -170,14 +170,13 @@ def _means_of(
         {measure.key: of_frame.get(measure.key) for measure in measures} for of_frame in scores
     ]
     values = np.array([[*of_frame.values()] for of_frame in measured], float)
-    # Their means. The measures of KITTI's development kit come first; their means round as the kit
-    # does.
+    # Their means. Those of the kit's measures, which come first, are rounded as the kit does.
     mean = frame_means(measured)
     if request.is_devkit:
         count = len(request.measures)
         keys = [measure.key for measure in measures[:count]]
         mean |= dict(zip(keys, devkit_mean(values[:, :count]).tolist(), strict=True))
-    # How sure they are over frames that count as independent.
+    # The intervals of the means, from the sets of frames that count as independent.
     clusters = find_clusters([record.group or "" for record in scored], values)
     ends = _intervals(measures, values, clusters)
     notes = [*clusters.notes()]
@@ -269,6 +268,7 @@ def _notes_on_depths(scored: Sequence[FrameRecord], request: EvalRequest) -> Ite
         scored: Records of the frames with scores.
         request: The rules.
     """
+    # Pixels without prediction, and pixels whose depth the network was given.
     with_truth = sum(_numbers(scored, "known"))
     empty = with_truth - sum(_numbers(scored, "predicted"))
     if empty:
@@ -331,10 +331,10 @@ def _notes_on_order(scored: Sequence[FrameRecord], request: EvalRequest) -> Iter
 
 
 def _agreement_of(scored: Sequence[FrameRecord]) -> Agreement:
-    """How predictions and ground truth agree, over all images."""
+    """How predictions and ground truth agree, over all images; no pairs if no image tells."""
     ratios = _numbers(scored, "median_ratio")
     if not ratios:
-        return Agreement(0, 0.0, math.nan, math.nan)
+        return Agreement(pairs=0, rank=0.0, ratio=math.nan, spread=math.nan)
     # The spread within an image, and that of the images' ratios, add up as independent ones do.
     within = float(np.median(_numbers(scored, "ratio_spread")))
     between = float(np.std(np.log(ratios)))

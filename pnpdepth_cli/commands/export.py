@@ -77,7 +77,7 @@ def export_results(
         for frame in copied:
             frame.copy_image()
         notes = export.write(output, frames, on_frame)
-    # In which unit, as the files themselves do not say it.
+    # The unit of the depths, which the files themselves do not say.
     unit = frames[0].result.record.unit
     if export.in_model_units and frames[0].unit_scale != 1:
         unit = MODEL_UNITS
@@ -164,9 +164,10 @@ def _image_path(image: ImageSource, output: Path, name: str) -> Path:
 
 
 def _image_name(result: ResultFrame, image: ImageSource) -> str:
-    """The image below a folder of images: in the folder that the result's name has, with slashes.
+    """The path of the image below the folder of images, with slashes.
 
-    A frame of a video gets the name of its result, as a PNG.
+    Its folder is that of the result's name. An image keeps its file name. A frame of a video gets
+    the name of its result, as a PNG.
     """
     frame = PurePosixPath(result.name)
     file_name = image.name if isinstance(image, Path) else f"{frame.name}.png"

@@ -60,9 +60,9 @@ _COMPARED_FRAMES = 5
 
 
 def _identity(request: FramesRequest) -> dict[str, object]:
-    """The beginning of the record, which is the same for the same frames.
+    """What decides the frames: the user's request, and size and time of change of the bag's files.
 
-    It has what the user asks for, and size and time of the bag's files.
+    The record begins with it. Where it is the same as in a record, the frames are, too.
     """
     bag = request.bag
     paths = sorted(bag.iterdir()) if bag.is_dir() else [bag]
@@ -137,7 +137,8 @@ def unpack(request: BatchRequest, say: Say) -> BatchRequest:
         OutputError: The folder holds files that may not be replaced.
     """
     folder = request.output.with_name(f"{request.output.name}_frames")
-    # A batch of the first frames needs no others, unless it chooses by names, which come later.
+    # A batch of the first frames needs no others: `limit` frames, each the `every`-th. One that
+    # chooses by names needs all, as the names are those of the written files.
     between = None
     if request.limit is not None and request.names is None:
         between = (0, request.every * request.limit - 1)
@@ -253,7 +254,7 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset_s: f
         if number < first or (number - first) % request.every:
             continue
         try:
-            values, counts = measurement(sensors, scan)
+            measured, counts = measurement(sensors, scan)
         except NoPointsError:
             lost += 1
             continue
@@ -261,14 +262,14 @@ def _write_pairs(request: FramesRequest, bag: Bag, sensors: Sensors, offset_s: f
         times.append(time_s)
         # The image as it is in the bag, and its depth map or cloud.
         name = f"{time_s:.6f}".replace(".", "_")
-        suffix, data = messages.image_file(image, sensors.images)
+        suffix, image_bytes = messages.image_file(image, sensors.images)
         with atomic_path(request.output / "rgb" / f"{name}{suffix}") as temporary:
-            temporary.write_bytes(data)
+            temporary.write_bytes(image_bytes)
         sparse = request.output / "sparse" / name
         if sensors.is_map:
-            write_depth(sparse.with_suffix(".exr"), values)
+            write_depth(sparse.with_suffix(".exr"), measured)
         else:
-            write_cloud(sparse.with_suffix(".ply"), [(values, None, None)])
+            write_cloud(sparse.with_suffix(".ply"), [(measured, None, None)])
     return _Pairs(times, lost, dropped)
 
 

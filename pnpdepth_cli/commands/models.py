@@ -34,12 +34,13 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     # On the meta device counting parameters needs no memory.
     with wrap_user_errors(f"build of network {definition.name!r}"), torch.device("meta"):
         module = definition.build()
+    # The defaults, with the paper's values where the definition leaves one open.
     defaults = definition.defaults.closed()
     path = definition.checkpoint
-    stated = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
+    copied_fields = ("name", "summary", "paper", "licence", "input_kind", "output_kind", "layers")
     return {
-        **{name: getattr(definition, name) for name in stated},
-        "size": _size(definition.size),
+        **{name: getattr(definition, name) for name in copied_fields},
+        "size": _size_text(definition.size),
         "parameters": _parameters_of(module),
         "checkpoint": str(path) if path and path.is_file() else None,
         "layer": definition.default_layer,
@@ -47,13 +48,19 @@ def _describe(definition: ModelDefinition) -> dict[str, object]:
     }
 
 
-def _size(size: Fixed | Multiple | Near) -> str:
-    """The sizes of images that a network takes, in a few words."""
+def _size_text(size: Fixed | Multiple | Near) -> str:
+    """The sizes (rows × columns) of images that a network takes, in a few words."""
     if isinstance(size, Fixed):
         return f"{size.height}×{size.width} ({size.fit})"
     if isinstance(size, Near):
-        return f"any, resized to {size.height}×{size.width}" if size.height else "any, resized"
-    return "any" if size.longest is None else f"any, shrunk to {size.longest}"
+        # Without a size to approach, images keep about their own.
+        if size.height is None:
+            return "any, resized"
+        return f"any, resized to {size.height}×{size.width}"
+    # Images whose sides are multiples of a number; those with a longer side than this are shrunk.
+    if size.longest is None:
+        return "any"
+    return f"any, shrunk to {size.longest}"
 
 
 def _parameters_of(module: torch.nn.Module) -> int:
@@ -121,13 +128,13 @@ def check_model(model: str, checkpoint: Path | None, image: Path | None) -> dict
 
 
 def _check_layer(network: Network, name: str, arguments: tuple[Tensor, ...], whole: Tensor) -> str:
-    """ "ok", or why the network cannot be cut at the layer.
+    """The text "ok", or why the network cannot be cut at the layer.
 
     Args:
         network: The network.
         name: Name of the layer.
         arguments: What the network takes for a frame.
-        whole: (1, 1, h, w) what it returns for them without a cut, as it returns it.
+        whole: (1, 1, h, w) what it returns for them without a cut.
     """
     try:
         with Split(network.module, name) as split:

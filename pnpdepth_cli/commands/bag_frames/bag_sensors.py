@@ -125,9 +125,9 @@ def _depth_topics(
 def _depth_camera(
     bag: Bag, images: str, points: str, has_same_frame_id: bool, say: Say
 ) -> Camera | None:
-    """The camera of depth images if it is another than that of the images, else None.
+    """The camera of depth images; None if their pixels are those of the images.
 
-    Without a camera_info of its own, depth is taken for that of the images' pixels.
+    Depth images without a camera_info of their own are taken to have the images' pixels.
 
     Args:
         bag: The open bag.
@@ -145,7 +145,7 @@ def _depth_camera(
             calibration, _ = calibration_and_frame
             cameras.append(calibration.camera)
     of_images, of_depth = cameras
-    # Depth without a camera_info is taken for that of the images' pixels.
+    # Depth has no camera_info.
     if of_depth is None:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None
@@ -156,7 +156,7 @@ def _depth_camera(
     if of_images.source == of_depth.source:
         _warn_of_unregistered(points, has_same_frame_id, say)
         return None
-    # Two cameras that are alike are one.
+    # Two camera_infos that are alike are of one camera.
     has_same_k = np.allclose(of_images.intrinsics, of_depth.intrinsics, rtol=_SAME_K)
     if has_same_frame_id and has_same_k and of_images.size == of_depth.size:
         return None

@@ -89,8 +89,8 @@ def methods_table(comparison: Comparison) -> Table:
         for row, run, mean in zip(rows, runs, means, strict=True):
             text = measure.text(mean)
             is_best = mean is not None and measure.sign != 0 and text == best_text
-            p = run.gains[measure.key].p_adjusted if run.gains else math.nan
-            stars = "*" * sum(p < limit for limit in _STARS)
+            p_adjusted = run.gains[measure.key].p_adjusted if run.gains else math.nan
+            stars = "*" * sum(p_adjusted < limit for limit in _STARS)
             row.append((text + stars, "bold" if is_best else ""))
     frames = f"means over {count_of(len(comparison.frames), 'frame')}, the best in bold"
     marks = f"*, **, ***: differs from {comparison.reference.name} with p < 0.05, 0.01, 0.001"

@@ -116,7 +116,8 @@ def _read_measure(entry: Mapping[str, Any]) -> Measure:
     """The measure of an entry that `Measure.to_json` wrote.
 
     Raises:
-        TypeError, ValueError, KeyError: The entry is another, or tables cannot show its measure.
+        TypeError, ValueError, KeyError: The entry has other fields than a measure, or tables cannot
+            show it.
     """
     measure = Measure(**entry)
     # Its heading and a value are made as tables do it, so that a wrong field fails here.

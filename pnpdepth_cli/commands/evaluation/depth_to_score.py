@@ -75,7 +75,7 @@ def read_truth(frame: FrameFiles, result: ResultFrame, request: EvalRequest) -> 
     if factor is not None:
         file = depth_of_inverse(file, factor, scale)
         scale = None
-    # Depth in metres, as all numbers of sensors pass one gate; then the part that is used.
+    # Depth in metres, which `plausible_map` checks; then the part that is used.
     reading = file.reading
     masked = apply_masks(file.values, frame.masks)
     # A scale that only the layout knows may not be of these very numbers.
@@ -109,7 +109,7 @@ def _depth_of_distances(
         whole: (H, W) of the whole frame, to which a calibration belongs.
 
     Raises:
-        InputError: Neither has a camera, or the record's is of another size.
+        InputError: Neither data set nor record has a camera, or the record's is of another size.
     """
     # A calibration is of the whole frame. A record's camera is of the prediction's pixels, so it
     # fits only ground truth of that size.
@@ -144,7 +144,7 @@ def read_prediction(path: Path, size: Size, request: EvalRequest) -> DepthToScor
     file = _read_depth(path, request.pred_scale, request)
     values = file.values
     notes = list[str]()
-    # Of a prediction that is known up to scale and shift, numbers below 0 are values. They are made
+    # In a prediction that is known up to scale and shift, numbers below 0 are values. They are made
     # positive, as 0 stands for unknown.
     added = 0.0
     stored = load_stored(path).values
@@ -170,7 +170,8 @@ def read_prediction(path: Path, size: Size, request: EvalRequest) -> DepthToScor
             "; --resize scales predictions if both show the same view",
         )
     if values.shape != size:
-        # Of known pixels alone: their interpolated sum over their interpolated weight.
+        # Only known pixels count: the interpolated depth, in which unknown ones are 0, is divided
+        # by the interpolated fraction of known ones.
         is_known = (values > 0).astype(np.float32)
         total, weight = (cv2.resize(image, (size[1], size[0])) for image in (values, is_known))
         values = np.where(

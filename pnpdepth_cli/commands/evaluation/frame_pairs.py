@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -126,21 +125,24 @@ def _notes_on_names(predictions: Mapping[str, Path], names: Sequence[str]) -> li
 
 
 def _data_set(prediction: Path, folder: Path) -> tuple[str | None, list[FrameFiles]]:
-    """The layout and the frames of a data set; None and no frames for another folder.
+    """The layout and the frames of a data set; None and no frames if the folder is none.
 
     Args:
         prediction: The predictions, which a batch may have refined from the data set.
         folder: What may be a data set.
     """
-    # As the batch read it, whose summary lies beside the predictions; else recognised anew.
+    # The layout that a batch used, by its summary beside the predictions; if there is none, or the
+    # folder does not have it, the layout is recognised (None).
     summary = prediction / "summary.json"
     layout_of_batch = read_json(summary).get("layout") if summary.is_file() else None
     layouts = [layout_of_batch, None] if layout_of_batch in LAYOUTS else [None]
     for layout in layouts:
-        # What is no data set may still be a folder of depth files.
-        with contextlib.suppress(InputError, OSError):
+        try:
             listed = list_frames(folder, layout)
-            return listed.layout, listed.frames
+        # The folder is no data set of this layout. It may still be a folder of depth files.
+        except (InputError, OSError):
+            continue
+        return listed.layout, listed.frames
     return None, []
 
 

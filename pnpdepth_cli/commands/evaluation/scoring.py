@@ -47,10 +47,10 @@ _CROPS = {
     "nyu": (45 / 480, 471 / 480, 41 / 640, 601 / 640),
 }
 """(top, bottom, left, right) of each crop as fractions of the frame, cut to whole pixels."""
-_CUT = (352, 1216)
+_KITTI_CUT_SIZE = (352, 1216)
 """(H, W) of KITTI's frames cut at the bottom, in the middle, as its depth benchmark has them."""
-_WHOLE = (375, 1242)
-"""(H, W) of most frames they are from."""
+_KITTI_SIZE = (375, 1242)
+"""(H, W) of most of KITTI's frames before the cut."""
 
 
 class _Scored(NamedTuple):
@@ -207,9 +207,12 @@ def scores_of(record: FrameRecord) -> Scores:
 
 
 def _measure(depth: Depth, truth: Depth, request: EvalRequest) -> Scores:
-    """The request's measures, by key, of depth (H, W) against ground truth (H, W) in metres.
+    """The request's measures of depth against ground truth, by key.
 
-    Ground truth is 0 where it is not scored.
+    Args:
+        depth: (H, W) metres, 0 where unknown.
+        truth: (H, W) metres, 0 where it is not scored.
+        request: The rules, which say what is measured.
     """
     if request.is_devkit:
         return {**devkit_errors(depth, truth)}
@@ -260,8 +263,8 @@ def crop_window(crop: str, size: Size) -> tuple[slice, slice]:
     # Frames that were cut to KITTI's usual part have the crop of the whole frame they are from:
     # the bottom rows and the middle columns of it.
     rows_above = columns_before = 0
-    if size == _CUT and crop in ("garg", "eigen"):
-        height, width = _WHOLE
+    if size == _KITTI_CUT_SIZE and crop in ("garg", "eigen"):
+        height, width = _KITTI_SIZE
         rows_above = height - size[0]
         columns_before = (width - size[1]) // 2
     rows = [int(end * height) - rows_above for end in (top, bottom)]

@@ -81,7 +81,7 @@ class ExportFrame:
         return self.pose
 
     def start_points(self, frames: int) -> PointCloud:
-        """Returns as many points of the depth as this frame gives a splatting program to start.
+        """Returns every n-th point of the depth: about the frame's part of `_START_POINTS`.
 
         They are coloured, and in the world's coordinates, in the unit of the result.
 

@@ -39,11 +39,11 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     """Writes depth and normal maps and the list of images; returns warnings for a person.
 
     Args:
-        folder: Output folder, in which the folders of the files are.
+        folder: Output folder; the folders of the files are there.
         frames: The frames.
         done: Callback after each frame.
     """
-    # The maps (H, W, C); depth in units of the COLMAP model, whatever the unit of the result.
+    # The maps (H, W, C). Depth is in the unit of the result, and becomes units of the COLMAP model.
     for frame in frames:
         depth = frame.valid_depth()
         depth_in_model_units = depth[..., None] / frame.unit_scale

@@ -62,7 +62,8 @@ def _needs_model(folder: Path, frames: Sequence[ExportFrame]) -> bool:
 
     It can be made if all poses are known and no image is distorted, as 3DGS has no lenses.
     """
-    if not all(frame.pose is not None and not frame.camera.has_lens for frame in frames):
+    can_be_made = all(frame.pose is not None and not frame.camera.has_lens for frame in frames)
+    if not can_be_made:
         return False
     present = model_files(_model(folder))
     return not present or present[0].read_bytes().startswith(_OURS)
@@ -72,7 +73,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     """Writes inverse depth, its scale, and a model if it needs one; returns lines for a person.
 
     Args:
-        folder: Output folder, in which the folders of the files are.
+        folder: Output folder; the folders of the files are there.
         frames: The frames.
         done: Callback after each frame.
 
@@ -103,10 +104,10 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     # What was changed, and what the program lacks.
     notes = [f"depth: {clipped:,} pixels are nearer than 1/{scale:.4g}, and clipped"]
     if masked:
-        depth = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
+        content = "the depth before the mask or that of the nearest pixel, as 3DGS reads no masks"
         if frames[0].unknown == "zero":  # the same for all frames
-            depth = "0, which 3DGS reads as infinitely far"
-        notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {depth}")
+            content = "0, which 3DGS reads as infinitely far"
+        notes.append(f"warning: {masked:,} pixels are unknown or not valid; they have {content}")
     if not model_files(_model(folder)):
         notes.append(
             "warning: sparse/0 has no model, which 3DGS needs to train; refine undistorted images"
@@ -131,7 +132,7 @@ def _inverse(frame: ExportFrame) -> tuple[NDArray[np.float64], NDArray[np.bool_]
 
 
 def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
-    """Writes cameras, images with poses, and points of the depth as text of COLMAP.
+    """Writes cameras, images with poses, and points of the depth as COLMAP's text files.
 
     Lengths are in units of the model. Camera, image and frame have one number, from 1.
 
@@ -139,6 +140,7 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
         folder: The folder of the model.
         frames: The frames, whose poses are known and whose cameras have no lens.
     """
+    # The lines of each file, below one by which a later export knows the file as its own.
     lines = {file: [_OURS.decode()] for file in MODEL_PARTS}
     for number, frame in enumerate(frames, 1):
         # The camera; COLMAP counts pixels from the image's corner, not from a pixel's centre.
@@ -154,10 +156,11 @@ def _write_model(folder: Path, frames: Sequence[ExportFrame]) -> None:
         x, y, z, w = Rotation.from_matrix(to_camera).as_quat()
         shift = " ".join(map(str, -to_camera @ pose[:, 3] / unit))
         lines["images"].append(f"{number} {w} {x} {y} {z} {shift} {number} {frame.image_name}\n\n")
-        # The points, with a colour and no error.
+        # The points, with a colour and no error. Their numbers count from 1, as the first line is
+        # no point.
         cloud = frame.start_points(len(frames))
-        colours = () if cloud.rgb is None else cloud.rgb
-        for point, (red, green, blue) in zip(cloud.xyz / unit, colours, strict=True):
+        assert cloud.rgb is not None  # the image colours all of them
+        for point, (red, green, blue) in zip(cloud.xyz / unit, cloud.rgb, strict=True):
             place = " ".join(f"{value:.7g}" for value in point)
             point_number = len(lines["points3D"])
             lines["points3D"].append(f"{point_number} {place} {red} {green} {blue} 0\n")

@@ -278,7 +278,11 @@ def _files_of_points(frame: ExportFrame, sparse: FileRecord) -> FrameFiles:
 
 
 def _options_of_points(sparse: FileRecord) -> ReadOptions:
-    """The options by which the points of a frame were read, as its record says of their file."""
+    """The options by which the points of a frame were read.
+
+    Args:
+        sparse: What the frame's record says of the file of its sparse depth.
+    """
     scan = ScanOptions(
         calib=None if sparse.calibration is None else Path(sparse.calibration),
         extrinsics=None if sparse.extrinsics is None else Path(sparse.extrinsics),

@@ -49,7 +49,7 @@ def _write(folder: Path, frames: Sequence[ExportFrame], done: Callable[[], None]
     """Writes depth, start points, cameras and poses; returns lines for a person.
 
     Args:
-        folder: Output folder, in which the folders of the files are.
+        folder: Output folder; the folders of the files are there.
         frames: The frames, whose poses are known.
         done: Callback after each frame.
 
@@ -105,9 +105,9 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
         frame: The frame.
 
     Raises:
-        InputError: The program has no lens with so many coefficients, or the pose is unknown.
+        InputError: Nerfstudio has no lens with so many coefficients, or the pose is unknown.
     """
-    # The coefficients of the lens, if the program has all of them.
+    # The coefficients of the lens by name. Those that Nerfstudio has no name for must be 0.
     camera = frame.camera
     _, names = _LENSES[camera.lens]
     coefficients = dict(zip(names, camera.distortion, strict=False))
@@ -117,16 +117,16 @@ def _entry(folder: Path, frame: ExportFrame) -> dict[str, object]:
             f" {len(camera.distortion)} coefficients; undistort images first"
         )
     image = os.path.relpath(os.path.realpath(frame.image_path), os.path.realpath(folder))
-    # The pose, with Nerfstudio's axes: y up, z backwards, the opposite of ours.
+    # The pose, with Nerfstudio's axes: y up and z backwards, where ours are y down and z forwards.
     matrix = np.eye(4)
     matrix[:3] = frame.known_pose()
     matrix[:3, 1:3] *= -1
-    # Principal points count from the image's corner.
+    # Principal points count from the image's corner, ours from the middle of the first pixel.
     intrinsics = camera.intrinsics
     return {
         "file_path": Path(image).as_posix(),
-        "depth_file_path": _depth_image(frame),
-        "depth_path": _depth_image(frame),
+        "depth_file_path": _depth_image(frame),  # as Nerfstudio calls it
+        "depth_path": _depth_image(frame),  # as Instant-NGP calls it
         "transform_matrix": matrix.tolist(),
         "w": frame.size[1],
         "h": frame.size[0],

@@ -167,16 +167,20 @@ def _entry(record: FrameRecord, basis: str, columns: Sequence[Measure]) -> dict[
 def _views(
     name: str, result: ResultRecord, request: BatchRequest, images: Path
 ) -> dict[str, object]:
-    """Links the images of a frame; returns the page's entry of them.
-
-    The entry says where each view of the page lies in which image. Its "key" is None if an image
-    was deleted, and then nothing is linked.
+    """Links the images of a frame into the report; returns the page's entry of them.
 
     Args:
         name: Name of the frame.
         result: The frame's result, which names its images.
         request: The batch, below whose output they lie.
         images: Folder for images of the report.
+
+    Returns:
+        key: beginning of the names of the frame's files in the report. None if the frame has no
+        preview or an image was deleted; then nothing is linked, and the entry has nothing else.
+        views: for each view of the page, its PNG, the box (left, top, width, height) of its panel,
+        and the size (width, height) of the PNG. view_mb: megabytes of the 3D view. scale_m: depths
+        at the ends of the colours. map: texts of the improvement map. None where there is none.
     """
     files = {kind: request.output / path for kind, path in result.outputs.items()}
     figures = result.figures
@@ -198,7 +202,7 @@ def _views(
                     "box": figure.panels[title],
                     "size": figure.size,
                 }
-    # The 3D view, and the ends of the colours.
+    # The 3D view, and the texts of the improvement map.
     view_mb = None
     if request.html_3d and "view" in files:
         view_mb = report.save_view_3d(files["view"], images / f"{key}_view.js")
@@ -248,7 +252,9 @@ def _values(stages: dict[str, Scores]) -> dict[str, float | None]:
     for key in ("rmse", "mae"):
         before = stages[BEFORE].get(key)
         after = stages[AFTER].get(key)
-        change = after / before - 1 if before and after is not None else None
+        change = None
+        if before and after is not None:  # of an error that was 0 there is no fraction
+            change = after / before - 1
         values |= {f"{key}_{BEFORE}": before, f"{key}_{AFTER}": after, f"{key}_{_CHANGE}": change}
     return values
 

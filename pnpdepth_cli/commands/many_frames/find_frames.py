@@ -50,7 +50,7 @@ class BatchFrames:
     frames: Sequence[FrameFiles]
     """All frames of the source."""
     chosen: Sequence[FrameFiles]
-    """Frames of these that the names, the limit and the shard choose."""
+    """Those of `frames` that the names, the limit and the shard choose."""
     unmatched: Sequence[str]
     """Files that are in no frame, and why, a line each."""
     poses: str | None
@@ -222,8 +222,8 @@ def _with_poses(
     count = sum(frame.pose is not None for frame in frames)
     if not count:
         return frames, f"poses: {ESTIMATED}" if request.accumulate else None
-    some = "" if count == len(frames) else f" ({count:,} of {len(frames):,} frames)"
-    return frames, f"poses: {source}{some}"
+    which_frames = "" if count == len(frames) else f" ({count:,} of {len(frames):,} frames)"
+    return frames, f"poses: {source}{which_frames}"
 
 
 def sequences_of(frames: Sequence[FrameFiles]) -> dict[str, list[int]]:
@@ -354,7 +354,7 @@ def input_files(request: RefineRequest) -> Iterator[tuple[str, Path]]:
     if files.gt is not None:
         sources |= {f"mask {number}": path for number, path in enumerate(files.masks)}
     sources |= {"extrinsics": scan.extrinsics, "calib": scan.over(files).calib}
-    # Of a folder, a COLMAP model or KITTI's calibrations, each file.
+    # A folder, of a COLMAP model or of KITTI's calibrations, stands for the files in it.
     for name, source in sources.items():
         path = None if source is None else frame_files.file_of(source)
         if path is not None and path.is_dir():

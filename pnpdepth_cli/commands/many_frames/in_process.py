@@ -141,13 +141,17 @@ class _Steps:
 
         The calling thread runs it.
 
+        Args:
+            reading: The frames as `read` returns them, in order.
+
         Raises:
             StorageError: Nothing more can be written.
-            ModelError, UsageError: An error of the network or the settings, before any frame was
-                refined: it may be one of all frames.
+            ModelError, UsageError: An error of the network or the settings before any frame was
+                refined, which may concern all frames.
         """
-        # Once a frame was refined, an error of another one is of that frame alone. Without a method
-        # no frame can be refined, and each of them gets a record that says so.
+        # The network and the settings are proven once a frame was refined: then an error concerns
+        # one frame alone. Without a method no frame can be refined, and each gets a record that
+        # says so.
         is_proven = self.has_worked or self.method is None
         for work in reading:
             if self.stopped():

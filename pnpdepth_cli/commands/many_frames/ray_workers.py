@@ -217,11 +217,11 @@ class _Workers:
 
 
 def _calls(to_do: Sequence[FrameFiles], workers: int) -> Iterator[_Call]:
-    """Yields the frames in parts of a few; the first is one frame, which proves the network.
+    """Yields calls of a few frames each; the first has one, which shows if the network works.
 
     Args:
         to_do: The frames to refine.
-        workers: Number of workers, each of which is to have several parts if there are enough.
+        workers: Number of workers, each of which is to have several calls if there are enough.
     """
     size = max(1, min(_FRAMES_OF_A_CALL, len(to_do) // (_CALLS_OF_A_WORKER * workers)))
     yield _Call(frames=to_do[:1])

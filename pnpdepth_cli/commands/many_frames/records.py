@@ -187,9 +187,12 @@ def _settings_of(request: RefineRequest) -> dict[str, object]:
     # All fields of the request and its groups, side by side.
     fields = dict[str, object]()
     for name, value in vars(request).items():
-        fields |= vars(value) if name in GROUPS else {name: value}
+        if name in GROUPS:
+            fields |= vars(value)
+        else:
+            fields[name] = value
     settings = {name: value for name, value in fields.items() if name not in _NO_SETTINGS}
-    # Of neighbours and scans, what is no file.
+    # Neighbours and scans name files besides their settings; only the settings are taken.
     neighbours = request.files.neighbours
     if neighbours:
         settings["neighbours"] = [(neighbour.motion, neighbour.apart) for neighbour in neighbours]

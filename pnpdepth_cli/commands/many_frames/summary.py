@@ -171,12 +171,13 @@ def _titles(
 def _frame_notes(records: Iterable[FrameRecord]) -> dict[str, list[str]]:
     """The names of the frames that have a note, by the note; warnings come first.
 
-    Notes that differ in numbers only are one, with the numbers of its first frame, whom it names.
+    Notes that differ in numbers only are one, with the numbers of its first frame, which it names.
     """
     # The note of each frame, by what it says without its numbers, then by the frame's name.
     by_text = defaultdict[str, dict[str, str]](dict)
     for record in records:
         for note in record.notes:
+            # A guess that is unsure says so in the middle of its line.
             if note.startswith(("warning", "note")) or ", unsure (" in note:
                 text = _NUMBER.sub("", note)
                 by_text[text].setdefault(record.name, note)

@@ -183,6 +183,10 @@ def _unseen_points(inputs: ReadFrame, frame: Refined) -> PointErrors | None:
 
     Held-out points have no part in the result; validation points choose and weigh what is fused,
     but the depths that are compared there were made without them.
+
+    Args:
+        inputs: The frame as it was read, with its held-out points.
+        frame: The refined frame, with its validation points if the method has some.
     """
     held_out = inputs.held_out
     validation = frame.validation

@@ -89,7 +89,14 @@ def write_refined(
 def _score(
     request: RefineRequest, method: Method, inputs: ReadFrame, frame: Refined
 ) -> FrameRecord:
-    """The record of the refined frame with its errors and notes, without its result."""
+    """The record of the refined frame with its errors and notes, without its result.
+
+    Args:
+        request: How the frame was refined.
+        method: The method that refined it, whose networks have notes.
+        inputs: The frame as it was read.
+        frame: The refined frame.
+    """
     files = request.files
     name = files.name
     if not name:  # as of a frame that is of no data set

@@ -154,13 +154,18 @@ class EvalRequest:
 
     @property
     def scoring(self) -> dict[str, object]:
-        """All rules on which scores depend, by their names; runs with others are not compared."""
+        """All rules on which scores depend, by their names.
+
+        `pnpdepth compare` refuses runs whose rules differ.
+        """
         rules = self.rules
         return {
             "min_depth": rules.min_depth,
             "max_depth": rules.max_depth,
             "clip": rules.clip,
             "crop": rules.crop,
+            # A pixel without prediction is 0, which clipping makes the least depth; else it is not
+            # scored, unless the development kit's definitions fill it in.
             "missing": "min" if rules.clip else "skip",
             "exclude_sparse": rules.exclude_sparse,
             "thresholds": self._thresholds,

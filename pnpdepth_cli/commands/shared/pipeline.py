@@ -69,13 +69,13 @@ def peak_memory_mb(device: torch.device) -> dict[str, float]:
 
 
 def _peak_resident_bytes() -> int:
-    """The most bytes of memory that the process had; on macOS, which does not tell, what it has."""
-    # Linux tells it only here, in a line such as `VmHWM:  123456 kB`.
+    """The peak memory of the process in bytes; on macOS, its present memory."""
+    # Linux tells the peak here, in a line such as `VmHWM:  123456 kB`.
     status = Path("/proc/self/status")
     if status.exists():
         line = next(row for row in status.read_text().splitlines() if row.startswith("VmHWM"))
         return int(line.split()[1]) * 1024
-    # Windows tells it through psutil.
+    # psutil has the peak on Windows only; on macOS it has no more than the present memory.
     import psutil
 
     memory = psutil.Process().memory_info()

@@ -72,8 +72,8 @@ def write_sparse_files(
     Args:
         files: The files of `sparse_outputs`, by kind.
         points: The sparse depth.
-        settings: What decided the points, for the record.
-        inputs: The files that the points are of, by what each is, for the record.
+        settings: Entries of the record that say what decided the points.
+        inputs: Records of the files that the points were made of, by a word such as "depth".
         notes: Lines for a person.
         rgb: (H, W, 3) in 0…1, the image to draw on. None if no overlay was asked for.
 
@@ -86,7 +86,7 @@ def write_sparse_files(
     write_sparse(files["sparse"], points.xy, points.depth, image)
     if rgb is not None:
         overlay(rgb, points.xy, points.depth, files["overlay"])
-    # The record, without entries of a file that do not apply to its kind.
+    # The record; `what_applies` leaves out entries of a file that are None, False or empty.
     content = {
         "version": __version__,
         **settings,

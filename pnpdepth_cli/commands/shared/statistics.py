@@ -92,7 +92,7 @@ def find_clusters(groups: Sequence[str], series: Floats) -> Clusters:
         return Clusters(ids=np.arange(frames), text=count_of(frames, "frame"))
     blocks = max(1, min(MAX_BLOCKS, frames // length))
     return Clusters(
-        ids=np.arange(frames) * blocks // frames,
+        ids=np.arange(frames) * blocks // frames,  # lengths differ by one frame at most
         text=f"{count_of(blocks, 'block')} of about {round(frames / blocks):,} consecutive frames"
         " of one sequence, as their errors are correlated",
     )

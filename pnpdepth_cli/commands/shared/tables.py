@@ -54,7 +54,7 @@ _LATEX = str.maketrans(
 _NAMED = 5
 """Names of a long list that are shown."""
 _SEPARATOR = re.compile(r"([_/\-])")
-"""Of the parts of a frame's name."""
+"""What stands between the parts of a frame's name, such as the slash of a folder."""
 _LEAST_SAVED = 8
 """Characters for which a name is shortened."""
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
@@ -188,9 +188,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def bases_of(errors: Errors) -> list[str]:
-    """Returns on which points errors are shown: ground truth and held-out points, else the best.
+    """Returns what errors are shown on: ground truth and held-out points, else the best basis.
 
-    They are keys of `measures.BASES`. The list is empty without any error.
+    They are keys of `measures.BASES`, which names the best first. The list is empty without any
+    error.
     """
     bases = [basis for basis in BASES if errors.get(basis)]
     return [basis for basis in bases if basis in (GT, HELD_OUT)] or bases[:1]
@@ -253,10 +254,12 @@ def _errors_table(
         titles: What each stage is, in words, in the order of the rows.
         keys: Keys of the measures, in the order of the columns. None: the main ones.
     """
+    # The measures that the result has, of those that are asked for.
     result = by_stage[AFTER]
     linear = by_stage.get(LINEAR, {})
     chosen = choose_measures(MEASURES, keys)
     measures = [measure for measure in chosen if measure.key in result and (keys or measure.main)]
+    # A row for each stage that was scored.
     rows = []
     for stage in [stage for stage in titles if stage in by_stage]:
         scores = by_stage[stage]
@@ -270,11 +273,12 @@ def _errors_table(
         ]
         style: Style = "bold" if stage == AFTER else ""
         row: list[Cell] = [(text, style) for text in (title, *texts)]
+        # The change against linear interpolation, where both are means over as many frames.
         if stage == LINEAR:
             row.append(("", ""))
         else:
-            is_of_same_frames = scores.get("frames") == linear.get("frames")
-            linear_mae = linear.get("mae") if is_of_same_frames else None
+            is_over_as_many_frames = scores.get("frames") == linear.get("frames")
+            linear_mae = linear.get("mae") if is_over_as_many_frames else None
             row.append(change_cell(linear_mae, scores.get("mae")))
         rows.append(row)
     remark = ", where a change proves nothing" if basis == USED else ""
