@@ -23,7 +23,7 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW, OpenNetwork
-from pnpdepth_cli.frames.strength import Judged, strength_of, trust_in_image, unexplained_by
+from pnpdepth_cli.frames.strength import OutlierSearch, strength_of, trust_in_image, unexplained_by
 from pnpdepth_cli.frames.validation import ValidatedFrame
 from pnpdepth_cli.measures import LINEAR
 from pnpdepth_cli.points import SparsePoints
@@ -82,8 +82,8 @@ class Expert:
 class NetworkExpert(Expert):
     """A network that predicts the frame, perhaps with another network's depth as a prior."""
 
-    whole: Prediction  # from all points
-    kept: Prediction  # from all but the validation points; the same as `whole` without any
+    from_all: Prediction  # from all points
+    from_others: Prediction  # from the points that are not for validation
     frame: Frame | None = None  # what it is shown mirrored, too. None: it sees one frame
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
     unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
@@ -106,7 +106,7 @@ class NetworkExpert(Expert):
 
         With `mirrored` it is the mean of the depths of both frames.
         """
-        depth = _mix_with_aligned(self.whole, self.share_of_aligned)
+        depth = _mix_with_aligned(self.from_all, self.share_of_aligned)
         if self.mirrored is None:
             return depth
         return weighted_mean([(depth, 1), (self.mirrored, 1)])
@@ -115,9 +115,9 @@ class NetworkExpert(Expert):
 class Experts(NamedTuple):
     """The experts of a frame, and what stands out among them."""
 
-    own: NetworkExpert
+    first_of_user: NetworkExpert
     """The user's first network."""
-    alone: NetworkExpert | None
+    without_prior: NetworkExpert | None
     """The network that takes a prior, without one. None: there is none beside the user's."""
     every: list[Expert]
     """All of them, the user's networks first."""
@@ -141,8 +141,14 @@ class Experts(NamedTuple):
             every: All experts, changed or not, in the order of `Experts.every`.
         """
         by_name = {expert.name: expert for expert in every if isinstance(expert, NetworkExpert)}
-        alone = None if self.alone is None else by_name[self.alone.name]
-        return self._replace(own=by_name[self.own.name], alone=alone, every=list(every))
+        without_prior = self.without_prior
+        if without_prior is not None:
+            without_prior = by_name[without_prior.name]
+        return self._replace(
+            first_of_user=by_name[self.first_of_user.name],
+            without_prior=without_prior,
+            every=list(every),
+        )
 
 
 def expert_of(
@@ -172,7 +178,7 @@ def expert_of(
             `unexplained_by`; 1 for a network that takes points.
     """
     # The network predicts from all points; a prior is made from all points, too.
-    whole = split.whole if prior is None else replace(split.whole, prior=prior.whole.aligned)
+    whole = split.whole if prior is None else replace(split.whole, prior=prior.from_all.aligned)
     if prediction is None:
         prediction = network.refine(whole, updates=updates)
     # The stronger a network is, the more of its depth is that before updates of z, unless the user
@@ -187,8 +193,8 @@ def expert_of(
         at_validation=no_depth,
         updated_at_validation=no_depth,
         points=whole.points,
-        whole=prediction,
-        kept=prediction,  # until it predicts without the validation points
+        from_all=prediction,
+        from_others=prediction,  # until it predicts without the validation points
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
@@ -198,7 +204,7 @@ def expert_of(
     if not len(split.points):
         return expert
     # It predicts the validation points from the others; a prior is made from the others, too.
-    kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
+    kept = split.kept if prior is None else replace(split.kept, prior=prior.from_others.aligned)
     return _with_validation(expert, network, split, kept, updates=updates)
 
 
@@ -241,7 +247,7 @@ def _with_validation(
         expert,
         at_validation=predicted,
         updated_at_validation=split.points.sample(prediction.updated),
-        kept=prediction,
+        from_others=prediction,
         share_of_aligned=share_of_aligned,
         harm=harm,
     )
@@ -259,7 +265,7 @@ def _at_validation_points(dense: Tensor, split: ValidatedFrame) -> Tensor:
 
 
 def expert_of_user(
-    network: OpenNetwork, split: ValidatedFrame, judged: Judged, *, needs_trust: bool = False
+    network: OpenNetwork, split: ValidatedFrame, search: OutlierSearch, *, needs_trust: bool = False
 ) -> NetworkExpert:
     """Returns what a user's network predicts, as an expert; z of a strong network is not updated.
 
@@ -270,11 +276,11 @@ def expert_of_user(
     Args:
         network: The network, open.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
         needs_trust: Whether a network has no part in the result if `trust_in_image` is 0, so that
             updates of its z would be in vain.
     """
-    prediction = judged.by(network)
+    prediction = search.by(network)
     unexplained = 1.0
     may_update = True
     lacks_trust = False
@@ -282,7 +288,7 @@ def expert_of_user(
     if not network.takes_points:
         if prediction is None:
             prediction = network.refine(split.whole, updates=network.always_updated)
-        unexplained = unexplained_by(prediction.aligned, split, judged)
+        unexplained = unexplained_by(prediction.aligned, split, search)
         # Updates that the user states are made without trust, too.
         is_stated = network.always_updated or network.tuned
         if needs_trust and not is_stated:
@@ -322,30 +328,30 @@ def _mix_with_aligned(prediction: Prediction, share_of_aligned: float) -> Tensor
 
 
 def networks_alone(
-    networks: Sequence[OpenNetwork], split: ValidatedFrame, judged: Judged
+    networks: Sequence[OpenNetwork], split: ValidatedFrame, search: OutlierSearch
 ) -> Experts:
     """Returns the predictions of the user's networks as the only experts, of equal prior weights.
 
     Args:
         networks: The networks, open.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
     of_users = [
-        replace(expert_of_user(network, split, judged), weight=1 / len(networks))
+        replace(expert_of_user(network, split, search), weight=1 / len(networks))
         for network in networks
     ]
-    return Experts(own=of_users[0], alone=None, every=[*of_users])
+    return Experts(first_of_user=of_users[0], without_prior=None, every=[*of_users])
 
 
 def fused_experts(
     networks: Sequence[OpenNetwork],
     fusing: OpenNetwork,
     split: ValidatedFrame,
-    judged: Judged,
+    search: OutlierSearch,
 ) -> Experts:
     """Returns the experts of a frame: what predicts it, each with a prior weight.
 
@@ -356,21 +362,21 @@ def fused_experts(
         networks: The networks, open, the user's first.
         fusing: The one of them that takes a prior.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
     # The user's networks predict.
     users = [network for network in networks if network is not fusing]
-    of_users = [expert_of_user(network, split, judged, needs_trust=True) for network in users]
+    of_users = [expert_of_user(network, split, search, needs_trust=True) for network in users]
     # The network that takes a prior predicts without one.
-    alone = expert_of(fusing, split, fusing.name, prediction=judged.by(fusing))
+    without_prior = expert_of(fusing, split, fusing.name, prediction=search.by(fusing))
     # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
     with_prior: list[NetworkExpert] = []
     merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in of_users]
     for number, (user, expert) in enumerate(zip(users, of_users, strict=True)):
-        share = trust(user, expert, split, alone) * merits[number] / sum(merits)
+        share = trust(user, expert, split, without_prior) * merits[number] / sum(merits)
         weight = (OWN + (OWN_STRONG - OWN) * expert.strength) * share
         # On scan lines a completion network has its weight by `fuse.shares_on_lines`.
         of_users[number] = replace(expert, weight=0.0 if expert.of_scanner else weight)
@@ -380,11 +386,11 @@ def fused_experts(
             with_prior.append(replace(prior_expert, weight=WITH_PRIOR * share))
     # What is left of the prior weights is that of the network without a prior.
     left = 1 - sum(expert.weight for expert in (*of_users, *with_prior))
-    alone = replace(alone, weight=left)
+    without_prior = replace(without_prior, weight=left)
     experts = Experts(
-        own=of_users[0] if of_users else alone,
-        alone=alone if of_users else None,
-        every=[*of_users, *with_prior, alone, _interpolation(split)],
+        first_of_user=of_users[0] if of_users else without_prior,
+        without_prior=without_prior if of_users else None,
+        every=[*of_users, *with_prior, without_prior, _interpolation(split)],
     )
     # Where the image does not help, an expert that does not see it joins.
     return _with_blind_expert(fusing, split, experts)
@@ -408,7 +414,7 @@ def _interpolation(split: ValidatedFrame) -> Expert:
 
 
 def trust(
-    network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, alone: NetworkExpert
+    network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, without_prior: NetworkExpert
 ) -> float:
     """Returns 0…1, the fraction of its prior weights that a user's network gets.
 
@@ -416,22 +422,23 @@ def trust(
     validation points change them.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points, the residual not propagated, is that of `alone`, and none if it is twice
-    that. Without validation points it has none. Another one has what `trust_in_image` says.
+    the validation points, the residual not propagated, is that of `without_prior`, and none if it
+    is twice that. Without validation points it has none. A network of the image alone has what
+    `trust_in_image` says.
 
     Args:
         network: The network, open.
         expert: The network's own depth.
         split: The frame and its validation points.
-        alone: The network that takes a prior, without one.
+        without_prior: What the network that takes a prior predicts without one.
     """
     if not network.takes_points:
-        return trust_in_image(expert.whole.aligned, split.whole.points)
-    # A network that takes the points: by its error beside that of `alone`.
+        return trust_in_image(expert.from_all.aligned, split.whole.points)
+    # A network that takes the points: by its error beside that of `without_prior`.
     if not len(split.points):
         return 0.0
     error = split.error(expert.updated_at_validation)
-    ratio = error / max(split.error(alone.at_validation), LEAST_ERROR)
+    ratio = error / max(split.error(without_prior.at_validation), LEAST_ERROR)
     return min(1.0, max(0.0, 2.0 - ratio))
 
 

@@ -205,20 +205,20 @@ def _share_of_image(
         inliers: The frame without its outliers.
         weights: The weights in the fused depth, by name.
     """
-    first = experts.own
-    alone = experts.alone
-    if alone is None or first.user is None or first.user.takes_points:
+    first = experts.first_of_user
+    without_prior = experts.without_prior
+    if without_prior is None or first.user is None or first.user.takes_points:
         return []
     # Its error at the validation points, beside that of `compact`, says how much it may have.
     kept = split.kept
-    field = ResidualField(first.kept.aligned, kept.points, kept.rgb)
+    field = ResidualField(first.from_others.aligned, kept.points, kept.rgb)
     predicted = field.depth(split.points.xy, kind=split.propagation)
-    ratio = split.error(predicted) / max(split.error(alone.at_validation), LEAST_ERROR)
+    ratio = split.error(predicted) / max(split.error(without_prior.at_validation), LEAST_ERROR)
     fraction = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
     least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, fraction))
     # What it has already in the fused depth counts.
     missing = least_weight - weights[first.name]
     if missing <= 0:
         return []
-    whole = ResidualField(first.whole.aligned, inliers.points, inliers.rgb)
+    whole = ResidualField(first.from_all.aligned, inliers.points, inliers.rgb)
     return [Share(first.name, missing, whole.depth(kind=split.propagation), predicted)]

@@ -177,7 +177,7 @@ class Method:
         self._stack.close()
 
     @property
-    def own(self) -> OpenNetwork:
+    def first_member(self) -> OpenNetwork:
         """The user's first network."""
         return self.members[0]
 

@@ -26,7 +26,7 @@ from pnpdepth_cli.frames.experts import (
 from pnpdepth_cli.frames.frame import Frame, Refined, Validation, is_dense
 from pnpdepth_cli.frames.fuse import Share, fit_weights, shares_on_lines, with_shares
 from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
-from pnpdepth_cli.frames.strength import Judged, strength_of, unexplained_of
+from pnpdepth_cli.frames.strength import OutlierSearch, strength_of, unexplained_of
 from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
 from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
@@ -76,22 +76,22 @@ def refine_frame(
     # tells them, else the user's: a useless network does not decide which points are used.
     judge = next((network for network in networks if network.weighs_points), networks[0])
     if pipeline.leaves_outliers_out:
-        judged = without_outliers(judge, frame, networks)
+        search = without_outliers(judge, frame, networks)
     else:
-        judged = Judged(judge, frame, judge.refine(frame))
-    inliers = judged.inliers
+        search = OutlierSearch(judge, frame, judge.refine(frame))
+    inliers = search.inliers
     # A fifth of the inliers are validation points, which every expert predicts from the others.
     split = whole_frame(inliers, pipeline.propagation)
     if pipeline.validates:
-        split = split_frame(split, judged.prediction.aligned, networks, seed=seed)
+        split = split_frame(split, search.prediction.aligned, networks, seed=seed)
     # The experts predict: the networks, z updated, and what a network makes of their depth.
     fusing = None
     if pipeline.fuses:
         fusing = next((network for network in networks if network.takes_prior), None)
     if fusing is None:
-        experts = networks_alone(networks, split, judged)
+        experts = networks_alone(networks, split, search)
     else:
-        experts = fused_experts(networks, fusing, split, judged)
+        experts = fused_experts(networks, fusing, split, search)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts.every, split)
     if fusing is not None:
@@ -100,9 +100,9 @@ def refine_frame(
     fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in weighted])
     # Points far from the depth of a network that weighs them are outliers, too.
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
-        inliers = inliers.without(far_points(judged.prediction.aligned, inliers.points))
+        inliers = inliers.without(far_points(search.prediction.aligned, inliers.points))
     # The residual at the inliers is propagated to every pixel.
-    propagated = _propagate(fused, inliers, split, judged.field)
+    propagated = _propagate(fused, inliers, split, search.field)
     depth = propagated
     # On scan lines, validation points do not show what some networks are worth.
     shares: list[Share] = []
@@ -110,7 +110,7 @@ def refine_frame(
         shares = shares_on_lines(experts, split, inliers, weights)
         depth = with_shares(propagated, [(share.dense, share.weight) for share in shares])
     steps = Steps(
-        judged=judged.field,
+        outlier_field=search.field,
         fused=fused,
         propagated=propagated,
         depth=depth,
@@ -127,7 +127,8 @@ def refine_frame(
 class Steps(NamedTuple):
     """What the steps of one frame gave; depths are (H, W) metres, 0 = unknown."""
 
-    judged: ResidualField | None  # the field that told the outliers. None: none did
+    outlier_field: ResidualField | None
+    """Residual field by which outliers were found. None: they were not sought."""
     fused: Tensor  # the weighted mean of the experts
     propagated: Tensor  # the same, its residual at the points propagated
     depth: Tensor  # the result: `propagated` with the shares of single networks
@@ -146,7 +147,7 @@ class Steps(NamedTuple):
 
 def without_outliers(
     judge: OpenNetwork, frame: Frame, networks: Sequence[OpenNetwork] = ()
-) -> Judged:
+) -> OutlierSearch:
     """Returns the frame without its outliers, and what a network, the judge, gives for it.
 
     The difference of an outlier's log depth from the judge's prediction is clearly another than
@@ -187,7 +188,7 @@ def without_outliers(
     inliers = frame.without(outlying)
     if predicts_again or not torch.equal(outlying, suspected):
         prediction = judge.refine(inliers, updates=judge.takes_points)
-    return Judged(judge, inliers, prediction, field, constant)
+    return OutlierSearch(judge, inliers, prediction, field, constant)
 
 
 def outliers_beside_strong(
@@ -250,7 +251,7 @@ def _refined(
         steps: What the steps gave.
         pipeline: The steps of the method.
     """
-    prediction = experts.own.whole  # of the user's first network
+    prediction = experts.first_of_user.from_all  # of the user's first network
     notes = _notes(frame, inliers, experts, split, steps, pipeline)
     return Refined(
         before=prediction.aligned.numpy(),
@@ -286,8 +287,8 @@ def _notes(
         steps: What the steps gave.
         pipeline: The steps of the method.
     """
-    first = experts.own
-    notes = list(first.whole.notes)
+    first = experts.first_of_user
+    notes = list(first.from_all.notes)
     # Of the image and the points.
     if frame.registration is not None:
         notes.append(
@@ -312,7 +313,7 @@ def _notes(
             f"{first.name} is strong: with its depth the points predict each other far better than"
             f" without; {first.share_of_aligned:.0%} of it is taken before the updates of z"
         )
-    if pipeline.unused and not first.whole.updates:
+    if pipeline.unused and not first.from_all.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
         notes.append(f"{names}: not used, as z of {first.name} is not updated")
     return [*notes, *experts.warnings]
@@ -336,20 +337,20 @@ def _stages(
         """Depth (H, W) with its residual propagated; that of the fused depth is known."""
         if dense is steps.fused:
             return steps.propagated
-        return _propagate(dense, frame, split, steps.judged)
+        return _propagate(dense, frame, split, steps.outlier_field)
 
-    first = experts.own
-    stages = {BEFORE: first.whole.aligned}
+    first = experts.first_of_user
+    stages = {BEFORE: first.from_all.aligned}
     # Updates without a part in the result are no stage, but for those that do harm, which is shown.
-    if first.whole.updates and (first.share_of_aligned < 1 or first.harm is not None):
-        stages[UPDATED] = first.whole.updated
+    if first.from_all.updates and (first.share_of_aligned < 1 or first.harm is not None):
+        stages[UPDATED] = first.from_all.updated
     # A completion network on scan lines has its share of the result without propagation.
     if first.of_scanner:
-        stages[PROPAGATED] = first.whole.updated
+        stages[PROPAGATED] = first.from_all.updated
     elif split.propagation != "none":
         stages[PROPAGATED] = propagated(first.dense)
-    if experts.alone is not None:
-        stages[ALONE] = propagated(experts.alone.dense)
+    if experts.without_prior is not None:
+        stages[ALONE] = propagated(experts.without_prior.dense)
     return stages
 
 
@@ -365,7 +366,7 @@ def _validation(
         split: The frame and its validation points.
         shares: The shares of single networks in the result.
     """
-    first = experts.own
+    first = experts.first_of_user
     points = split.points
     if not len(points):
         return None
@@ -383,21 +384,21 @@ def _validation(
     if split.kept.outliers is not None:
         others = others.joined(split.kept.outliers)
     # The steps of the user's network, `compact` alone, the result and interpolation.
-    predicted = {BEFORE: points.sample(first.kept.aligned)}
-    if first.kept.updates:
+    predicted = {BEFORE: points.sample(first.from_others.aligned)}
+    if first.from_others.updates:
         predicted[UPDATED] = first.updated_at_validation
     if first.of_scanner:
         predicted[PROPAGATED] = first.updated_at_validation
     elif split.propagation != "none":
         predicted[PROPAGATED] = first.at_validation
-    if experts.alone is not None:
-        predicted[ALONE] = experts.alone.at_validation
+    if experts.without_prior is not None:
+        predicted[ALONE] = experts.without_prior.at_validation
     predicted[AFTER] = with_shares(fused, [(share.at_validation, share.weight) for share in shares])
     predicted[LINEAR] = linear(others, points.xy)
     return Validation(
         points=points,
         kept=others,
-        network=first.kept.aligned,
+        network=first.from_others.aligned,
         weights=split.weights,
         predicted=predicted,
     )
@@ -414,7 +415,7 @@ def _notes_on_networks(
         weights: The weights of all experts in the result, by name.
     """
     notes: list[str] = []
-    alone = experts.alone
+    without_prior = experts.without_prior
     for network in experts.of_users:
         if network.lacks_trust:
             notes.append(
@@ -426,11 +427,11 @@ def _notes_on_networks(
         if sum(weights[expert.name] for expert in experts_of_user) >= LEAST_PART:
             continue
         why = "its depth does not help to predict the points from each other"
-        if len(split.points) and alone is not None:
+        if len(split.points) and without_prior is not None:
             why = (
                 f"at {len(split.points):,} validation points its error is"
-                f" {split.error(network.at_validation):.4f}, that of {alone.name}"
-                f" {split.error(alone.at_validation):.4f}"
+                f" {split.error(network.at_validation):.4f}, that of {without_prior.name}"
+                f" {split.error(without_prior.at_validation):.4f}"
             )
         notes.append(f"{network.name} has no part in the result: {why}")
     return notes

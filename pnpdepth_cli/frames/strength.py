@@ -32,26 +32,31 @@ USEFUL = 0.75
 """The same fraction, from which on it has all of its prior weight."""
 
 
-class Judged(NamedTuple):
-    """A frame without its outliers, which were told beside the depth of one of its networks."""
+class OutlierSearch(NamedTuple):
+    """A frame without its outliers, and the network beside whose depth these were found.
+
+    Where outliers were not sought, the frame has all its points.
+    """
 
     network: OpenNetwork
-    """The network beside whose depth they were told."""
+    """The network beside whose depth outliers were found."""
     inliers: Frame
-    """The frame without them."""
+    """The frame without its outliers."""
     prediction: Prediction
-    """What that network gives for the frame without them."""
+    """What `network` gives for `inliers`."""
     field: ResidualField | None = None
     """Residual field of its aligned depth at all points. None: outliers were not sought."""
     constant: ResidualField | None = None
-    """Residual field of a constant depth at all points, likewise."""
+    """Residual field of a constant depth at all points. None: outliers were not sought."""
 
     def by(self, network: OpenNetwork) -> Prediction | None:
-        """Returns what a network gives for the inliers; None if it did not tell the outliers."""
-        return self.prediction if network is self.network else None
+        """Returns what a network gives for the inliers; None if outliers were found by another."""
+        if network is self.network:
+            return self.prediction
+        return None  # it has not predicted yet
 
 
-def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
+def unexplained_by(aligned: Tensor, split: ValidatedFrame, search: OutlierSearch) -> float:
     """Returns which part of the points' depth, mostly 0…1, a network leaves unexplained.
 
     That is a quotient of two leave-one-out errors: that with which the network's aligned depth, its
@@ -66,16 +71,16 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
     Args:
         aligned: (H, W) metres, 0 = unknown, the network's depth before updates of z.
         split: The frame and its validation points.
-        judged: The frame without outliers, and the residual fields by which they were told.
+        search: The frame without outliers, and the residual fields by which these were found.
     """
     points = split.whole.points
     known_count = int((points.sample(aligned) > 0).sum())
-    if split.has_scan_lines or known_count < MIN_POINTS or judged.constant is None:
+    if split.has_scan_lines or known_count < MIN_POINTS or search.constant is None:
         return 1.0
-    field = judged.field
+    field = search.field
     if field is None or not field.is_of(aligned, points):
         field = ResidualField(aligned, points, split.whole.rgb)
-    return unexplained_of(field, judged.constant)
+    return unexplained_of(field, search.constant)
 
 
 def unexplained_of(field: ResidualField, constant: ResidualField) -> float:

@@ -92,7 +92,7 @@ def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
 
 
 def split_frame(
-    whole: ValidatedFrame, judged: Tensor, networks: Sequence[OpenNetwork], *, seed: int
+    unsplit: ValidatedFrame, prediction: Tensor, networks: Sequence[OpenNetwork], *, seed: int
 ) -> ValidatedFrame:
     """Returns the frame with and without its validation points, and these points.
 
@@ -100,23 +100,24 @@ def split_frame(
     does not see.
 
     Args:
-        whole: The frame with all its points, none of them for validation yet.
-        judged: (H, W) metres, 0 = unknown, a prediction. Validation points whose residual beside it
-            differs from their neighbours' count less: outliers would decide the weights.
+        unsplit: The frame with all its points, none of them for validation yet.
+        prediction: (H, W) metres, 0 = unknown: depth from a network. Validation points whose
+            residual, log measured − log predicted depth, differs from their neighbours' count
+            less: outliers would decide the weights.
         networks: The networks that will predict.
         seed: Random seed of the validation points.
     """
-    points = whole.whole.points
+    points = unsplit.whole.points
     if len(points) < MIN_POINTS:
-        return whole
+        return unsplit
     # Of a depth map with holes, the points that copies of its holes cover; else a fold.
     hole = None
-    if is_dense(points) and not whole.has_scan_lines:
+    if is_dense(points) and not unsplit.has_scan_lines:
         hole = under_holes(points, FOLDS, seed=seed)
     is_chosen = (spatial_folds(points, FOLDS, seed=seed) == 0) if hole is None else (hole > 0)
-    kept = replace(whole.whole, points=points.select(~is_chosen))
+    kept = replace(unsplit.whole, points=points.select(~is_chosen))
     if not bool(is_chosen.any()) or not all(network.sees(kept) for network in networks):
-        return whole
+        return unsplit
     # Of many validation points some are drawn; all of them are kept from the experts.
     (numbers,) = is_chosen.nonzero(as_tuple=True)
     order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
@@ -124,12 +125,12 @@ def split_frame(
     validation = points.select(numbers)
     hole = None if hole is None else hole[numbers]
     # Each counts as much as it is consistent with its neighbours.
-    predicted = validation.sample(judged)
+    predicted = validation.sample(prediction)
     residual = validation.depth.double().log() - predicted.clamp_min(_LEAST_DEPTH).double().log()
     weights = torch.where(predicted > 0, inlier_weights(validation, residual), 0.0).float()
     if not bool(weights.any()):
         weights = torch.ones_like(weights)
-    return replace(whole, kept=kept, points=validation, weights=weights, hole=hole)
+    return replace(unsplit, kept=kept, points=validation, weights=weights, hole=hole)
 
 
 def log_of(depth: Tensor) -> Tensor:
