@@ -118,7 +118,8 @@ def split_frame(
     if is_dense(points) and not unsplit.has_scan_lines:
         hole = under_holes(points, FOLDS, seed=seed)
     if hole is None:
-        is_chosen = spatial_folds(points, FOLDS, seed=seed) == 0
+        fold = spatial_folds(points, FOLDS, seed=seed)
+        is_chosen = fold == 0
     else:
         is_chosen = hole > 0
     kept = replace(unsplit.whole, points=points.select(~is_chosen))
