@@ -46,7 +46,7 @@ from benchmarks.frames import (
 )
 from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.frames.frame import Refined
-from pnpdepth_cli.frames.refine_frame import LEAST_PART
+from pnpdepth_cli.frames.refine_frame import LEAST_WEIGHT_IN_RESULT
 from pnpdepth_cli.frames.uncertainty import with_uncertainty
 from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 from pnpdepth_cli.models.network import Network
@@ -227,7 +227,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "mean": {stage: tuple(mean.tolist()) for stage, mean in means.items()},
         "worse": float(np.mean(worse)),
         "weight": float(np.mean([row["weight"] for row in rows])),
-        "no_part": float(np.mean([row["weight"] < LEAST_PART for row in rows])),
+        "no_part": float(np.mean([row["weight"] < LEAST_WEIGHT_IN_RESULT for row in rows])),
         "warned": float(np.mean([row["warned"] for row in rows])),
         "cpu_s": float(np.median([row["cpu_s"] for row in rows])),
     }

@@ -175,7 +175,12 @@ class Refiner:
             decides_alone = self._register == "auto" and frame.size not in method.registrations
             is_moved_otherwise = decides_alone and self._is_moved_otherwise(frame, refined)
         # What a person should know, and how the frame is saved.
-        notes = [*method.own.network.notes, *frame.notes, *notes_on_registration, *refined.notes]
+        notes = [
+            *method.first_member.network.notes,
+            *frame.notes,
+            *notes_on_registration,
+            *refined.notes,
+        ]
         if is_moved_otherwise:
             notes.append(
                 "note: images of this size were moved to their points in different ways;"

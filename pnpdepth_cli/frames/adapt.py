@@ -40,7 +40,7 @@ EPSILON = 1e-12
 STEPS_A_VISIT = 4
 """Updates on a frame before the next is taken: every point is hidden twice."""
 LEAST_FRAMES = 8
-"""Least number of frames of a sequence; fewer teach too little."""
+"""Frames of a sequence from which a network learns, at least; fewer teach too little."""
 SIGNIFICANT = 0.05
 """Level of the one-sided paired t test over the frames for validation."""
 
@@ -59,11 +59,14 @@ _LEAST_FOR_VALIDATION = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Learnt:
-    """What the weights of a network learnt from a sequence."""
+    """Weights that learnt from a sequence, and their loss before and after."""
 
     weights: Weights
-    before: NDArray[np.float64]  # loss at hidden points of each frame for validation
-    after: NDArray[np.float64]  # the same with these weights
+    """The parameters that learnt, as they are afterwards."""
+    before: NDArray[np.float64]
+    """(F,) loss at hidden points of each of F frames for validation, before the weights learnt."""
+    after: NDArray[np.float64]
+    """(F,) the same with `weights`."""
 
     @property
     def is_better(self) -> bool:
@@ -102,7 +105,8 @@ def learn(
 ) -> Learnt:
     """Returns weights of a network that learnt from the points of a sequence, and their losses.
 
-    The network itself does not change.
+    Half of a frame's points are hidden from the network's input, and the loss is the mean error of
+    log depth at these. The network itself does not change.
 
     Args:
         network: Network that takes sparse depth, not cut.
@@ -121,7 +125,9 @@ def learn(
             f"network {name!r} takes no sparse depth, so none can be hidden from it; adapt one that"
             " takes it"
         )
-    # One frame of each period is for validation; a short sequence has shorter periods.
+    # The last of every `period` frames is for validation, the others are for training. A short
+    # sequence has shorter periods, so that at least `_LEAST_FOR_VALIDATION` frames are for it; but
+    # no period is shorter than 2, which leaves one of two frames for training.
     lessons = [_lesson(network, name, frame) for name, frame in frames]
     period = max(2, min(_LARGEST_PERIOD, len(lessons) // _LEAST_FOR_VALIDATION))
     validation = lessons[period - 1 :: period]
@@ -149,8 +155,8 @@ def _make_updates(
 
     Args:
         network: The network.
-        lessons: The frames to learn from.
-        theta: Weights with gradients, which change in place.
+        lessons: The frames to learn from, and their points of which half is hidden at each update.
+        theta: Weights with gradients by name, float32, which change in place.
         seed: Random seed of the frames' order and of the hidden points.
         on_step: Function that is called after each update.
 
@@ -163,7 +169,7 @@ def _make_updates(
     # Visits of frames in random order, each with other points hidden at every update.
     generator = torch.Generator().manual_seed(seed)
     order = _shuffle(len(lessons), generator)
-    for first_step in range(0, STEPS, STEPS_A_VISIT):
+    for first_step in range(0, STEPS, STEPS_A_VISIT):  # the number of a visit's first update
         lesson = lessons[next(order)]
         with _open_lesson(network, lesson, generator) as loss_of:
             for step in range(first_step, min(first_step + STEPS_A_VISIT, STEPS)):
@@ -184,7 +190,12 @@ def _make_updates(
 
 @contextmanager
 def weights_in_place(network: Network, weights: Weights) -> Iterator[None]:
-    """Inside, the network computes with these weights; afterwards it has its own again."""
+    """Inside, the network computes with these weights; afterwards it has its own again.
+
+    Args:
+        network: The network, whose other parameters stay.
+        weights: Values of parameters by name, which are given their parameter's type.
+    """
     parameters = dict(network.module.named_parameters())
     originals = {name: parameters[name].data for name in weights}
     try:
@@ -213,8 +224,9 @@ def _lesson(network: Network, name: str, frame: Frame) -> Lesson:
         raise NoPointsError(
             f"{name}: {len(points)} points; hiding some needs 2, so leave this frame out"
         )
-    # An outlier among few points may be all that is seen of a small object. Outliers contradict
-    # their neighbours: beside a constant depth.
+    # Outliers are left out: points whose depth contradicts their neighbours', told by the residual
+    # beside a constant depth. Of few points none is left out: an outlier may be all that is seen of
+    # a small object.
     if len(points) >= FEW_POINTS:
         outlying = ResidualField(torch.ones(points.size), points.tensors(), None).outliers
         points = points.select(~outlying.to(points.xy.device))
@@ -254,11 +266,11 @@ def _open_lesson(
         with wrap_user_errors("the network's forward"):
             output = functional_call(network.module, typed_weights, arguments)
         predicted = hidden.sample(reader(output))
-        is_known = predicted.isfinite()  # not where the network says so, such as in the sky
+        is_known = predicted.isfinite()  # some networks leave depth unknown, such as in the sky
         log_error = predicted[is_known].clamp_min(MIN_DEPTH).log() - hidden.depth[is_known].log()
         return log_error.abs().mean()
 
-    with encoding_once(network, {}):
+    with encoding_once(network, {}):  # the image encoder does not learn
         yield loss_of
 
 
@@ -284,7 +296,7 @@ def _losses_of(
     Args:
         network: The network.
         lessons: The frames, and their points of which half is hidden.
-        theta: The weights.
+        theta: The weights by name.
         seed: Random seed of the hidden points: with one seed they are the same for all weights.
     """
     losses: list[float] = []
@@ -304,6 +316,7 @@ def _shuffle(count: int, generator: torch.Generator) -> Iterator[int]:
 def _halves(count: int, generator: torch.Generator) -> Iterator[Tensor]:
     """Yields masks (count,) bool without end: a random half, its complement, another half, …"""
     while True:
+        # The odd ones of shuffled numbers are a random half of the points.
         is_second = (torch.randperm(count, generator=generator) % 2).bool()
         yield ~is_second
         yield is_second

@@ -23,17 +23,17 @@ from pnpdepth_cli.completion.interpolation import linear
 from pnpdepth_cli.completion.residual_field import ResidualField
 from pnpdepth_cli.frames.frame import Frame, Prediction
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW, OpenNetwork
-from pnpdepth_cli.frames.strength import Judged, strength_of, trust_in_image, unexplained_by
+from pnpdepth_cli.frames.strength import OutlierSearch, strength_of, trust_in_image, unexplained_by
 from pnpdepth_cli.frames.validation import ValidatedFrame
 from pnpdepth_cli.measures import LINEAR
 from pnpdepth_cli.points import SparsePoints
 
 # Prior weights were chosen on 7-Scenes, ICL-NUIM, NYU, RealSense, rendered rooms and streets with
 # each set left out in turn (docs/notes/fusion.md). What a network is worth is in `strength`.
-OWN = 0.15
-"""Prior weight of a network that explains the points."""
-OWN_STRONG = 0.5
-"""The same of a strong network."""
+OF_NETWORK = 0.15
+"""Prior weight of a network that explains the points, and is not strong."""
+OF_STRONG_NETWORK = 0.5
+"""Prior weight of a strong network, of strength 1 (`strength_of`)."""
 LEAST_UNEXPLAINED = 0.02
 """Least part that a network leaves unexplained (`strength.unexplained_by`). Several networks share
 the prior weights by its inverse square."""
@@ -41,7 +41,8 @@ HARMFUL = 1.05
 """Error at the validation points with updates of z, over that without, from which on updates that
 the user states are not used."""
 WITH_PRIOR = 0.45
-"""Prior weight of `compact` with that network's depth as a prior. Without one it has the rest."""
+"""Prior weight of `compact` with that network's depth as a prior. `compact` without a prior has
+what all other prior weights leave of 1."""
 WITHOUT_IMAGE = 0.05
 """Prior weight of every expert that leaves the image out."""
 LEAST_WEIGHT = 1e-6
@@ -50,8 +51,9 @@ DOUBT = 2.0
 """Standard errors by which the image lowers the error at the validation points, from which on no
 expert that leaves the image out joins."""
 NO_GAIN = 0.5
-"""The same, below which there is a warning. With 500 points, 25 even frames with their own image
-have at least 0.7, but 2 of 18 odd ones less than 0.5; 8 of 9 with another image at most 0.4."""
+"""Standard errors by which the image lowers that error, below which there is a warning. With 500
+points, 25 even frames with their own image have at least 0.7, but 2 of 18 odd ones less than 0.5;
+8 of 9 with another image at most 0.4."""
 ENOUGH_FOR_DOUBT = 50
 """Fewer validation points do not tell an image that belongs to its points from another one."""
 LEAST_ERROR = 1e-9
@@ -63,14 +65,20 @@ class Expert:
     """What predicts a frame from its points: linear interpolation, or a network."""
 
     name: str
-    weight: float = 0.0  # prior weight; with 0 it has no part in the fused depth
+    weight: float = 0.0
+    """Prior weight: its weight in the fused depth before the validation points change it. With 0 it
+    has no part in the fused depth."""
     at_validation: Tensor
     """(M,) metres, 0 = unknown: its depth at the M validation points, predicted from the other
     points, its residual at these propagated."""
-    updated_at_validation: Tensor  # (M,) the same, the residual not propagated
+    updated_at_validation: Tensor
+    """(M,) metres, 0 = unknown: the same depth, the residual not propagated; of a network, always
+    that of the updated z."""
     points: SparsePoints  # all points, those for validation too
-    user: OpenNetwork | None = None  # the user's network whose depth it is, or has as a prior
-    of_scanner: bool = False  # whether it is a completion network of the user's, given scan lines
+    user: OpenNetwork | None = None
+    """The user's network whose depth it has, or takes as its prior. None: neither."""
+    of_scanner: bool = False
+    """Whether it is a network of the user's that takes points, and these are scan lines."""
 
     @functools.cached_property
     def dense(self) -> Tensor:
@@ -82,13 +90,15 @@ class Expert:
 class NetworkExpert(Expert):
     """A network that predicts the frame, perhaps with another network's depth as a prior."""
 
-    whole: Prediction  # from all points
-    kept: Prediction  # from all but the validation points; the same as `whole` without any
+    from_all: Prediction  # from all points
+    from_others: Prediction  # from the points that are not for validation
     frame: Frame | None = None  # what it is shown mirrored, too. None: it sees one frame
     mirrored: Tensor | None = None  # (H, W): its depth of the mirrored frame, turned back
-    unexplained: float = 1.0  # what a network that takes the image alone leaves: `unexplained_by`
+    unexplained: float = 1.0
+    """Part of the points' depth, mostly 0…1, that a network of the image alone leaves unexplained
+    (`unexplained_by`); 1 for a network that takes points."""
     share_of_aligned: float = 0.0
-    """0…1, the part in its depth of the aligned depth, before updates of z. The updated depth has
+    """0…1, weight in its depth of the aligned depth, before updates of z. The depth after them has
     the rest."""
     lacks_trust: bool = False  # whether z is not updated only because `trust_in_image` is 0
     harm: tuple[float, float] | None = None
@@ -106,7 +116,7 @@ class NetworkExpert(Expert):
 
         With `mirrored` it is the mean of the depths of both frames.
         """
-        depth = _mix_with_aligned(self.whole, self.share_of_aligned)
+        depth = _mix_with_aligned(self.from_all, self.share_of_aligned)
         if self.mirrored is None:
             return depth
         return weighted_mean([(depth, 1), (self.mirrored, 1)])
@@ -115,17 +125,20 @@ class NetworkExpert(Expert):
 class Experts(NamedTuple):
     """The experts of a frame, and what stands out among them."""
 
-    own: NetworkExpert
+    first_of_user: NetworkExpert
     """The user's first network."""
-    alone: NetworkExpert | None
-    """The network that takes a prior, without one. None: there is none beside the user's."""
+    without_prior: NetworkExpert | None
+    """What the network that takes a prior predicts without one. None: no such network is fused with
+    the user's."""
     every: list[Expert]
-    """All of them, the user's networks first."""
+    """All experts, the user's networks first."""
     warnings: tuple[str, ...] = ()
+    """Notes for a person, each of which begins with "warning"."""
 
     @property
     def of_users(self) -> list[NetworkExpert]:
-        """The user's networks, each with its own depth."""
+        """The experts that are a network of the user's, none with another network's prior."""
+        # An expert of another network with the user's depth as its prior has another name.
         return [
             expert
             for expert in self.every
@@ -141,8 +154,14 @@ class Experts(NamedTuple):
             every: All experts, changed or not, in the order of `Experts.every`.
         """
         by_name = {expert.name: expert for expert in every if isinstance(expert, NetworkExpert)}
-        alone = None if self.alone is None else by_name[self.alone.name]
-        return self._replace(own=by_name[self.own.name], alone=alone, every=list(every))
+        without_prior = self.without_prior
+        if without_prior is not None:
+            without_prior = by_name[without_prior.name]
+        return self._replace(
+            first_of_user=by_name[self.first_of_user.name],
+            without_prior=without_prior,
+            every=list(every),
+        )
 
 
 def expert_of(
@@ -156,9 +175,10 @@ def expert_of(
     updates: bool = True,
     unexplained: float = 1.0,
 ) -> NetworkExpert:
-    """Returns an expert: what one network predicts from all points, and without validation points.
+    """Returns what a network predicts from all points, and from those not for validation.
 
-    Its prior weight in the fused depth is still 0.
+    The prior weight of this expert, its weight in the fused depth before the validation points
+    change it, is still 0.
 
     Args:
         network: The network, open.
@@ -172,7 +192,7 @@ def expert_of(
             `unexplained_by`; 1 for a network that takes points.
     """
     # The network predicts from all points; a prior is made from all points, too.
-    whole = split.whole if prior is None else replace(split.whole, prior=prior.whole.aligned)
+    whole = split.whole if prior is None else replace(split.whole, prior=prior.from_all.aligned)
     if prediction is None:
         prediction = network.refine(whole, updates=updates)
     # The stronger a network is, the more of its depth is that before updates of z, unless the user
@@ -181,14 +201,14 @@ def expert_of(
     share_of_aligned = 0.0
     if is_updated and not network.always_updated:
         share_of_aligned = strength_of(unexplained)
-    no_depth = split.points.depth[:0]  # the prediction without validation points, (0,)
+    no_depth = split.points.depth[:0]  # (0,), until the validation points are predicted
     expert = NetworkExpert(
         name=name,
         at_validation=no_depth,
         updated_at_validation=no_depth,
         points=whole.points,
-        whole=prediction,
-        kept=prediction,  # until it predicts without the validation points
+        from_all=prediction,
+        from_others=prediction,  # until it predicts without the validation points
         user=user,
         frame=whole if network.takes_prior else None,
         of_scanner=user is network and network.takes_points and split.has_scan_lines,
@@ -198,7 +218,7 @@ def expert_of(
     if not len(split.points):
         return expert
     # It predicts the validation points from the others; a prior is made from the others, too.
-    kept = split.kept if prior is None else replace(split.kept, prior=prior.kept.aligned)
+    kept = split.kept if prior is None else replace(split.kept, prior=prior.from_others.aligned)
     return _with_validation(expert, network, split, kept, updates=updates)
 
 
@@ -222,6 +242,7 @@ def _with_validation(
     share_of_aligned = expert.share_of_aligned
     # Updates of a network that takes points gain little and take as long as all else. So they are
     # spared here, unless the user states them.
+    # With a share of 1 the updated depth has no part.
     is_stated = network.tuned or network.always_updated
     is_worth_it = share_of_aligned < 1 and (is_stated or not network.takes_points)
     prediction = network.refine(kept, updates=updates and is_worth_it)
@@ -241,7 +262,7 @@ def _with_validation(
         expert,
         at_validation=predicted,
         updated_at_validation=split.points.sample(prediction.updated),
-        kept=prediction,
+        from_others=prediction,
         share_of_aligned=share_of_aligned,
         harm=harm,
     )
@@ -259,22 +280,23 @@ def _at_validation_points(dense: Tensor, split: ValidatedFrame) -> Tensor:
 
 
 def expert_of_user(
-    network: OpenNetwork, split: ValidatedFrame, judged: Judged, *, needs_trust: bool = False
+    network: OpenNetwork, split: ValidatedFrame, search: OutlierSearch, *, needs_trust: bool = False
 ) -> NetworkExpert:
     """Returns what a user's network predicts, as an expert; z of a strong network is not updated.
 
-    A network of the image alone is strong if, with its depth, the points predict each other far
-    better than with a constant depth (`strength_of`). In between, its depth is a mean of the one
-    before and the one after the updates.
+    A network of the image alone has a strength 0…1. The strength is 1 if, with its depth, the
+    points predict each other far better than with a constant depth (`strength_of`). Between 0 and 1
+    its depth is a mean of the one before and the one after the updates. z is updated also of a
+    strong network if the user states the number of updates.
 
     Args:
         network: The network, open.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
         needs_trust: Whether a network has no part in the result if `trust_in_image` is 0, so that
             updates of its z would be in vain.
     """
-    prediction = judged.by(network)
+    prediction = search.by(network)
     unexplained = 1.0
     may_update = True
     lacks_trust = False
@@ -282,16 +304,18 @@ def expert_of_user(
     if not network.takes_points:
         if prediction is None:
             prediction = network.refine(split.whole, updates=network.always_updated)
-        unexplained = unexplained_by(prediction.aligned, split, judged)
+        unexplained = unexplained_by(prediction.aligned, split, search)
         # Updates that the user states are made without trust, too.
         is_stated = network.always_updated or network.tuned
         if needs_trust and not is_stated:
             may_update = trust_in_image(prediction.aligned, split.whole.points) > 0
         # A strong network gains nothing by updates, but a stated number of them is made.
         can_gain = network.always_updated or strength_of(unexplained) < 1
-        is_missing = can_gain and not prediction.updates and network.is_updated(split.whole)
-        lacks_trust = is_missing and not may_update
-        if is_missing and may_update:
+        updates_are_missing = (
+            can_gain and not prediction.updates and network.is_updated(split.whole)
+        )
+        lacks_trust = updates_are_missing and not may_update
+        if updates_are_missing and may_update:
             prediction = network.refine(split.whole)
     expert = expert_of(
         network,
@@ -315,37 +339,37 @@ def _mix_with_aligned(prediction: Prediction, share_of_aligned: float) -> Tensor
         share_of_aligned: Weight 0…1 of the aligned depth; the updated one has the rest.
     """
     if not prediction.updates or share_of_aligned <= 0:
-        return prediction.updated
+        return prediction.updated  # without updates both depths are one
     return weighted_mean(
         [(prediction.updated, 1 - share_of_aligned), (prediction.aligned, share_of_aligned)]
     )
 
 
 def networks_alone(
-    networks: Sequence[OpenNetwork], split: ValidatedFrame, judged: Judged
+    networks: Sequence[OpenNetwork], split: ValidatedFrame, search: OutlierSearch
 ) -> Experts:
     """Returns the predictions of the user's networks as the only experts, of equal prior weights.
 
     Args:
         networks: The networks, open.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
     of_users = [
-        replace(expert_of_user(network, split, judged), weight=1 / len(networks))
+        replace(expert_of_user(network, split, search), weight=1 / len(networks))
         for network in networks
     ]
-    return Experts(own=of_users[0], alone=None, every=[*of_users])
+    return Experts(first_of_user=of_users[0], without_prior=None, every=[*of_users])
 
 
 def fused_experts(
     networks: Sequence[OpenNetwork],
     fusing: OpenNetwork,
     split: ValidatedFrame,
-    judged: Judged,
+    search: OutlierSearch,
 ) -> Experts:
     """Returns the experts of a frame: what predicts it, each with a prior weight.
 
@@ -356,23 +380,25 @@ def fused_experts(
         networks: The networks, open, the user's first.
         fusing: The one of them that takes a prior.
         split: The frame and its validation points.
-        judged: The frame without outliers, and what the network that told them predicts.
+        search: The frame without outliers, and what the network that found them predicts.
 
     Raises:
         PnpDepthError: A network gives no depth.
     """
     # The user's networks predict.
     users = [network for network in networks if network is not fusing]
-    of_users = [expert_of_user(network, split, judged, needs_trust=True) for network in users]
+    of_users = [expert_of_user(network, split, search, needs_trust=True) for network in users]
     # The network that takes a prior predicts without one.
-    alone = expert_of(fusing, split, fusing.name, prediction=judged.by(fusing))
-    # Each one's depth is its prior in turn; the prior weights follow what the depth explains.
+    without_prior = expert_of(fusing, split, fusing.name, prediction=search.by(fusing))
+    # Each one's depth is its prior in turn. Several networks share the prior weights by the inverse
+    # square of what their depth leaves unexplained.
     with_prior: list[NetworkExpert] = []
     merits = [max(expert.unexplained, LEAST_UNEXPLAINED) ** -2 for expert in of_users]
     for number, (user, expert) in enumerate(zip(users, of_users, strict=True)):
-        share = trust(user, expert, split, alone) * merits[number] / sum(merits)
-        weight = (OWN + (OWN_STRONG - OWN) * expert.strength) * share
-        # On scan lines a completion network has its weight by `fuse.shares_on_lines`.
+        share = trust(user, expert, split, without_prior) * merits[number] / sum(merits)
+        weight = (OF_NETWORK + (OF_STRONG_NETWORK - OF_NETWORK) * expert.strength) * share
+        # A network that takes points has no weight here on scan lines: `fuse.shares_on_lines` gives
+        # it one beside the fused depth.
         of_users[number] = replace(expert, weight=0.0 if expert.of_scanner else weight)
         if share > 0:
             name = f"{fusing.name} with {expert.name}"
@@ -380,13 +406,13 @@ def fused_experts(
             with_prior.append(replace(prior_expert, weight=WITH_PRIOR * share))
     # What is left of the prior weights is that of the network without a prior.
     left = 1 - sum(expert.weight for expert in (*of_users, *with_prior))
-    alone = replace(alone, weight=left)
+    without_prior = replace(without_prior, weight=left)
     experts = Experts(
-        own=of_users[0] if of_users else alone,
-        alone=alone if of_users else None,
-        every=[*of_users, *with_prior, alone, _interpolation(split)],
+        first_of_user=of_users[0] if of_users else without_prior,
+        without_prior=without_prior if of_users else None,
+        every=[*of_users, *with_prior, without_prior, _interpolation(split)],
     )
-    # Where the image does not help, an expert that does not see it joins.
+    # Where the image does not help, what the network that takes a prior predicts without it joins.
     return _with_blind_expert(fusing, split, experts)
 
 
@@ -408,7 +434,7 @@ def _interpolation(split: ValidatedFrame) -> Expert:
 
 
 def trust(
-    network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, alone: NetworkExpert
+    network: OpenNetwork, expert: NetworkExpert, split: ValidatedFrame, without_prior: NetworkExpert
 ) -> float:
     """Returns 0…1, the fraction of its prior weights that a user's network gets.
 
@@ -416,30 +442,32 @@ def trust(
     validation points change them.
 
     A network that takes the points has seen them. It has all of the prior weights if its error at
-    the validation points, the residual not propagated, is that of `alone`, and none if it is twice
-    that. Without validation points it has none. Another one has what `trust_in_image` says.
+    the validation points, the residual not propagated, is that of `without_prior`, and none if it
+    is twice that. Without validation points it has none. A network of the image alone has what
+    `trust_in_image` says.
 
     Args:
         network: The network, open.
         expert: The network's own depth.
         split: The frame and its validation points.
-        alone: The network that takes a prior, without one.
+        without_prior: What the network that takes a prior predicts without one.
     """
     if not network.takes_points:
-        return trust_in_image(expert.whole.aligned, split.whole.points)
-    # A network that takes the points: by its error beside that of `alone`.
+        return trust_in_image(expert.from_all.aligned, split.whole.points)
+    # A network that takes the points: by its error beside that of `without_prior`.
     if not len(split.points):
-        return 0.0
+        return 0.0  # nothing that it has not seen tells its error
     error = split.error(expert.updated_at_validation)
-    ratio = error / max(split.error(alone.at_validation), LEAST_ERROR)
-    return min(1.0, max(0.0, 2.0 - ratio))
+    ratio = error / max(split.error(without_prior.at_validation), LEAST_ERROR)
+    return min(1.0, max(0.0, 2.0 - ratio))  # 1 up to an equal error, 0 from twice that on
 
 
 def _with_blind_expert(fusing: OpenNetwork, split: ValidatedFrame, experts: Experts) -> Experts:
     """The experts, joined by one that sees a grey image where the image is in doubt.
 
-    It is in doubt where `fusing` does not predict the validation points clearly better than linear
-    interpolation. There is a warning where the grey image does about as well, too.
+    The image is in doubt where `fusing` does not predict the validation points clearly better than
+    linear interpolation does. There is a warning where the mean of its gains over
+    interpolation and over the grey image is small.
 
     Args:
         fusing: The network that takes a prior, open.
@@ -449,14 +477,15 @@ def _with_blind_expert(fusing: OpenNetwork, split: ValidatedFrame, experts: Expe
     rgb = split.whole.rgb
     count = len(split.points)
     if rgb is None or split.whole.one_view or count < ENOUGH_FOR_DOUBT:
-        return experts  # nothing can be in doubt, or nothing tells it
+        return experts  # no image, one stated to be of the points' view, or too few points to tell
     by_name = {expert.name: expert.at_validation for expert in experts.every}
     with_image = by_name[fusing.name]
     interpolated = by_name[LINEAR]
     gain_over_linear = split.gain(with_image, interpolated)
     if gain_over_linear >= DOUBT:
         return experts
-    # The image is in doubt: a grey one takes its place.
+    # The image is in doubt: a grey one takes its place. What the network keeps of an image is
+    # forgotten before and after.
     fusing.next_image()
     grey = torch.full_like(rgb, 0.5)
     without_image = replace(
@@ -482,7 +511,8 @@ def _with_blind_expert(fusing: OpenNetwork, split: ValidatedFrame, experts: Expe
 def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, float]) -> Experts:
     """Returns the experts, those of `fusing` with their depth of the mirrored frame, too.
 
-    That is so with fewer than `MIRRORED_BELOW` points. An expert without weight does not need it.
+    The mean of both depths is better with few points, fewer than `MIRRORED_BELOW`. An expert
+    without weight in the fused depth does not need it.
 
     Args:
         fusing: The network that takes a prior, open.
@@ -495,9 +525,9 @@ def with_mirrored(fusing: OpenNetwork, experts: Experts, weights: Mapping[str, f
         if isinstance(expert, NetworkExpert) and weights[expert.name] > 0:
             frame = expert.frame
             if frame is not None and len(frame.points) < MIRRORED_BELOW:
-                turned = fusing.refine(frame.mirrored(), updates=frame.prior is None)
-                depth = _mix_with_aligned(turned, expert.share_of_aligned)
-                expert = replace(expert, mirrored=depth.flip(-1))
+                prediction = fusing.refine(frame.mirrored(), updates=frame.prior is None)
+                depth = _mix_with_aligned(prediction, expert.share_of_aligned)
+                expert = replace(expert, mirrored=depth.flip(-1))  # turned back
         every.append(expert)
     return experts.replaced(every)
 
@@ -511,7 +541,7 @@ def weighted_mean(depths: Sequence[tuple[Tensor, float]]) -> Tensor:
     """
     weighted = [(depth, weight) for depth, weight in depths if weight > 0]
     if len(weighted) == 1:
-        return weighted[0][0]
+        return weighted[0][0]  # itself, without rounding by logarithm and exponential
     logarithm = torch.zeros_like(weighted[0][0])
     total = torch.zeros_like(logarithm)
     for depth, weight in weighted:

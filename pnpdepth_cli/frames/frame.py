@@ -25,9 +25,9 @@ from pnpdepth_cli.settings import ClosedSettings, Settings
 
 DepthMap = NDArray[np.float32]
 Registration = str | tuple[float, float, float]
-"""What the user says of the registration: "auto", "off", or zoom, and pixels right and down."""
+"""How the user wants images moved: "auto", "off", or zoom, and shift in pixels right and down."""
 Register = ImageRegistration | Literal["auto"] | None
-"""How an image is to be moved to its points. "auto": as the points say."""
+"""How an image is to be moved to its points. "auto": as its points tell. None: it is not moved."""
 AnyFrame = TypeVar("AnyFrame", bound="Frame")
 """A frame, or a frame as it was read."""
 
@@ -73,25 +73,29 @@ class Frame:
 
     @functools.cached_property
     def evidence_of_registration(self) -> Evidence | None:
-        """What image and points tell of the registration; None where they tell nothing."""
+        """What image and points tell of how the image is moved to them; None: they tell nothing."""
         image = self.image
         return None if image is None else evidence(image, self.points)
 
     @functools.cached_property
     def _registration_of_points(self) -> ImageRegistration | None:
-        """The registration that the points tell; kept, because most frames need it twice."""
+        """How the points tell that the image is to be moved; None: it is not, or they do not tell.
+
+        It is kept, because most frames need it twice.
+        """
         return estimate_registration([self.evidence_of_registration])
 
     def registered(self: AnyFrame) -> AnyFrame:
-        """Returns the frame with its image moved to the points; itself if that is not to be done.
+        """Returns the frame with its image moved to its points; itself if that is not to be done.
 
-        Depth maps of networks move with the image, and the points stay.
+        `register` says how the image is moved, and is None afterwards. Depth maps of networks move
+        with the image, and the points stay.
         """
         image = self.image
         if image is None or self.register is None:
             return self
         registration = self._registration_of_points if self.register == "auto" else self.register
-        if registration is None:
+        if registration is None:  # the points tell that the image stays
             return replace(self, register=None)
         predicted = [
             torch.from_numpy(registration.apply_to(depth_map.numpy()))
@@ -128,7 +132,7 @@ class Frame:
             outliers: (N,) bool, which of the frame's N points are moved.
         """
         if not bool(outliers.any()):
-            return self
+            return self  # so that what is kept of it is not computed again
         left_out = self.points.select(outliers)
         if self.outliers is not None:
             left_out = self.outliers.joined(left_out)
@@ -142,14 +146,14 @@ class Prediction:
     aligned: Tensor  # (H, W) metres, 0 = unknown: of z as the network computes it
     updated: Tensor  # (H, W) metres, 0 = unknown: of the updated z
     losses: tuple[float, ...]  # at the points, before the first update of z and after each
-    step: float  # α as a number
+    step: float  # α of the updates as a number; 0 without updates
     diverged: DivergedError | None  # why the updates ended early. None if they did not
-    alignment: Alignment | None
-    notes: tuple[str, ...]
+    alignment: Alignment | None  # the network's output fitted to the points. None: it is in metres
+    notes: tuple[str, ...]  # what a person should know of the output and its fit, a text each
 
     @property
     def updates(self) -> int:
-        """How often z was updated."""
+        """Number of updates of z."""
         return len(self.losses) - 1
 
 
@@ -262,7 +266,7 @@ class ValidationPoints:
     def error(self, predicted: Tensor) -> float:
         """Returns the weighted mean absolute error in metres of a prediction of the points.
 
-        A point without prediction counts as far off as a depth of 0 is.
+        A point without prediction counts as if a depth of 0 were predicted.
 
         Args:
             predicted: (M,) metres, 0 = unknown: depth of each validation point.
@@ -287,7 +291,7 @@ def registration_to_make(registration: Registration, settings: Settings) -> Regi
     The paper's method moves none unless numbers are given.
 
     Args:
-        registration: What the user says.
+        registration: How the user wants images moved.
         settings: The settings, which say whether the method is the paper's.
 
     Raises:

@@ -27,10 +27,11 @@ IMAGE_ON_LINES = 0.15
 networks of 4 and 9 % error on two KITTI frames, RMSE falls by 3.1 % and MAE by 1.2 to 1.5 %. With
 0.25 it is 5 and 2 %, but exact lines of a depth camera lose 1 to 4 % indoors."""
 ALL_ON_LINES = 1.5
-"""Error of that depth at the validation points, over that of `compact`, up to which it has the
-least weight. Simulated networks of 4 and 9 % error have 0.4 to 1.55, FastDepth 1.9 to 2.5."""
+"""Error of an image network's depth at the validation points, over that of `compact`, up to which
+it has all of that least weight. Simulated networks of 4 and 9 % error have 0.4 to 1.55, FastDepth
+1.9 to 2.5."""
 NONE_ON_LINES = 2.0
-"""The same quotient, from which on it has no least weight."""
+"""Error of that depth, over that of `compact`, from which on it has no least weight."""
 
 # Of the fit of the weights.
 _PASSES = 5  # of iteratively reweighted least squares
@@ -91,27 +92,28 @@ def _fit(prior: Floats, offsets: Floats, residual: Floats, point_weights: Floats
     """
     from scipy.optimize import nnls
 
-    # The residual from which on Huber's loss is linear: their standard deviation.
+    # The residual from which on Huber's loss is linear: the standard deviation of the residuals.
     mean_size = float(np.average(np.abs(residual), weights=point_weights))
     scale = max(_STD_OF_MEAN * mean_size, _LEAST_STD)
-    # The factor of the rows of the prior weights, so that they count as `STRENGTH` such residuals.
+    # The factor of the rows of the prior weights: a squared distance of 1 from these counts as
+    # `STRENGTH` squared residuals of one standard deviation.
     ridge = np.sqrt(STRENGTH) * scale
     sum_of_weights = np.full((1, len(prior)), _SUM_WEIGHT)
     fitted = prior
     for _ in range(_PASSES):
-        # Large residuals are weighed down.
+        # Rows have the square root of their weight, which falls where a residual is above `scale`.
         size = np.abs(residual - offsets @ fitted)
         root = np.sqrt(point_weights * np.minimum(1, scale / np.maximum(size, _LEAST_SIZE)))
-        # Rows of the least squares: the points, the prior weights, and the sum of 1.
+        # Rows of the least squares: the M points, the E prior weights, and the sum of 1.
         rows = [offsets * root[:, None], ridge * np.eye(len(prior)), sum_of_weights]
         targets = [residual * root, ridge * prior, [_SUM_WEIGHT]]
         fitted, _ = nnls(np.concatenate(rows), np.concatenate(targets))
-        fitted /= fitted.sum()
+        fitted /= fitted.sum()  # which the last row makes nearly 1
     return fitted
 
 
 class Share(NamedTuple):
-    """The part of the result that one network has by itself, beside the fused depth."""
+    """A network's depth, and its weight in the result beside the fused depth of all experts."""
 
     name: str
     weight: float
@@ -129,28 +131,30 @@ def with_shares(fused: Tensor, shares: Sequence[tuple[Tensor, float]]) -> Tensor
         fused: Depth in metres, 0 = unknown, of any shape. It has the weight that the others leave.
         shares: Depths of that shape, and their weights, whose sum is at most 1.
     """
-    left = 1 - sum(weight for _, weight in shares)
-    return weighted_mean([(fused, left), *shares])
+    weight_of_fused = 1 - sum(weight for _, weight in shares)
+    return weighted_mean([(fused, weight_of_fused), *shares])
 
 
 def shares_on_lines(
     experts: Experts, split: ValidatedFrame, inliers: Frame, weights: Mapping[str, float]
 ) -> list[Share]:
-    """Returns which single networks have a weight in the result beside the fused depth.
+    """Returns the networks that have a weight in the result beside the fused depth; mostly none.
 
-    That is for frames of scan lines. Their validation points are whole lines beside others, where
-    `compact` and interpolation are best. So they do not show what a completion network of that
-    scanner is worth, nor an image network between the lines. Without validation points no network
-    has such a weight.
+    This is for frames whose points are scan lines. The validation points of such a frame are whole
+    lines beside others, where `compact` and interpolation are best. So their error does not show
+    what a completion network for that scanner is worth, nor what an image network is worth between
+    the lines. The user's completion networks that fit the points have the weight
+    `OWN_SCANNER` together. If none does, the user's first network may have up to `IMAGE_ON_LINES`,
+    if it takes the image alone.
 
     Args:
         experts: The experts.
         split: The frame and its validation points.
         inliers: The frame without its outliers.
-        weights: The weights in the fused depth, by name.
+        weights: Weights of the experts in the fused depth, by name.
     """
     if not len(split.points):
-        return []
+        return []  # no error of the experts to compare with
     of_scanner = _shares_of_scanner(experts.every, split, weights)
     if of_scanner:
         return of_scanner
@@ -184,7 +188,7 @@ def _shares_of_scanner(
     ]
     if not fitting:
         return []
-    # They have the weight in equal parts.
+    # The weight is divided equally among them.
     weight = OWN_SCANNER / len(fitting)
     return [
         Share(expert.name, weight, expert.dense, expert.updated_at_validation) for expert in fitting
@@ -196,8 +200,10 @@ def _share_of_image(
 ) -> list[Share]:
     """The user's first network, if it has a weight beside the fused depth, in a list; else none.
 
-    Its depth is the aligned one, the residual propagated. It has no weight if its weight in the
-    fused depth is enough, if it takes points, or if no other network is fused with it.
+    Its depth is the aligned one, the residual propagated. A network of the image alone has a least
+    weight in the result; here it gets what its weight in the fused depth lacks of that. It gets
+    nothing if that weight is enough, if the network takes points, or if no other one is fused with
+    it.
 
     Args:
         experts: The experts.
@@ -205,20 +211,22 @@ def _share_of_image(
         inliers: The frame without its outliers.
         weights: The weights in the fused depth, by name.
     """
-    first = experts.own
-    alone = experts.alone
-    if alone is None or first.user is None or first.user.takes_points:
+    first = experts.first_of_user
+    without_prior = experts.without_prior
+    if without_prior is None or first.user is None or first.user.takes_points:
         return []
-    # Its error at the validation points, beside that of `compact`, says how much it may have.
+    # The least weight follows its error at the validation points over that of `compact`: all of
+    # `IMAGE_ON_LINES` up to `ALL_ON_LINES`, 0 from `NONE_ON_LINES` on, linear in between.
     kept = split.kept
-    field = ResidualField(first.kept.aligned, kept.points, kept.rgb)
+    field = ResidualField(first.from_others.aligned, kept.points, kept.rgb)
     predicted = field.depth(split.points.xy, kind=split.propagation)
-    ratio = split.error(predicted) / max(split.error(alone.at_validation), LEAST_ERROR)
+    ratio = split.error(predicted) / max(split.error(without_prior.at_validation), LEAST_ERROR)
     fraction = (NONE_ON_LINES - ratio) / (NONE_ON_LINES - ALL_ON_LINES)
     least_weight = IMAGE_ON_LINES * min(1.0, max(0.0, fraction))
-    # What it has already in the fused depth counts.
+    # What its weight in the fused depth lacks of that.
     missing = least_weight - weights[first.name]
     if missing <= 0:
         return []
-    whole = ResidualField(first.whole.aligned, inliers.points, inliers.rgb)
-    return [Share(first.name, missing, whole.depth(kind=split.propagation), predicted)]
+    # Its depth from all points.
+    field = ResidualField(first.from_all.aligned, inliers.points, inliers.rgb)
+    return [Share(first.name, missing, field.depth(kind=split.propagation), predicted)]

@@ -14,15 +14,16 @@ from pnpdepth_cli.points import SparsePoints
 
 CHANGED_M = 0.002
 """Metres from which on a measured pixel is called changed: the noise of a depth camera at 1 m."""
-MAP = 0.5
+LEAST_OF_MAP = 0.5
 """Fraction of the pixels that are measured, from which on the points are called a depth map."""
 
 
 def with_measured(refined: Refined) -> Refined:
     """Returns a refined frame with the measured depth itself at the pixels of its points.
 
-    A note counts these pixels, and the points between pixels, whose depth is not kept. Of several
-    points at a pixel the nearest counts. The depth of outliers is not kept: they are not in `used`.
+    A note counts these pixels, and the points between pixel centres, whose depth is not kept. Of
+    several points at a pixel the nearest counts. The depth of outliers is not kept: they are not in
+    `Refined.used`.
 
     Raises:
         UsageError: All points lie between pixels.
@@ -34,7 +35,7 @@ def with_measured(refined: Refined) -> Refined:
             f"`keep_measured`: all {len(points):,} points lie between pixels; it takes a depth map"
             " of the image's size, or points at whole pixels"
         )
-    measured = points.where(is_at_pixel).scatter()[0, 0].numpy()
+    measured = points.where(is_at_pixel).scatter()[0, 0].numpy()  # (H, W) metres, 0 = none
     depth = np.where(measured > 0, measured, refined.depth)
     note = f"measured pixels: {int((measured > 0).sum()):,} have the depth of their points"
     between = len(points) - int(is_at_pixel.sum())
@@ -52,7 +53,7 @@ def with_note_on_measured(refined: Refined) -> Refined:
     points = refined.used
     height, width = points.size
     points = points.where(_at_whole_pixels(points))
-    if len(points) < MAP * height * width:
+    if len(points) < LEAST_OF_MAP * height * width:
         return refined  # its points are no depth map
     change = (points.sample(torch.from_numpy(refined.depth)) - points.depth).abs()
     count = int((change > CHANGED_M).sum())

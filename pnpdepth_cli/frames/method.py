@@ -27,19 +27,19 @@ from pnpdepth_cli.settings import PAPER, Settings
 
 COMPANION = "compact"
 """The network that is fused with the user's, where there is an image."""
-_TRIED = 3  # after so many frames that tell nothing of the registration, no more are read
+_FRAMES_TRIED = 3
+"""After so many frames that tell nothing of the registration, no more are read."""
 
 
 def check_combination(asked: Settings, networks: int, maps: int = 0) -> None:
-    """Checks that settings of z come with a network, and the paper's method with only one.
+    """Raises UsageError if settings that need a network with a layer come with depth maps instead.
+
+    Raised, too, if the paper's method comes with several networks: it refines one.
 
     Args:
         asked: Settings that the user gives.
         networks: Number of networks.
-        maps: Number of depth maps besides, which take the place of networks.
-
-    Raises:
-        UsageError: They do not.
+        maps: Number of depth maps besides, each of which takes the place of a network.
     """
     if asked.is_paper and maps:
         raise UsageError(
@@ -59,9 +59,10 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
 
     Args:
         asked: Settings that the user gives.
-        validated: Whether the paper's method is validated, for which each frame is refined again.
+        validated: Whether the paper's method has validation points, for which each frame is refined
+            once more. The other methods always have them.
     """
-    # Who states 0 updates knows that settings of updates are not used.
+    # A note names settings of updates that are not used. Who states 0 updates knows it.
     unused = tuple(asked.of_updates) if asked.iterations != 0 else ()
     if not asked.is_paper:
         return Pipeline(propagation=asked.propagate, unused=unused)
@@ -75,13 +76,13 @@ def pipeline_of(asked: Settings, *, validated: bool = False) -> Pipeline:
 
 
 def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
-    """The networks, joined by stand-ins for the depth maps of a frame.
+    """The networks and a stand-in for each depth map of a frame; the user's first comes first.
 
-    With the included network, which takes a prior, the maps are the user's networks and come first.
-    Any other network is the user's first, and the maps follow.
+    If the first network takes a prior, as the included one does, it completes the maps, which are
+    the user's networks. Any other network is the user's first, and the maps follow.
 
     Args:
-        networks: The networks.
+        networks: The networks, at least one.
         count: Number of depth maps of each frame.
     """
     maps = [stored_map(number, count) for number in range(count)]
@@ -90,7 +91,7 @@ def _with_maps(networks: Sequence[Network], count: int) -> list[Network]:
     return [*networks, *maps]
 
 
-def _used(member: OpenNetwork) -> UsedNetwork:
+def _network_of_record(member: OpenNetwork) -> UsedNetwork:
     """What a result keeps of a network: its name, layer, settings, input and output."""
     definition = member.network.definition
     return UsedNetwork(
@@ -114,10 +115,11 @@ class Method:
         networks: Networks of the user.
         asked: Settings that the user gives: the method, and values for its steps. Those of a step
             of the network are for the first network; the others have their own.
-        first: The first frame, which decides what definitions leave open.
+        first: The first frame. It decides what definitions leave open, such as the RGB range.
         more: Function that returns further frames, which decide as well; called only if a network
-            needs it. `tuple` returns none.
-        validated: Whether the paper's method is validated, for which each frame is refined again.
+            leaves its RGB range open. The default, `tuple`, returns none.
+        validated: Whether the paper's method has validation points, for which each frame is refined
+            once more. The other methods always have them.
         uncertainty: Whether the standard deviation of the depth is estimated too.
         keep_measured: Whether the result has the points' own depth at their pixels.
 
@@ -153,8 +155,9 @@ class Method:
             resolve_definition(network, first, lambda: [frame.registered() for frame in more()])
             for network in networks
         ]
-        # The included network has no part where `alone` or a missing image excludes it. Else it
-        # joins, unless it is the user's.
+        # The included network, `COMPANION`, joins with method `fused` and an image, unless it is
+        # among the user's. Where it came to complete depth maps, but the method is `alone` or there
+        # is no image, it leaves.
         if self._maps and (asked.method == "alone" or first.rgb is None):
             resolved = [network for network in resolved if not network.definition.takes_prior]
         names = {network.definition.name for network in resolved}
@@ -177,7 +180,7 @@ class Method:
         self._stack.close()
 
     @property
-    def own(self) -> OpenNetwork:
+    def first_member(self) -> OpenNetwork:
         """The user's first network."""
         return self.members[0]
 
@@ -202,7 +205,7 @@ class Method:
         if frame.register == "auto" and frame.size in self.registrations:
             frame = replace(frame, register=self.registrations[frame.size])
         frame = frame.registered()
-        # The steps of the method, and what is done with their result.
+        # The steps of the method; then measured pixels, what the record keeps, and uncertainty.
         refined = refine_frame(
             self.members, frame, self.pipeline, seed=seed, with_stages=with_stages
         )
@@ -210,7 +213,7 @@ class Method:
         refined = replace(
             refined,
             asked=self.asked,
-            networks=tuple(_used(member) for member in self.members),
+            networks=tuple(_network_of_record(member) for member in self.members),
             camera=frame.camera,
         )
         if not self._uncertainty:
@@ -231,7 +234,7 @@ class Method:
                 evidence = frame.evidence_of_registration
                 if evidence is not None:
                     evidences.append(evidence)
-            if number == _TRIED and not evidences:  # such as scans, none of which will tell
+            if number == _FRAMES_TRIED and not evidences:  # such as scans, none of which will tell
                 break
         if evidences:
             self.registrations = {evidences[0].size: estimate_registration(evidences)}

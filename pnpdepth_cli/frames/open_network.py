@@ -56,7 +56,8 @@ class PreparedFrame:
     def to_image(self, depth: Tensor) -> Tensor:
         """Returns a depth (1, 1, h, w) of the network's pixels as (H, W) of the image, on the CPU.
 
-        Both are in metres. The result is 0 where depth is not finite, not above 0, or not seen.
+        Both are in metres. The result is 0 = unknown where the depth is not finite or not above 0,
+        and where the network does not see the image.
         """
         image = self.map.depth_to_image(depth).cpu()
         return torch.where(image.isfinite() & (image > 0), image, 0.0).float()
@@ -71,8 +72,8 @@ class OpenNetwork:
         network: The network, its definition with nothing left open.
         layer: Layer to cut at.
         settings: How its output is aligned and z is updated.
-        coarse: Whether z is updated by a smaller depth, which is faster, if the definition gives
-            one.
+        coarse: Whether the gradient of the updates of z is taken of a smaller depth of the same
+            view, which is faster, if the definition gives one (`ModelDefinition.coarse`).
         always_updated: Whether z is updated in every frame, also where that gains nothing.
         tuned: Whether the user states how z is updated, so that validation points tell whether that
             gains anything.
@@ -118,7 +119,7 @@ class OpenNetwork:
         self.next_image()
 
     def next_image(self) -> None:
-        """Forgets what was computed for the last image."""
+        """Forgets what was computed for the last image, so that the next call may have another."""
         self._z0 = self._output = None
         self._encoded.clear()
 
@@ -129,23 +130,23 @@ class OpenNetwork:
         return self._split
 
     def sees(self, frame: Frame) -> bool:
-        """Returns whether any of the frame's points lies where the network looks."""
+        """Returns whether any of the frame's points lies in the crop that the network sees."""
         to_network = FrameMap.fit(self.network.definition.size, *frame.size)
         return len(to_network.points_to_network(frame.points)) > 0
 
     def is_updated(self, frame: Frame) -> bool:
         """Returns whether z is updated in this frame.
 
-        That is wherever it gains anything, or where the user states the number of updates.
+        It is where that gains anything, or where the user states the number of updates.
         """
         if not self.settings.iterations:
-            return False
+            return False  # no updates are wanted
         if self.always_updated or not self.takes_points:
             return True
-        # Of a network that takes the points, few points gain nothing. With a LiDAR's points updates
-        # gain 1 % and take as long as all else.
-        fewest = MIRRORED_BELOW if self.takes_prior else FEW_POINTS
-        return len(frame.points) >= fewest and not is_dense(frame.points)
+        # Updates of a network that takes the points gain nothing with few points. With points as
+        # dense as a LiDAR's they gain 1 % and take as long as all else.
+        fewest_points = MIRRORED_BELOW if self.takes_prior else FEW_POINTS
+        return len(frame.points) >= fewest_points and not is_dense(frame.points)
 
     def refine(self, frame: Frame, *, updates: bool = True) -> Prediction:
         """Returns what this network gives for the frame, its residual not propagated.
@@ -187,7 +188,7 @@ class OpenNetwork:
                 refinement = error.last_good
         aligned = prepared.to_image(refinement.before)
         updated = aligned
-        if refinement.after is not refinement.before:
+        if refinement.after is not refinement.before:  # z was updated
             updated = prepared.to_image(refinement.after)
         return Prediction(
             aligned=aligned,
@@ -200,7 +201,7 @@ class OpenNetwork:
         )
 
     def _check_seen(self, prepared: PreparedFrame, frame: Frame) -> None:
-        """Raises NoPointsError if none of the frame's points lies where the network looks.
+        """Raises NoPointsError if none of the points lies in the crop that the network sees.
 
         Args:
             prepared: The frame as the network takes it.
@@ -216,9 +217,10 @@ class OpenNetwork:
             )
 
     def _front(self, prepared: PreparedFrame) -> Tensor:
-        """z_0, the output of the cut layer for a frame.
+        """z_0, the output of the cut layer for a frame, before any update.
 
-        It is the same for all points if the network takes the image alone, and is kept then.
+        It is the same for all points if the network takes the image alone. Then it is kept until
+        the next image.
         """
         z0 = self._z0
         if z0 is None:
@@ -228,14 +230,16 @@ class OpenNetwork:
         return z0
 
     def _output_for(self, prepared: PreparedFrame) -> object:
-        """What the network returns for a frame without updates of z.
+        """What the network's forward returns for a frame, z not updated; `AlignedDepth` reads it.
 
-        It is the same for all points if the network takes the image alone, and is kept then.
+        It is the same for all points if the network takes the image alone. Then it is kept until
+        the next image.
         """
         output = self._output
         may_be_updated = self._of_image_only and self.settings.iterations > 0
         if output is None and may_be_updated and self._coarse is None:
-            # Updates may follow from the same z_0. (Those of a smaller depth need their own pass.)
+            # Updates may follow from the same z_0, which is kept. Those by a smaller depth cannot
+            # use it: they make the smaller depth in a pass of their own.
             output = self.cut().rear(self._front(prepared))
         elif output is None:
             # A network whose z is never updated need not be cut.
@@ -245,7 +249,7 @@ class OpenNetwork:
         return output
 
     def _plain(self, prepared: PreparedFrame, reader: AlignedDepth) -> Refinement:
-        """The depth of one pass of the network, without updates of z, and its loss at the points.
+        """The depth of one pass of the network, z not updated, and its loss at the points.
 
         Args:
             prepared: The frame as the network takes it.
@@ -254,7 +258,7 @@ class OpenNetwork:
         with torch.no_grad():
             depth = reader(self._output_for(prepared)).detach()
         at_points = prepared.points.sample(depth)
-        is_known = at_points.isfinite()
+        is_known = at_points.isfinite()  # NaN where a network leaves depth unknown
         loss_of = checked_loss(self.settings.loss)
         loss = loss_of(at_points[is_known], prepared.points.depth[is_known])
         return Refinement(before=depth, after=depth, losses=(float(loss),), step=0.0)
@@ -262,8 +266,9 @@ class OpenNetwork:
     def _smaller_depth(self) -> AbstractContextManager[list[Any]]:
         """Returns a context in which the network gives the smaller depth of its definition.
 
-        Its list gets the full depth of the first forward, and of each without gradients. It stays
-        empty where the definition gives no smaller depth, or another layer is cut.
+        The context's value is a list. What forward returns for the full depth is added to it, in
+        the first forward and in each without gradients. The list stays empty where the definition
+        gives no smaller depth, or where the user states the layer to cut at.
         """
         if self._coarse is None:
             return nullcontext([])
@@ -273,13 +278,15 @@ class OpenNetwork:
 def _at_full_size(
     refinement: Refinement, full_outputs: Sequence[object], reader: AlignedDepth
 ) -> Refinement:
-    """A refinement by a smaller depth, with the full depth before and after the updates of z.
+    """A refinement whose depths before and after the updates of z are those of full size.
+
+    z may have been updated by a smaller depth of the same view, which is faster.
 
     Args:
-        refinement: The refinement by the smaller depth.
+        refinement: The refinement, its depths as they were used for the updates.
         full_outputs: What the network returned for the full depth, the first for z_0 and the last
-            for the updated z. Empty if the depth of the refinement has full size.
-        reader: Reads the network's output as metres.
+            for the updated z. Empty if the depths of the refinement have full size.
+        reader: Function from the network's output to depth (1, 1, h, w) in metres.
     """
     if not full_outputs:
         return refinement
@@ -291,7 +298,7 @@ def _at_full_size(
 def prepare(network: Network, frame: Frame) -> PreparedFrame:
     """Returns the frame as the network takes it: resized, its points in the network's pixels.
 
-    It has no points if all lie in what is cropped from the image for the network.
+    It has no points if all of them lie outside the crop of the image that the network sees.
 
     Args:
         network: The network, whose definition says what it takes.
@@ -318,14 +325,14 @@ def prepare(network: Network, frame: Frame) -> PreparedFrame:
             return (frame.predicted[network.definition.map_number][None, None],)
         return network.arguments_of(image, points, prior, intrinsics)
 
-    # A network that weighs its points takes the outliers, too: it finds them itself.
+    # A network that weighs its points is given the outliers, too: it finds them itself.
     inliers = to_network.points_to_network(frame.points)
-    taken = inliers
+    input_points = inliers
     if frame.outliers is not None and network.definition.weighs_points:
-        taken = inliers.joined(to_network.points_to_network(frame.outliers))
+        input_points = inliers.joined(to_network.points_to_network(frame.outliers))
     return PreparedFrame(
         map=to_network,
-        arguments=arguments_for(taken),
+        arguments=arguments_for(input_points),
         points=inliers.tensors(network.device),
         arguments_for=arguments_for,
     )
@@ -343,7 +350,7 @@ def encoding_once(network: Network, encoded: dict[str, object]) -> Iterator[None
             another image.
     """
     name = network.definition.image_encoder
-    if name is None:
+    if name is None:  # nothing depends on the image alone
         yield
         return
 

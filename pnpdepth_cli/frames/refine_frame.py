@@ -26,12 +26,13 @@ from pnpdepth_cli.frames.experts import (
 from pnpdepth_cli.frames.frame import Frame, Refined, Validation, is_dense
 from pnpdepth_cli.frames.fuse import Share, fit_weights, shares_on_lines, with_shares
 from pnpdepth_cli.frames.open_network import FEW_POINTS, OpenNetwork
-from pnpdepth_cli.frames.strength import Judged, strength_of, unexplained_of
+from pnpdepth_cli.frames.strength import OutlierSearch, strength_of, unexplained_of
 from pnpdepth_cli.frames.validation import FOLDS, ValidatedFrame, split_frame, whole_frame
 from pnpdepth_cli.measures import AFTER, ALONE, BEFORE, LINEAR, PROPAGATED, UPDATED
 
-LEAST_PART = 0.01
-"""A network whose experts have less weight together has no part in the result; a note says so."""
+LEAST_WEIGHT_IN_RESULT = 0.01
+"""Weight in the result that a network's own depth and the depth with it as a prior have together;
+with less, a note says that the network has no part in the result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +48,7 @@ class Pipeline:
     propagation: str | None = None
     """How the residual is propagated; None: as the points say (`validation.whole_frame`)."""
     unused: tuple[str, ...] = ()
-    """Settings of the user that only updates of z use."""
+    """Names of the user's settings that have no effect if z is not updated, which a note says."""
 
 
 def refine_frame(
@@ -61,7 +62,7 @@ def refine_frame(
     """Returns the frame refined by the steps of a method.
 
     Args:
-        networks: The networks, open, the user's first.
+        networks: The networks, open; those of the user come before any other.
         frame: The frame, its image moved to its points already.
         pipeline: The steps of the method.
         seed: Random seed of the validation points.
@@ -72,26 +73,28 @@ def refine_frame(
     """
     for network in networks:
         network.next_image()
-    # Points that contradict their neighbours are outliers. The network that weighs its points
-    # tells them, else the user's: a useless network does not decide which points are used.
+    # Points that contradict their neighbours are outliers. They are found beside what one network,
+    # the judge, predicts: one that weighs its points, so that a useless network of the user's does
+    # not decide which points are used; without such a one, the user's first.
     judge = next((network for network in networks if network.weighs_points), networks[0])
     if pipeline.leaves_outliers_out:
-        judged = without_outliers(judge, frame, networks)
+        search = without_outliers(judge, frame, networks)
     else:
-        judged = Judged(judge, frame, judge.refine(frame))
-    inliers = judged.inliers
+        search = OutlierSearch(judge, frame, judge.refine(frame))
+    inliers = search.inliers
     # A fifth of the inliers are validation points, which every expert predicts from the others.
     split = whole_frame(inliers, pipeline.propagation)
     if pipeline.validates:
-        split = split_frame(split, judged.prediction.aligned, networks, seed=seed)
-    # The experts predict: the networks, z updated, and what a network makes of their depth.
+        split = split_frame(split, search.prediction.aligned, networks, seed=seed)
+    # The experts predict: the networks, z updated; and `fusing`, a network that takes a dense depth
+    # as a prior, with the depth of each.
     fusing = None
     if pipeline.fuses:
         fusing = next((network for network in networks if network.takes_prior), None)
     if fusing is None:
-        experts = networks_alone(networks, split, judged)
+        experts = networks_alone(networks, split, search)
     else:
-        experts = fused_experts(networks, fusing, split, judged)
+        experts = fused_experts(networks, fusing, split, search)
     # The weights that predict the validation points best, close to prior weights, fuse the depths.
     weights = fit_weights(experts.every, split)
     if fusing is not None:
@@ -100,17 +103,18 @@ def refine_frame(
     fused = weighted_mean([(expert.dense, weights[expert.name]) for expert in weighted])
     # Points far from the depth of a network that weighs them are outliers, too.
     if pipeline.leaves_outliers_out and judge.weighs_points and not is_dense(inliers.points):
-        inliers = inliers.without(far_points(judged.prediction.aligned, inliers.points))
+        inliers = inliers.without(far_points(search.prediction.aligned, inliers.points))
     # The residual at the inliers is propagated to every pixel.
-    propagated = _propagate(fused, inliers, split, judged.field)
+    propagated = _propagate(fused, inliers, split, search.field)
     depth = propagated
-    # On scan lines, validation points do not show what some networks are worth.
+    # On scan lines, validation points do not show what some networks are worth: these have a weight
+    # beside the fused depth.
     shares: list[Share] = []
     if pipeline.fuses and split.has_scan_lines:
         shares = shares_on_lines(experts, split, inliers, weights)
         depth = with_shares(propagated, [(share.dense, share.weight) for share in shares])
     steps = Steps(
-        judged=judged.field,
+        outlier_field=search.field,
         fused=fused,
         propagated=propagated,
         depth=depth,
@@ -127,12 +131,13 @@ def refine_frame(
 class Steps(NamedTuple):
     """What the steps of one frame gave; depths are (H, W) metres, 0 = unknown."""
 
-    judged: ResidualField | None  # the field that told the outliers. None: none did
+    outlier_field: ResidualField | None
+    """Residual field by which outliers were found. None: they were not sought."""
     fused: Tensor  # the weighted mean of the experts
     propagated: Tensor  # the same, its residual at the points propagated
-    depth: Tensor  # the result: `propagated` with the shares of single networks
+    depth: Tensor  # the result: the mean of `propagated` and the depths of `shares`
     weights: Mapping[str, float]  # weights of the experts in `fused`, by name
-    shares: list[Share]  # the shares of single networks in `depth`
+    shares: list[Share]  # networks with a weight in `depth` beside the fused depth; mostly none
 
     @property
     def weights_in_depth(self) -> dict[str, float]:
@@ -146,14 +151,14 @@ class Steps(NamedTuple):
 
 def without_outliers(
     judge: OpenNetwork, frame: Frame, networks: Sequence[OpenNetwork] = ()
-) -> Judged:
+) -> OutlierSearch:
     """Returns the frame without its outliers, and what a network, the judge, gives for it.
 
-    The difference of an outlier's log depth from the judge's prediction is clearly another than
-    that of its neighbours. From `FEW_POINTS` points on, one whose depth alone contradicts its
-    neighbours' is an outlier, too. A point that agrees with a strong network is none.
+    An outlier's residual, log measured − log depth that the judge predicts, differs clearly from
+    the residuals of its neighbours. From `FEW_POINTS` points on, one whose depth alone contradicts
+    its neighbours' is an outlier, too. A point that agrees with a strong network is none.
 
-    z of a judge that takes the image alone is not updated yet: how strong the network is tells
+    z of a judge that takes the image alone is not updated here: how strong the network is tells
     whether it will be (`expert_of_user`).
 
     Args:
@@ -164,7 +169,8 @@ def without_outliers(
     Raises:
         NoPointsError: No point lies where the network predicts.
     """
-    # Points that contradict their neighbours are suspected: outliers beside a constant depth.
+    # Points whose depth contradicts their neighbours' are suspected: outliers beside a constant
+    # depth of 1 m.
     points = frame.points
     constant = ResidualField(torch.ones(points.size), points, frame.rgb)
     suspected = constant.outliers
@@ -179,15 +185,15 @@ def without_outliers(
     # Outliers beside its prediction.
     field = ResidualField(prediction.aligned, points, frame.rgb)
     outlying = field.outliers
-    if len(points) >= FEW_POINTS:
+    if len(points) >= FEW_POINTS:  # of fewer, a suspect may be all that is seen of a small object
         outlying = outlying | suspected
     if bool(outlying.any()) and not is_dense(points):
         outlying = outlying & outliers_beside_strong(networks, frame, constant)
-    # What the judge gives for the frame without them.
+    # What the judge gives for the frame without them; that is known if they are the suspects.
     inliers = frame.without(outlying)
     if predicts_again or not torch.equal(outlying, suspected):
         prediction = judge.refine(inliers, updates=judge.takes_points)
-    return Judged(judge, inliers, prediction, field, constant)
+    return OutlierSearch(judge, inliers, prediction, field, constant)
 
 
 def outliers_beside_strong(
@@ -196,8 +202,8 @@ def outliers_beside_strong(
     """Returns (N,) bool: which points are outliers beside the depth of every strong network.
 
     A strong network takes the image alone, and with its depth the points predict each other far
-    better than with a constant one (`strength_of`). With few points it knows more of the scene than
-    `compact` does. Without any such network all points are true.
+    better than with a constant one (strength 1 by `strength_of`). With few points it knows more of
+    the scene than `compact` does. Where no network is strong, the mask is true at all points.
 
     Args:
         networks: The networks, open.
@@ -207,7 +213,7 @@ def outliers_beside_strong(
     outlying = torch.ones(len(frame.points), dtype=torch.bool)
     for network in networks:
         if network.takes_points:
-            continue
+            continue  # it has seen the outliers
         aligned = network.refine(frame, updates=False).aligned
         field = ResidualField(aligned, frame.points, frame.rgb)
         if strength_of(unexplained_of(field, constant)) == 1:
@@ -218,14 +224,16 @@ def outliers_beside_strong(
 def _propagate(
     depth: Tensor, frame: Frame, split: ValidatedFrame, field: ResidualField | None
 ) -> Tensor:
-    """Depth (H, W) metres, 0 = unknown, with its residual at the points propagated.
+    """Depth (H, W) metres, 0 = unknown, corrected by its propagated residual at the points.
+
+    The residual is log measured − log `depth`, and it is predicted at every pixel.
 
     Args:
         depth: (H, W) metres, 0 = unknown.
         frame: The frame without its outliers.
         split: The frame and its validation points, which says how the residual is propagated.
-        field: Residual field of some depth at some points, used if it is that of these. None: there
-            is none yet.
+        field: Residual field that was computed before. It saves time where it is the field of
+            `depth` at the frame's points, and is not used otherwise. None: there is none.
     """
     if field is None or not field.is_of(depth, frame.points):
         field = ResidualField(depth, frame.points, frame.rgb)
@@ -250,7 +258,7 @@ def _refined(
         steps: What the steps gave.
         pipeline: The steps of the method.
     """
-    prediction = experts.own.whole  # of the user's first network
+    prediction = experts.first_of_user.from_all  # of the user's first network
     notes = _notes(frame, inliers, experts, split, steps, pipeline)
     return Refined(
         before=prediction.aligned.numpy(),
@@ -286,8 +294,9 @@ def _notes(
         steps: What the steps gave.
         pipeline: The steps of the method.
     """
-    first = experts.own
-    notes = list(first.whole.notes)
+    # The user's first network, and what its alignment told.
+    first = experts.first_of_user
+    notes = list(first.from_all.notes)
     # Of the image and the points.
     if frame.registration is not None:
         notes.append(
@@ -302,17 +311,17 @@ def _notes(
     # Of the networks, and of the updates of the user's.
     notes += _notes_on_networks(experts, split, steps.weights_in_depth)
     if first.harm is not None:
-        without, with_updates = first.harm
+        error_without, error_with = first.harm  # metres
         notes.append(
             f"{first.name}: these updates of z are not used, as they raise its error at"
-            f" {len(split.points):,} validation points from {without:.4f} to {with_updates:.4f}"
+            f" {len(split.points):,} validation points from {error_without:.4f} to {error_with:.4f}"
         )
     elif first.share_of_aligned > 0:
         notes.append(
             f"{first.name} is strong: with its depth the points predict each other far better than"
             f" without; {first.share_of_aligned:.0%} of it is taken before the updates of z"
         )
-    if pipeline.unused and not first.whole.updates:
+    if pipeline.unused and not first.from_all.updates:
         names = ", ".join(f"`{name}`" for name in pipeline.unused)
         notes.append(f"{names}: not used, as z of {first.name} is not updated")
     return [*notes, *experts.warnings]
@@ -321,9 +330,9 @@ def _notes(
 def _stages(
     experts: Experts, frame: Frame, split: ValidatedFrame, steps: Steps
 ) -> dict[str, Tensor]:
-    """Depths (H, W) metres, 0 = unknown, after each step of the user's first network, by stage.
+    """Depths (H, W) metres, 0 = unknown, of the user's first network after each step, by stage.
 
-    Those of the network that takes a prior, without one, are a stage, too.
+    The depth of the network that takes a prior, predicted without one, is a stage, too.
 
     Args:
         experts: The experts.
@@ -333,23 +342,24 @@ def _stages(
     """
 
     def propagated(dense: Tensor) -> Tensor:
-        """Depth (H, W) with its residual propagated; that of the fused depth is known."""
+        """A depth (H, W) metres, 0 = unknown, corrected by its propagated residual."""
         if dense is steps.fused:
-            return steps.propagated
-        return _propagate(dense, frame, split, steps.judged)
+            return steps.propagated  # computed already
+        return _propagate(dense, frame, split, steps.outlier_field)
 
-    first = experts.own
-    stages = {BEFORE: first.whole.aligned}
-    # Updates without a part in the result are no stage, but for those that do harm, which is shown.
-    if first.whole.updates and (first.share_of_aligned < 1 or first.harm is not None):
-        stages[UPDATED] = first.whole.updated
-    # A completion network on scan lines has its share of the result without propagation.
+    first = experts.first_of_user
+    stages = {BEFORE: first.from_all.aligned}
+    # Updates without a part in the result are no stage, except those that do harm, so that a user
+    # sees it.
+    if first.from_all.updates and (first.share_of_aligned < 1 or first.harm is not None):
+        stages[UPDATED] = first.from_all.updated
+    # A completion network on scan lines has its weight in the result without propagation.
     if first.of_scanner:
-        stages[PROPAGATED] = first.whole.updated
+        stages[PROPAGATED] = first.from_all.updated
     elif split.propagation != "none":
         stages[PROPAGATED] = propagated(first.dense)
-    if experts.alone is not None:
-        stages[ALONE] = propagated(experts.alone.dense)
+    if experts.without_prior is not None:
+        stages[ALONE] = propagated(experts.without_prior.dense)
     return stages
 
 
@@ -358,18 +368,18 @@ def _validation(
 ) -> Validation | None:
     """The stages and the result at the validation points; None without such points.
 
-    The result at each fifth of them is fused by weights that were fitted to the others.
+    The fused depth at each fifth of them has weights that were fitted to the other four fifths.
 
     Args:
         experts: The experts.
         split: The frame and its validation points.
         shares: The shares of single networks in the result.
     """
-    first = experts.own
+    first = experts.first_of_user
     points = split.points
     if not len(points):
         return None
-    # The result at each fifth of the points.
+    # The fused depth at each fold of the points, a fifth of them.
     fold_of_point = torch.arange(len(points)) % FOLDS
     fused = torch.empty(len(points))
     for fold in range(FOLDS):
@@ -383,21 +393,21 @@ def _validation(
     if split.kept.outliers is not None:
         others = others.joined(split.kept.outliers)
     # The steps of the user's network, `compact` alone, the result and interpolation.
-    predicted = {BEFORE: points.sample(first.kept.aligned)}
-    if first.kept.updates:
+    predicted = {BEFORE: points.sample(first.from_others.aligned)}
+    if first.from_others.updates:
         predicted[UPDATED] = first.updated_at_validation
     if first.of_scanner:
         predicted[PROPAGATED] = first.updated_at_validation
     elif split.propagation != "none":
         predicted[PROPAGATED] = first.at_validation
-    if experts.alone is not None:
-        predicted[ALONE] = experts.alone.at_validation
+    if experts.without_prior is not None:
+        predicted[ALONE] = experts.without_prior.at_validation
     predicted[AFTER] = with_shares(fused, [(share.at_validation, share.weight) for share in shares])
     predicted[LINEAR] = linear(others, points.xy)
     return Validation(
         points=points,
         kept=others,
-        network=first.kept.aligned,
+        network=first.from_others.aligned,
         weights=split.weights,
         predicted=predicted,
     )
@@ -414,23 +424,23 @@ def _notes_on_networks(
         weights: The weights of all experts in the result, by name.
     """
     notes: list[str] = []
-    alone = experts.alone
+    without_prior = experts.without_prior
     for network in experts.of_users:
         if network.lacks_trust:
             notes.append(
                 f"z of {network.name} is not updated: its aligned depth explains too little of the"
                 " points for updates to reach the result; `iterations` updates it all the same"
             )
-        # Its depth, and what the network that takes a prior makes of it.
+        # The weight of its own depth, and of the depth that has it as a prior.
         experts_of_user = [expert for expert in experts.every if expert.user is network.user]
-        if sum(weights[expert.name] for expert in experts_of_user) >= LEAST_PART:
+        if sum(weights[expert.name] for expert in experts_of_user) >= LEAST_WEIGHT_IN_RESULT:
             continue
         why = "its depth does not help to predict the points from each other"
-        if len(split.points) and alone is not None:
+        if len(split.points) and without_prior is not None:
             why = (
                 f"at {len(split.points):,} validation points its error is"
-                f" {split.error(network.at_validation):.4f}, that of {alone.name}"
-                f" {split.error(alone.at_validation):.4f}"
+                f" {split.error(network.at_validation):.4f}, that of {without_prior.name}"
+                f" {split.error(without_prior.at_validation):.4f}"
             )
         notes.append(f"{network.name} has no part in the result: {why}")
     return notes

@@ -35,7 +35,7 @@ from pnpdepth_cli.spent import spent_on
 UPDATES = 5
 """Most updates of z in the default method. More fit what propagation fits anyway."""
 _CLEARLY_BETTER = 0.6
-"""Error of an input range over that of 0…1 below which it is taken.
+"""Error of another input range over that of 0…1, below which it is taken in place of 0…1.
 
 FastDepth, whose range is 0…1, has ratios down to 0.61 in 13 frames of 7-Scenes and ICL-NUIM.
 """
@@ -47,8 +47,9 @@ The paper's rule of thumb is that the field of a point should reach the next poi
 reach all pixels. On real frames fields several gaps wide, and at least half the image, were better:
 a network's error is smooth over surfaces, and later layers follow each point and its noise."""
 LEAST_FRACTION = 0.5
-"""Fraction of the image's shorter side that a field should span in any case. Both are the best of
-several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to LiDAR."""
+"""Fraction of the image's shorter side that a field should span in any case. `GAPS` and this are
+the best of several for FastDepth on even frames of ICL-NUIM, 7-Scenes and KITTI, 100 points to
+LiDAR."""
 
 
 def with_input_range(network: Network, name: str | None) -> Network:
@@ -67,7 +68,7 @@ def with_input_range(network: Network, name: str | None) -> Network:
 def resolve_definition(
     network: Network, frame: Frame, more_frames: Callable[[], Sequence[Frame]] = tuple
 ) -> Network:
-    """Returns the network with all decided that its definition leaves open, and notes on that.
+    """Returns the network with all that its definition leaves open decided, and notes on that.
 
     An open input range becomes the one whose prediction fits the points best, in the mean over the
     frames (`choose_input_range`).
@@ -110,25 +111,26 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
 
     It is the definition's default, if it states one. Else it is the last of the definition's layers
     that has a wide enough influential field: the part of the depth map that changes when one point
-    changes z. The last one costs least. If none is wide enough it is the widest.
+    changes z. The last one costs least. If no field is wide enough, it is the layer of the widest.
 
     Args:
         network: The network.
-        size: (rows, columns) of the image.
-        point_count: Number of points, taken as even over the image. Without any, the definition's
-            first layer is taken.
+        size: (H, W) of the image.
+        point_count: Number of points, taken as spread evenly over the image. Without any, the
+            definition's first layer is taken.
     """
     definition = network.definition
-    frame = FrameMap.fit(definition.size, *size)
-    if definition.defaults.layer is not None or len(definition.layers) < 2 or not point_count:
-        return definition.default_layer
-    # No field is wider than the image as the network sees it.
-    enough_px = min(wanted_field(frame.network, point_count), *frame.network)
+    to_network = FrameMap.fit(definition.size, *size)
+    is_stated = definition.defaults.layer is not None
+    if is_stated or len(definition.layers) < 2 or not point_count:
+        return definition.default_layer  # there is nothing to choose, or nothing to choose by
+    # No field is wider than the image as the network sees it, (h, w) `to_network.network`.
+    enough_px = min(wanted_field(to_network.network, point_count), *to_network.network)
 
     def decide() -> list[str]:
         """The layer that is chosen, in a list of one, which is the form that is remembered."""
         with out_of_memory_is_a_device_error(network.device):
-            arguments = network.synthetic_arguments(frame)
+            arguments = network.synthetic_arguments(to_network)
             fields = fields_of(network, arguments, definition.layers)
             ordered = _by_preference(definition.layers, fields, enough_px)
             first_usable = partial(_first_usable, ordered)
@@ -136,7 +138,7 @@ def default_layer(network: Network, size: tuple[int, int], point_count: int) -> 
             return [definition.layers[0] if layer is None else layer]
 
     # What was decided for this question in an earlier run is not decided again.
-    question = f"layer of {definition.layers} for {enough_px:.6g} pixels of {frame.network}"
+    question = f"layer of {definition.layers} for {enough_px:.6g} pixels of {to_network.network}"
     with spent_on("layer"):
         return recall_or_decide_layers(network.module, network.definition, question, decide)[0]
 
@@ -174,7 +176,7 @@ def fields_of(
     """
 
     def measured(module: nn.Module, arguments: tuple[Tensor, ...]) -> dict[str, Field]:
-        """The fields of this network, or of its copy without values."""
+        """The field of each layer by its name, of this network, or of its copy without values."""
         return influential_fields(module, arguments, layers, network.map_of)
 
     return run_by_shapes(network.module, arguments, measured)
@@ -185,7 +187,8 @@ def _by_preference(
 ) -> list[str]:
     """The layers whose field is wide enough, from the last one, then the others, widest first.
 
-    Of others that are equally wide, that with the larger patch of z comes first, and then the last.
+    Of others whose fields are equally wide, the one whose point reaches the larger patch of z comes
+    first, then the later one.
 
     Args:
         layers: Names of the layers, from the image to the depth.
@@ -194,7 +197,9 @@ def _by_preference(
         enough_px: Width in pixels of the depth map from which on a field is wide enough.
     """
     wide: list[str] = []
-    narrow: dict[str, tuple[int, float]] = {}
+    narrow: dict[
+        str, tuple[int, float]
+    ] = {}  # widths of the field and of the patch of z, in pixels
     for name in reversed(layers):
         if name not in fields:
             continue
@@ -203,9 +208,13 @@ def _by_preference(
         if width_px >= enough_px:
             wide.append(name)
         else:
-            patch_px = 0.0 if field.in_z is None else field.stride * min(field.in_z)
+            patch_px = 0.0
+            if field.in_z is not None:  # `stride` is the pixels of depth for an element of z
+                patch_px = field.stride * min(field.in_z)
             narrow[name] = (width_px, patch_px)
-    return [*wide, *sorted(narrow, key=narrow.__getitem__, reverse=True)]
+    # Sorting keeps the order of equal ones, which is from the last layer on.
+    widest_first = sorted(narrow, key=narrow.__getitem__, reverse=True)
+    return [*wide, *widest_first]
 
 
 def wanted_field(size: tuple[int, int], point_count: int) -> float:
@@ -240,7 +249,7 @@ def resolve_layer(definition: ModelDefinition, layer: str | None) -> str:
         )
     try:
         fraction = float(wanted)
-    except ValueError:
+    except ValueError:  # of `float`: it is a name
         return wanted
     if not 0 <= fraction <= 1 or not definition.layers:
         raise UsageError(
@@ -270,8 +279,10 @@ def resolve_settings(
     defaults = definition.defaults
     if settings.is_paper:
         settings = settings.over(PAPER)
+    # None leaves a default open, for the paper's value.
     if settings.update not in (None, defaults.closed().update):
         defaults = replace(defaults, lr=None, schedule=None, blur=None)
+    # Metres from an image alone cannot be the unit of these points.
     alignment = definition.default_alignment
     if not metric and alignment == "none" and definition.input_kind == "rgb":
         alignment = "scale"
@@ -285,7 +296,7 @@ def resolve_member(network: Network, frame: Frame, asked: Settings) -> OpenNetwo
     paper. The other methods propagate the residual, and take for the rest what serves that: at most
     `UPDATES` updates of z, none of a network that takes the points but no prior, and none of a
     depth map. They also align a network that gives metres from the image alone, where the points
-    say that it should be.
+    tell that its metres are off.
 
     Args:
         network: The network, its definition with nothing left open.
@@ -356,12 +367,16 @@ def choose_input_range(misfits: Mapping[str, float]) -> tuple[str, str | None]:
     Args:
         misfits: Relative errors at the points after alignment, by the names of `NORMALISATIONS`.
     """
+    chosen = "unit"
     best = min(misfits, key=misfits.__getitem__)
-    chosen = best if misfits[best] < _CLEARLY_BETTER * misfits["unit"] else "unit"
+    if misfits[best] < _CLEARLY_BETTER * misfits["unit"]:
+        chosen = best
     others = [name for name in misfits if name != chosen]
     rival = min(others, key=misfits.__getitem__)
     is_unsure = misfits[chosen] > _CLEARLY_BETTER * misfits[rival]
-    return chosen, rival if is_unsure else None
+    if not is_unsure:
+        return chosen, None
+    return chosen, rival
 
 
 def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
@@ -383,11 +398,13 @@ def _mean_alignment_error(network: Network, frames: Sequence[Frame]) -> float:
                 output = network.module(*prepared.arguments)
             points = prepared.points.tensors()
             at_points = points.sample(network.raw_of(output).cpu())
-            lost = 1 - float(at_points.isfinite().float().mean())
+            fraction_lost = 1 - float(at_points.isfinite().float().mean())
             best_alignment = align_output(definition, at_points, points, "auto")[0]
-            misfits.append(best_alignment.error + lost)
-        except NoPointsError:
+            misfits.append(best_alignment.error + fraction_lost)
+        except NoPointsError:  # the network sees none of this frame's points
             continue
-        except ModelError:
-            return float("inf")
-    return sum(misfits) / len(misfits) if misfits else float("inf")
+        except ModelError:  # it fails with this input range
+            return math.inf
+    if not misfits:
+        return math.inf
+    return sum(misfits) / len(misfits)

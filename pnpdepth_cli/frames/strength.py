@@ -14,10 +14,10 @@ from pnpdepth_cli.points import SparsePoints
 
 STRONG = 0.5
 """Leave-one-out error at the points of a network's depth, its residual propagated, over that of a
-constant depth, up to which a network is strong. Networks of 2 to 9 % error have 0.1 to 0.4 in the
+constant depth, up to which its strength is 1. Networks of 2 to 9 % error have 0.1 to 0.4 in the
 median, FastDepth 0.95, random weights 1.1."""
 WEAK = 0.8
-"""The same quotient, from which on a network is not strong at all."""
+"""That quotient of leave-one-out errors, from which on the strength of a network is 0."""
 FITTED = 2
 """Parameters of an alignment, which explain so many points by themselves."""
 LEAST_LOG_ERROR = 1e-9
@@ -29,29 +29,34 @@ USELESS = 0.25
 not fitted to, up to which it has no prior weight. A network of random weights has less than this in
 86 % of the runs with 20 points, 97 % with more."""
 USEFUL = 0.75
-"""The same fraction, from which on it has all of its prior weight."""
+"""That fraction of the variance, from which on a network has all of its prior weight."""
 
 
-class Judged(NamedTuple):
-    """A frame without its outliers, which were told beside the depth of one of its networks."""
+class OutlierSearch(NamedTuple):
+    """A frame without its outliers, and the network beside whose depth these were found.
+
+    Where outliers were not sought, the frame has all its points.
+    """
 
     network: OpenNetwork
-    """The network beside whose depth they were told."""
+    """The network beside whose depth outliers were found."""
     inliers: Frame
-    """The frame without them."""
+    """The frame without its outliers."""
     prediction: Prediction
-    """What that network gives for the frame without them."""
+    """What `network` gives for `inliers`."""
     field: ResidualField | None = None
     """Residual field of its aligned depth at all points. None: outliers were not sought."""
     constant: ResidualField | None = None
-    """Residual field of a constant depth at all points, likewise."""
+    """Residual field of a constant depth at all points. None: outliers were not sought."""
 
     def by(self, network: OpenNetwork) -> Prediction | None:
-        """Returns what a network gives for the inliers; None if it did not tell the outliers."""
-        return self.prediction if network is self.network else None
+        """Returns what a network gives for the inliers; None if outliers were found by another."""
+        if network is self.network:
+            return self.prediction
+        return None  # it has not predicted yet
 
 
-def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> float:
+def unexplained_by(aligned: Tensor, split: ValidatedFrame, search: OutlierSearch) -> float:
     """Returns which part of the points' depth, mostly 0…1, a network leaves unexplained.
 
     That is a quotient of two leave-one-out errors: that with which the network's aligned depth, its
@@ -66,25 +71,26 @@ def unexplained_by(aligned: Tensor, split: ValidatedFrame, judged: Judged) -> fl
     Args:
         aligned: (H, W) metres, 0 = unknown, the network's depth before updates of z.
         split: The frame and its validation points.
-        judged: The frame without outliers, and the residual fields by which they were told.
+        search: The frame without outliers, and the residual fields by which these were found.
     """
     points = split.whole.points
     known_count = int((points.sample(aligned) > 0).sum())
-    if split.has_scan_lines or known_count < MIN_POINTS or judged.constant is None:
+    if split.has_scan_lines or known_count < MIN_POINTS or search.constant is None:
         return 1.0
-    field = judged.field
-    if field is None or not field.is_of(aligned, points):
+    field = search.field
+    if field is None or not field.is_of(aligned, points):  # that of another network
         field = ResidualField(aligned, points, split.whole.rgb)
-    return unexplained_of(field, judged.constant)
+    return unexplained_of(field, search.constant)
 
 
 def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
-    """Returns which part of the points' depth another depth leaves unexplained: `unexplained_by`.
+    """Returns which part of the points' depth a network's depth leaves unexplained, mostly 0…1.
 
-    It is 1 with fewer than `MIN_POINTS` points.
+    It is the quotient of leave-one-out errors that `unexplained_by` describes, and 1 with fewer
+    than `MIN_POINTS` points.
 
     Args:
-        field: Residual field of the depth.
+        field: Residual field of the network's depth.
         constant: Residual field of a constant depth at the same points.
     """
     count = len(field.at_points.points)
@@ -92,7 +98,9 @@ def unexplained_of(field: ResidualField, constant: ResidualField) -> float:
         return 1.0
     of_depth = field.at_inliers.leave_one_out_error
     of_constant = constant.at_inliers.leave_one_out_error
-    return of_depth / max(of_constant, LEAST_LOG_ERROR) * (count - 1) / (count - 1 - FITTED)
+    quotient = of_depth / max(of_constant, LEAST_LOG_ERROR)
+    # The alignment of the depth was fitted to these points.
+    return quotient * (count - 1) / (count - 1 - FITTED)
 
 
 def strength_of(unexplained: float) -> float:
@@ -105,6 +113,8 @@ def strength_of(unexplained: float) -> float:
 
 def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
     """Returns 0…1, the fraction of its prior weights that a network of the image alone gets.
+
+    The prior weights are those in the fused depth before the validation points change them.
 
     It rises from 0 to 1 as the fraction of the variance of the points' log depth that the network's
     log depth explains rises from `USELESS` to `USEFUL`. That fraction is 1 − PRESS / SS: each point
@@ -134,6 +144,7 @@ def trust_in_image(aligned: Tensor, points: SparsePoints) -> float:
     # 1 − leverage; so is that of the others' mean.
     leverage_left = 1 - 1 / count - x.square() / squares
     errors = (y - slope * x) / leverage_left
-    total = (y / (1 - 1 / count)).square().sum().clamp_min(LEAST_SQUARES)
-    explained = float(1 - errors.square().sum() / total)
+    mean_errors = y / (1 - 1 / count)
+    total = mean_errors.square().sum().clamp_min(LEAST_SQUARES)  # SS
+    explained = float(1 - errors.square().sum() / total)  # 1 − PRESS / SS
     return min(1.0, max(0.0, (explained - USELESS) / (USEFUL - USELESS)))

@@ -62,11 +62,12 @@ _WINDOW_PX = 9
 _WITHIN = (0.68, 0.95)
 """Fractions of normal errors within one and two standard deviations."""
 _TAIL = 0.75
-"""Weight of the second in the scale: both cannot hold where tails are heavy."""
+"""Weight of the second fraction, 95 % within 2σ, in the factor: where tails are heavy, no factor
+gives both."""
 _TYPICAL = 1.75
-"""Typical factor with 100 points."""
+"""Typical factor of σ with 100 points."""
 _PER_POINT = -0.18
-"""Power of the number of points, over 100, by which the typical factor is multiplied."""
+"""Exponent: with N points the typical factor is `_TYPICAL` times (N / 100) to this power."""
 _FEWEST_POINTS = 20
 """With fewer points the typical factor is that of so many."""
 _MOST_POINTS = 500
@@ -93,21 +94,22 @@ it is as deep."""
 _SHARP = 0.5
 """Least points at the end over those in the band before, if the points end sharply."""
 _LEAST_AT_END = 0.02
-"""Least fraction of all points at the end, likewise."""
+"""Least fraction of all points that are at the end of a sensor's range."""
 _FEWEST_AT_END = 10
-"""Least number of points at the end, likewise."""
+"""Least number of points that are at the end of a sensor's range."""
 _GAP = 3.6
 """Median spacings from a pixel in a gap to the nearest point. Of random pixels 0.01 % are farther
 from one."""
 _GAP_LINES = 1.2
 """Spacings of scan lines from a pixel in a gap to the nearest point."""
 _REACHED = 0.8
-"""Fraction of that distance around the middle of a gap that belongs to the gap."""
+"""Distance from the middle of a gap up to which pixels belong to the gap, over the distance from
+points at which the middle begins."""
 _LEAST_GAP = 0.01
 """Least fraction of the image's pixels that are so far from any point."""
 _LARGE_GAPS = 0.05
-"""The same fraction, from which on gaps tell without a sharp end. Of 12 rooms with all their depth
-two have as large gaps, with no point at the end beside them."""
+"""Fraction of the image's pixels in gaps, from which on gaps tell without a sharp end. Of 12 rooms
+with all their depth two have as large gaps, with no point at the end beside them."""
 _AT_BORDER = 0.25
 """Least fraction of the points beside the gaps that are at the end."""
 
@@ -142,15 +144,16 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
         residual, residual_sigma = _residuals(frame.validation)
         note = f"uncertainty: calibrated with {len(residual):,} validation points"
     of_points = calibration(residual, residual_sigma, len(points)) * shape
-    # What a sensor's points have in common, and what they do not reach, comes on top. Until the
-    # product with depth, all are fractions of the depth, as deviations of log depth are.
+    # Two deviations come on top: the error that all points of a sensor share, and that beyond its
+    # range. Independent deviations add up by their squares. All are fractions of the depth, as
+    # deviations of log depth are, until they are multiplied by it.
     is_map = is_dense(points) and scan_pattern(points.xy, points.size) is None
     of_sensor = torch.tensor(SENSOR_ERROR if is_map else 0.0)
     beyond = beyond_range(points)
     of_range = torch.where(beyond, BEYOND_RANGE_SIGMA, 0.0)
     sigma = of_points.hypot(of_sensor).hypot(of_range) * depth
     valid = valid_depth(points, depth, sigma)
-    # What to know of it.
+    # Notes on the points.
     notes = [*frame.notes, note]
     if of_matches:
         notes.append(_OF_MATCHES)
@@ -162,7 +165,7 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
             f" in {100 * float(beyond.double().mean()):.0f} % of the image, which is taken as"
             " beyond the sensor's range: not valid"
         )
-    # What it does not cover.
+    # A note on the pixels that are not valid.
     if not bool(valid.all()):
         count = int((~valid).sum())
         percent = round(100 * count / valid.numel())
@@ -172,9 +175,10 @@ def with_uncertainty(frame: Refined, *, of_matches: bool = False) -> Refined:
 
 
 def _residuals(validation: Validation) -> tuple[Tensor, Tensor]:
-    """Log measured − log predicted depth, and its uncalibrated standard deviation, (K,) each.
+    """Log measured − log predicted depth at K validation points, (K,), and its deviation, (K,).
 
-    At the K validation points that have a prediction and are no outliers.
+    The standard deviation is not calibrated yet: it is that of `relative_shape`. The K points have
+    a prediction and are no outliers.
     """
     predicted = validation.predicted[AFTER]
     points = validation.points
@@ -203,11 +207,11 @@ def relative_shape(
     if bool(is_known.any()):
         filled = network[is_known].median()
     log_network = torch.where(is_known, network, filled).log()[None, None]
-    half = _WINDOW_PX // 2
-    highest = F.max_pool2d(log_network, _WINDOW_PX, 1, half)
-    lowest = -F.max_pool2d(-log_network, _WINDOW_PX, 1, half)
+    half_px = _WINDOW_PX // 2
+    highest = F.max_pool2d(log_network, _WINDOW_PX, stride=1, padding=half_px)
+    lowest = -F.max_pool2d(-log_network, _WINDOW_PX, stride=1, padding=half_px)
     ranges = highest - lowest
-    # Where the standard deviation is asked for, and that range there.
+    # The positions at which the standard deviation is wanted, and the range there.
     if xy is None:
         queries = pixels_of(points.size)
         network_range = ranges.flatten()
@@ -228,7 +232,7 @@ def relative_shape(
         high - low,
         network_range.double(),
     )
-    # The product of their powers.
+    # The product of their powers, as the exponential of a sum of logarithms.
     logarithms = [
         exponent * (difference + _LEAST).log()
         for exponent, difference in zip(_EXPONENTS, differences, strict=True)
@@ -246,12 +250,13 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     points, which is the factor without any residual.
 
     Args:
-        residual: (M,) true − predicted at points that neither refinement nor propagation used.
-        sigma: (M,) their standard deviations, in the same unit.
+        residual: (M,) log measured − log predicted depth at points that neither refinement nor
+            propagation used.
+        sigma: (M,) their standard deviations up to the factor, in log depth.
         points: Number of points that the depth was fitted to.
     """
-    points = min(max(points, _FEWEST_POINTS), _MOST_POINTS)
-    typical = _TYPICAL * math.pow(points / 100, _PER_POINT)
+    count_for_typical = min(max(points, _FEWEST_POINTS), _MOST_POINTS)
+    typical = _TYPICAL * math.pow(count_for_typical / 100, _PER_POINT)
     ratio = (residual.double().abs() / sigma.double()).flatten()
     ratio = ratio[ratio.isfinite()].sort().values
     if not len(ratio):
@@ -260,7 +265,8 @@ def calibration(residual: Tensor, sigma: Tensor, points: int) -> float:
     count = len(ratio)
     ranks = [min(math.ceil(fraction * (count + 1)), count) - 1 for fraction in _WITHIN]
     of_68, of_95 = (max(float(ratio[rank]), _LEAST_RATIO) for rank in ranks)
-    # Means of logarithms: of the two, and with the typical factor.
+    # The geometric mean of the two factors, and that of this and the typical factor. The weight
+    # rises from 0 to 1 with the number of residuals.
     of_residuals = (1 - _TAIL) * math.log(of_68) + _TAIL * math.log(of_95 / 2)
     weight = count / (count + _TYPICAL_WEIGHT)
     low, high = CALIBRATION_RANGE
@@ -284,11 +290,11 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
     valid = supported & (sigma <= VALID_SIGMA * depth)
     # Pixels inside the hull, and those outside that are as near to a point. `flip` makes x and y of
     # rows and columns.
-    is_near = in_hull(points)
+    is_near = in_hull(points)  # (H, W)
     outside = torch.nonzero(~is_near).flip(1)
     inside = torch.nonzero(is_near & ~beyond_range(points)).flip(1)
     if len(outside) and len(inside):
-        sample = inside[:: max(1, len(inside) // _SAMPLED)]
+        sample = inside[:: max(1, len(inside) // _SAMPLED)]  # evenly spaced ones
         inside_px, _ = nearest_points(points, sample.double(), 1)
         outside_px, _ = nearest_points(points, outside.double(), 1)
         typical_px = float(inside_px.quantile(_TYPICAL_QUANTILE))
@@ -297,11 +303,16 @@ def valid_depth(points: SparsePoints, depth: Tensor, sigma: Tensor) -> Tensor:
 
 
 def beyond_range(points: SparsePoints) -> Tensor:
-    """Returns (H, W) true where a sensor of limited range had no return; nowhere for others.
+    """Returns (H, W) true where surfaces are beyond the sensor's range, as its points tell.
 
-    That is in gaps among and beside the points, if many points beside the gaps are near the depth
-    of the farthest point. Points of a scan, and points with small gaps, must also be many there and
-    few before: a scan has no returns from the sky, and surfaces without return are small.
+    These are the gaps among and beside the points, if many of the points beside the gaps are at
+    the end of the range, near the depth of the farthest point. Gaps may have other causes: a scan
+    has no returns from the sky, and small gaps are surfaces without return. So for a scan, and for
+    small gaps, the points must also end sharply: many at the end of the range, few before it. False
+    everywhere if the points tell of no such range.
+
+    Args:
+        points: The points that the depth was fitted to.
     """
     from scipy import ndimage
 
@@ -312,7 +323,7 @@ def beyond_range(points: SparsePoints) -> Tensor:
     is_at_end = depth >= _END * farthest
     at_end = int(is_at_end.sum())
     if at_end < max(_LEAST_AT_END * len(points), _FEWEST_AT_END):
-        return nowhere
+        return nowhere  # the farthest points are single ones
     # The gaps: pixels too far from any point for their spacing.
     to_next_px, _ = nearest_points(points, points.xy.double(), 2)  # to itself, and to the next
     reach_px = _GAP * float(to_next_px[:, 1].median())
@@ -322,20 +333,21 @@ def beyond_range(points: SparsePoints) -> Tensor:
         reach_px = max(reach_px, _GAP_LINES * across_px)
     distance_px, nearest = nearest_points(points, pixels_of(points.size), 1)
     is_gap = (distance_px.flatten() > reach_px).reshape(points.size)
-    in_gaps = float(is_gap.double().mean())
-    if in_gaps < _LEAST_GAP:
+    fraction_in_gaps = float(is_gap.double().mean())
+    if fraction_in_gaps < _LEAST_GAP:
         return nowhere
     # Points end sharply where those of the band before the end, which is as deep, are not far more:
     # a scene thins out.
-    is_before = (depth >= (2 * _END - 1) * farthest) & ~is_at_end
+    begin_of_band = 2 * _END - 1  # as far below `_END` as 1 is above it
+    is_before = (depth >= begin_of_band * farthest) & ~is_at_end
     is_sharp = at_end >= _SHARP * int(is_before.sum())
-    must_be_sharp = pattern is not None or in_gaps < _LARGE_GAPS
+    must_be_sharp = pattern is not None or fraction_in_gaps < _LARGE_GAPS
     if must_be_sharp and not is_sharp:
         return nowhere
     # Of the points beside the gaps, enough are at the end.
     beside = torch.unique(nearest.flatten()[is_gap.flatten()])
     if float(is_at_end[beside].double().mean()) < _AT_BORDER:
         return nowhere
-    # The gaps reach from there to near the points.
+    # Pixels so far from points are the middle of a gap; the gap reaches from it to near the points.
     around = ndimage.distance_transform_edt(~is_gap.numpy()) <= _REACHED * reach_px
     return torch.from_numpy(around)

@@ -35,31 +35,33 @@ class ValidatedFrame(ValidationPoints):
     kept: Frame
     """The frame without its validation points; `whole` if there are none."""
     has_scan_lines: bool
-    """Whether the points are those of a scanner."""
+    """Whether the points lie on scan lines."""
     propagation: str
     """How the residual at the points is propagated, a name in `choices.PROPAGATIONS`, or "none"."""
     hole: Tensor | None = None
-    """(M,) number of the hole of a depth map that a validation point is in. None: in none."""
+    """(M,) number from 1 on of the copied hole that each validation point of a depth map lies under
+    (`under_holes`). None: the points are no depth map with holes."""
 
     def gain(self, predicted: Tensor, rival: Tensor) -> float:
         """Returns by how many standard errors one prediction is better than another.
 
-        By absolute errors of log depth; negative where it is worse. Points in one hole of a depth
-        map err together, so a hole counts as one point.
+        Absolute errors of log depth are compared; the number is negative if the prediction is
+        worse. Points under one hole of a depth map err together, so a hole counts as one point.
 
         Args:
             predicted: (M,) metres, 0 = unknown: the prediction at the validation points.
             rival: (M,) metres, 0 = unknown: the prediction that it is compared with.
         """
-        # How much nearer to the truth it is at each point, and what fraction the point counts.
+        # By how much its error is smaller at each point, and the point's fraction of all weights.
         truth = log_of(self.points.depth)
         fractions = self.weights / self.weights.sum()
         gains = (log_of(rival) - truth).abs() - (log_of(predicted) - truth).abs()
-        # Means of holes in place of points.
+        # The mean of each hole in place of its points, all holes alike.
         if self.hole is not None:
             _, hole_of_point = torch.unique(self.hole, return_inverse=True)
-            of_hole = torch.bincount(hole_of_point, fractions)
-            gains = (torch.bincount(hole_of_point, fractions * gains) / of_hole)[of_hole > 0]
+            fraction_of_hole = torch.bincount(hole_of_point, fractions)
+            sum_of_hole = torch.bincount(hole_of_point, fractions * gains)
+            gains = (sum_of_hole / fraction_of_hole)[fraction_of_hole > 0]
             fractions = torch.full_like(gains, 1 / len(gains))
         # The mean over its standard error.
         mean = (fractions * gains).sum()
@@ -92,44 +94,51 @@ def whole_frame(frame: Frame, propagation: str | None) -> ValidatedFrame:
 
 
 def split_frame(
-    whole: ValidatedFrame, judged: Tensor, networks: Sequence[OpenNetwork], *, seed: int
+    unsplit: ValidatedFrame, prediction: Tensor, networks: Sequence[OpenNetwork], *, seed: int
 ) -> ValidatedFrame:
     """Returns the frame with and without its validation points, and these points.
 
-    A frame of fewer than `MIN_POINTS` points has none, nor has one whose other points a network
-    does not see.
+    The frame stays as it is, without validation points, if it has fewer than `MIN_POINTS` points,
+    or if a network sees none of the points that are not for validation.
 
     Args:
-        whole: The frame with all its points, none of them for validation yet.
-        judged: (H, W) metres, 0 = unknown, a prediction. Validation points whose residual beside it
-            differs from their neighbours' count less: outliers would decide the weights.
+        unsplit: The frame with all its points, none of them for validation yet.
+        prediction: (H, W) metres, 0 = unknown: depth from a network. Validation points whose
+            residual, log measured − log predicted depth, differs from their neighbours' count
+            less: outliers would decide the weights.
         networks: The networks that will predict.
         seed: Random seed of the validation points.
     """
-    points = whole.whole.points
+    points = unsplit.whole.points
     if len(points) < MIN_POINTS:
-        return whole
-    # Of a depth map with holes, the points that copies of its holes cover; else a fold.
+        return unsplit
+    # Of a depth map with holes, the points under copies of its holes (number 0 is under none); else
+    # one fold of the points.
     hole = None
-    if is_dense(points) and not whole.has_scan_lines:
+    if is_dense(points) and not unsplit.has_scan_lines:
         hole = under_holes(points, FOLDS, seed=seed)
-    is_chosen = (spatial_folds(points, FOLDS, seed=seed) == 0) if hole is None else (hole > 0)
-    kept = replace(whole.whole, points=points.select(~is_chosen))
+    if hole is None:
+        fold = spatial_folds(points, FOLDS, seed=seed)
+        is_chosen = fold == 0
+    else:
+        is_chosen = hole > 0
+    kept = replace(unsplit.whole, points=points.select(~is_chosen))
     if not bool(is_chosen.any()) or not all(network.sees(kept) for network in networks):
-        return whole
-    # Of many validation points some are drawn; all of them are kept from the experts.
+        return unsplit
+    # Of many validation points some are drawn for the comparison. The experts predict without any.
     (numbers,) = is_chosen.nonzero(as_tuple=True)
     order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))
     numbers = numbers[order[:MOST_VALIDATION_POINTS]]
     validation = points.select(numbers)
     hole = None if hole is None else hole[numbers]
-    # Each counts as much as it is consistent with its neighbours.
-    predicted = validation.sample(judged)
+    # Each has a weight 0…1 by how consistent its residual is with its neighbours'; all count alike
+    # if none is consistent.
+    predicted = validation.sample(prediction)
     residual = validation.depth.double().log() - predicted.clamp_min(_LEAST_DEPTH).double().log()
     weights = torch.where(predicted > 0, inlier_weights(validation, residual), 0.0).float()
     if not bool(weights.any()):
         weights = torch.ones_like(weights)
-    return replace(whole, kept=kept, points=validation, weights=weights, hole=hole)
+    return replace(unsplit, kept=kept, points=validation, weights=weights, hole=hole)
 
 
 def log_of(depth: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.sensors.lens import rays_of, unproject
 from pnpdepth_cli.sensors.projection import Mask, Points, points_in_image
 
-# Which moved points agree with the measured ones around them.
+# Which moved points agree with the measured ones around them (a "moved" point is another scan's).
 _TOLERANCE = 0.05
 """Difference of log depth to a measured point that agrees; chosen on frames 2 and 4 of a KITTI
 drive."""
@@ -52,10 +52,10 @@ _MIN_PLANES = 200  # pairs of a point and a plane; with fewer the motion is not 
 _STEPS = 8  # of the correction
 _NEIGHBOURS = 8  # points that a plane is fitted to,
 _NEAR = 0.1  # whose depth differs by this fraction at most,
-_FLAT = 0.02  # and whose smallest variance is below this fraction of the next
+_FLAT = 0.02  # and whose smallest variance, along the normal, is below this fraction of the next
 _REACH = 1.2  # mean spacings of the points, between a point and the one it is compared with
-_LEAST_ERROR = 2e-4  # typical distance, fraction of the depth
-_NORMAL_MEDIAN = 1.4826  # standard deviation over median of |x|, normal errors
+_LEAST_ERROR = 2e-4  # least typical distance of points from their planes, fraction of the depth
+_STD_OF_MEDIAN = 1.4826  # standard deviation of normal errors over the median of their size
 
 # The motion of images, estimated where no pose is known.
 _MIN_INLIERS = 30  # matches that agree with it; fewer support none
@@ -87,21 +87,24 @@ def _spacing_px(points: Points) -> float:
 def accumulate(points: Points, neighbours: Mapping[int, Sequence[Scan]], camera: Camera) -> Points:
     """Returns a frame's own points followed by those of neighbouring frames that agree with them.
 
+    A point of a frame that is `apart` frames away joins if no point that is there already is nearer
+    than `apart` pixels: the farther a frame is away in time, the larger the gaps that it fills.
+
     Args:
-        points: The frame's own points.
-        neighbours: Scans of other frames by how many frames they are before or after this one, from
-            1 on.
+        points: The frame's own points, depth in metres.
+        neighbours: Scans of other frames, each with its motion to this frame's camera, by how many
+            frames they are before or after this one, from 1 on.
         camera: The camera of all frames.
     """
     joined = points
-    for apart, scans in sorted(neighbours.items()):
+    for apart, scans in sorted(neighbours.items()):  # the nearest in time first
         # The points of these neighbours in this frame's camera, their motions corrected.
         moved = []
         for neighbour, motion in scans:
             xyz = unproject(camera, neighbour.xy, neighbour.depth)
             refined = refine_motion(points, xyz, motion, camera)
             moved.append(xyz @ refined[:, :3].T + refined[:, 3])
-        # Those join that agree with measured points, if no point so far is within `apart` pixels.
+        # Those join that agree with this frame's own points and lie in a gap of the points so far.
         xyz, xy = points_in_image(np.concatenate(moved), camera, points.size)
         agrees = _agrees(xy, xyz[:, 2], points)
         xy = xy[agrees]
@@ -126,11 +129,11 @@ def _agrees(xy: Floats, depth: Floats, measured: Points) -> Mask:
     """
     nearest = _nearest(cKDTree(measured.xy), xy, _CONTRADICTING)
     difference = np.abs(np.log(depth[:, None] / measured.depth[nearest]))
-    # The nearest one agrees with it, or several of the nearest do.
+    # The nearest measured point agrees with it, or several of the nearest do.
     is_alike = difference[:, :_COMPARED] <= _TOLERANCE
     is_supported = is_alike[:, 0] | (is_alike.sum(axis=1) >= _AGREEING)
-    # None that is close in the image has quite another depth.
-    offset = np.abs(measured.xy[nearest] - xy[:, None]) / _spacing_px(measured)
+    # None that is close in the image, across and down, has quite another depth.
+    offset = np.abs(measured.xy[nearest] - xy[:, None]) / _spacing_px(measured)  # (M, K, 2)
     is_close = (offset <= _CLOSE).all(axis=2)
     is_contradicted = (is_close & (difference > _CONTRADICTION)).any(axis=1)
     agrees: Mask = is_supported & ~is_contradicted
@@ -166,7 +169,8 @@ def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
     neighbours = _nearest(tree, points.xy, _NEIGHBOURS)
     # The normal is the direction in which the neighbours vary least.
     around = xyz[neighbours] - xyz[neighbours].mean(axis=1, keepdims=True)
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))  # rising variances
+    scatter = np.einsum("nki,nkj->nij", around, around)  # (N, 3, 3), of the K neighbours
+    variance, axes = np.linalg.eigh(scatter)  # rising variances, and their axes as columns
     jump = np.abs(np.log(points.depth[neighbours] / points.depth[:, None])).max(axis=1)
     is_flat = (variance[:, 0] < _FLAT * variance[:, 1]) & (jump < _NEAR)
     return axes[:, :, 0], is_flat
@@ -175,7 +179,7 @@ def _planes(points: Points, xyz: Floats, tree: cKDTree) -> tuple[Floats, Mask]:
 def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera) -> Floats:
     """Returns the motion (3, 4) corrected so that another frame's points lie on measured surfaces.
 
-    It is the given one if too few points are near to a surface.
+    The motion is returned as it was given if too few points are near to a flat surface.
 
     Args:
         measured: The points of the frame, which measured the surfaces.
@@ -203,9 +207,10 @@ def refine_motion(measured: Points, xyz: Floats, motion: Floats, camera: Camera)
         normal = normals[index]
         depth = surface[index, 2]
         distance = np.einsum("ij,ij->i", moved - surface[index], normal) / depth
-        # A step of least squares towards the planes, with the weights of Geman and McClure. `slope`
-        # is the derivative of the distance by a small rotation vector and translation.
-        typical = max(_NORMAL_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
+        # A step of least squares towards the planes, with the weights of Geman and McClure, which
+        # fall with the distance. `slope` (P, 6) is the derivative of the distance by a small
+        # rotation vector and translation.
+        typical = max(_STD_OF_MEDIAN * float(np.median(np.abs(distance))), _LEAST_ERROR)
         weight = (1 + (distance / (2 * typical)) ** 2) ** -2
         slope = np.column_stack([np.cross(moved, normal), normal]) / depth[:, None]
         weighted = slope * weight[:, None]
@@ -248,7 +253,8 @@ def motion_of_images(
     rays = rays_of(camera, xy_here[is_known])
     if len(xyz) < _MIN_INLIERS:
         return None, f"{len(xyz)} matches with depth, at least {_MIN_INLIERS} needed"
-    # The motion that most matches agree with; rays are pixels of a camera of focal length 1.
+    # The motion that most matches agree with. Rays are pixels of a camera whose matrix is the
+    # identity, so the error is divided by the focal length.
     solved, rotation, translation, index = cv2.solvePnPRansac(
         xyz,
         rays,
@@ -259,7 +265,7 @@ def motion_of_images(
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_SQPNP,
     )
-    inliers = np.empty(0, np.intp) if not solved or index is None else index.ravel()
+    inliers = index.ravel() if solved and index is not None else np.empty(0, np.intp)
     basis = f"{len(inliers)} of {len(xyz)} matches of the images"
     if len(inliers) < max(_MIN_INLIERS, _MIN_FRACTION * len(xyz)):
         return None, f"{basis} agree"
@@ -287,7 +293,7 @@ def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
     """
     xy_here, descriptors_here = here
     xy_there, descriptors_there = there
-    if min(len(xy_here), len(xy_there)) < 2:
+    if min(len(xy_here), len(xy_there)) < 2:  # no second nearest one to compare with
         return np.empty((0, 2)), np.empty((0, 2))
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_there, descriptors_here, k=2)
     clear = [best for best, second in pairs if best.distance < _RATIO * second.distance]
@@ -297,15 +303,16 @@ def _matches(here: Keypoints, there: Keypoints) -> tuple[Floats, Floats]:
 
 
 def _depth_at(points: Points, xy: Floats) -> tuple[Floats, Mask]:
-    """Depth (M,) at pixels (M, 2), and (M,) where it is known: on one surface, beside a point.
+    """Depth (M,) in metres at pixels (M, 2), and (M,) true where it is known.
 
-    Depth is the inverse of the mean inverse depth of the nearest points, weighted by nearness.
+    It is known where the nearest points are on one surface, and one of them is near. Depth is the
+    inverse of their mean inverse depth, weighted by the inverse of their distance in the image.
 
     Args:
         points: The points.
         xy: (M, 2) pixel coordinates.
     """
-    if len(points) < _MIN_INLIERS or not len(xy):
+    if len(points) < _MIN_INLIERS or not len(xy):  # too few for a motion, or nothing is asked for
         return np.zeros(len(xy)), np.zeros(len(xy), bool)
     distance_px, numbers = cKDTree(points.xy).query(xy, k=_AROUND)
     around = points.depth[numbers].astype(np.float64)

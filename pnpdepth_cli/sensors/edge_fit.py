@@ -22,7 +22,8 @@ from pnpdepth_cli.sensors.lens import pixels_of
 from pnpdepth_cli.sensors.projection import points_in_image
 
 _LONGEST_PX = 1280
-"""Longer side of the image, to which it is reduced. The next five are pixels of that."""
+"""Longer side of the image, to which it is reduced. The constants of blurs below are pixels of the
+reduced image."""
 _BLUR = 1.0
 """Standard deviation of the blur that smooths noise."""
 _SURROUNDINGS = 16.0
@@ -30,15 +31,16 @@ _SURROUNDINGS = 16.0
 _BAND = 12.0
 """Standard deviation beyond which the strength of edges says nothing of a place."""
 _COARSER = 4
-"""Factor by which an image is reduced before a blur by more pixels than that."""
+"""Factor by which an image is reduced before it is blurred by many pixels, to save time."""
 _REACH = 1.0
 """Standard deviation of the blur of an edge; jumps are no better known."""
 _DARK = 0.004
-"""Gradient of noise, of the range 0…1 of an image."""
+"""Gradient that noise has, per pixel, of an image in 0…1. It is added to the strength of an edge's
+surroundings: where there is nothing, noise is no edge."""
 _NEIGHBOURS = 12
 """Nearest points, among which a jump of depth is looked for."""
 _JUMP = 1.3
-"""Ratio of depths across a jump of weight 1."""
+"""Ratio of the farther to the nearer depth, from which on a jump is a clear one, of weight 1."""
 _LEAST_WEIGHT = 0.15
 """Weight of a jump that counts; below are slopes, such as a road."""
 _TO_THE_FAR_SIDE = 0.3
@@ -61,9 +63,9 @@ class Jumps(NamedTuple):
     """Where depth jumps from a beam of a scan to a neighbour's, in a camera's coordinates."""
 
     xyz: Floats  # (N, 3) metres, between the two beams, at the depth of the nearer
-    beyond: Floats  # (N, 3) metres, a pixel farther towards the other beam
+    beyond: Floats  # (N, 3) metres, the same point moved by a pixel towards the farther side
     weights: Floats  # (N,) how large each jump is; their squares add up to 1
-    clear: int  # number of jumps by a ratio of at least `_JUMP`
+    clear: int  # number of jumps by a ratio of at least `_JUMP`, in the whole scan
 
     def largest(self, fraction: float) -> Jumps:
         """Returns the jumps whose weight is at least a fraction of the largest weight."""
@@ -73,14 +75,18 @@ class Jumps(NamedTuple):
         )
 
     def moved(self, motion: Extrinsics) -> Jumps:
-        """Returns the jumps in the coordinates that a motion leads to."""
+        """Returns the jumps moved: in the coordinates that a motion leads to."""
         return self._replace(xyz=motion.apply(self.xyz), beyond=motion.apply(self.beyond))
 
     def projected(self, camera: Camera) -> tuple[Floats, Floats]:
-        """Returns pixels (M, 2) and weights (M, 3), for an `EdgeMap`, of jumps before the camera.
+        """Returns pixels (M, 2) and weights (M, 3) of the M jumps in front of the camera.
 
-        A jump's weights are its own weight times x·x, y·y and x·y of its direction (x, y) in the
-        image, a unit vector.
+        (x, y) is the direction of a jump in the image, a unit vector, x right and y down. The three
+        weights are the jump's own weight times x·x, y·y and x·y. `EdgeMap.score` multiplies them by
+        the edge strengths of the same three products.
+
+        Args:
+            camera: The camera, in whose coordinates the jumps are.
         """
         ahead = (self.xyz[:, 2] > _LEAST_DEPTH_M) & (self.beyond[:, 2] > _LEAST_DEPTH_M)
         xy = pixels_of(camera, self.xyz[ahead])
@@ -95,34 +101,39 @@ class EdgeMap(NamedTuple):
     """Edges of an image at a reduced size."""
 
     strength: NDArray[np.float32]
-    """(h, w, 3), strength of edges across x, across y, and the mixed product; their mean over the
-    surroundings is taken off."""
+    """(h, w, 3) strength of edges, less its mean over the surroundings.
+
+    (x, y) is the direction of the image's gradient, a unit vector. The three channels are the
+    strength times x·x, y·y and 2·x·y."""
     scale: float  # size of the reduced image over that of the image
 
     def score(self, xy: Floats, weights: Floats) -> float:
-        """Returns the sum of weights times the strength of the edges at their pixels.
+        """Returns how well jumps of depth lie on edges: the sum of weights times edge strength.
 
-        Outside the image the strength is 0.
+        A jump counts the strength of the edge at its pixel times its own weight times the squared
+        cosine of the angle between the jump and the image's gradient. Outside the image the
+        strength is 0.
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
+            weights: (N, 3) weights of the jumps by direction, from `Jumps.projected`.
         """
         height, width = self.strength.shape[:2]
         x, y = self._reduced(xy)
         inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
-        strength = self.strength.reshape(-1, 3).take(y[inside] * width + x[inside], axis=0)
+        pixel = y[inside] * width + x[inside]  # row-major
+        strength = self.strength.reshape(-1, 3).take(pixel, axis=0)
         return float(np.vdot(strength, weights.take(inside, axis=0)))
 
     def shifted(self, xy: Floats, weights: Floats, reach_px: tuple[float, float]) -> Floats:
-        """Returns the score at all shifts of the pixels, (2·down + 1, 2·right + 1).
+        """Returns the score at all shifts of the jumps, (2·down + 1, 2·right + 1).
 
-        `down` and `right` are the reach in pixels of the reduced image. The element in the middle
-        is the score without a shift.
+        `down` and `right` are the largest shifts in pixels of the reduced image. Element (i, j) is
+        the score with the jumps moved by i − down pixels down and j − right to the right.
 
         Args:
             xy: (N, 2) pixel coordinates of the image at full size.
-            weights: (N, 3) of x·x, y·y and x·y of the jumps, from `Jumps.projected`.
+            weights: (N, 3) weights of the jumps by direction, from `Jumps.projected`.
             reach_px: Largest shift to each side, down and right, in pixels of the full image.
         """
         height, width = self.strength.shape[:2]
@@ -157,13 +168,15 @@ class EdgeMap(NamedTuple):
 
 def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
     """Returns the edges of an image (H, W, 3) in 0…1, relative to their surroundings."""
+    # The image is reduced, and blurred against noise; OpenCV finds the window from the deviation.
     height, width = rgb.shape[:2]
     scale = min(1.0, _LONGEST_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.GaussianBlur(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
-    # Sobel's weights sum to 8.
-    across_x = cv2.Sobel(small, cv2.CV_32F, 1, 0, scale=0.125)
-    across_y = cv2.Sobel(small, cv2.CV_32F, 0, 1, scale=0.125)
+    reduced = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(reduced, (0, 0), _BLUR)
+    # The gradient (x, y) of each colour, per pixel: the sizes of Sobel's weights add up to 8.
+    across_x = cv2.Sobel(small, cv2.CV_32F, dx=1, dy=0, scale=1 / 8)
+    across_y = cv2.Sobel(small, cv2.CV_32F, dx=0, dy=1, scale=1 / 8)
     # The products of the gradient with itself, summed over the colours: x·x, y·y, 2·x·y.
     products = np.dstack(
         [
@@ -172,22 +185,28 @@ def edge_map(rgb: NDArray[np.float32]) -> EdgeMap:
             2 * (across_x * across_y).sum(axis=2),
         ]
     )
-    # The strength of edges is relative to their surroundings; the square root lets
-    # a strong edge count less than in proportion.
-    squared = products[:, :, 0] + products[:, :, 1] + _LEAST_SQUARE
+    # The gradient's length, relative to its mean over the surroundings, is the strength of an edge.
+    # The square root lets a strong edge count less than in proportion.
+    squared = products[:, :, 0] + products[:, :, 1] + _LEAST_SQUARE  # squared length
     strength = np.sqrt(squared)
     relative = np.sqrt(strength / (_widely_blurred(strength, _SURROUNDINGS) + _DARK))
-    # Each direction has its part: times the weights of `Jumps.projected`, the sum is the strength
-    # times the squared cosine of the angle between gradient and jump.
+    # The strength times the products of the gradient's unit vector. Multiplied by x·x, y·y and x·y
+    # of a jump's direction, their sum is the strength times the squared cosine of the angle between
+    # gradient and jump.
     by_direction = products * (relative / squared)[:, :, None]
+    # Blurred, as jumps are not known to the pixel, and less the mean over a wider band.
     sharp = cv2.GaussianBlur(by_direction, (0, 0), _REACH)
     return EdgeMap(np.asarray(sharp - _widely_blurred(by_direction, _BAND)), scale)
 
 
 def _widely_blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
-    """The image (h, w) or (h, w, channels) blurred by a Gaussian of many pixels.
+    """The image (h, w) or (h, w, channels) blurred by a Gaussian of many pixels, of the same shape.
 
-    That needs a fraction of the resolution only.
+    Such a blur needs a fraction of the resolution only.
+
+    Args:
+        image: The image.
+        sigma_px: Standard deviation of the Gaussian in pixels of the image, well above `_COARSER`.
     """
     height, width = image.shape[:2]
     small = max(1, round(width / _COARSER)), max(1, round(height / _COARSER))
@@ -211,12 +230,13 @@ def jumps_of(
         scanner: The scanner's pose beside the camera.
         size: (H, W) of the image.
     """
-    # Pixels of a camera at the scanner's place, which has the camera's axes and focal length.
+    # Points that the camera sees, in pixels of a camera at the scanner's place, which has the axes
+    # and the focal length of the real one, and its principal point at 0.
     seen, _ = points_in_image(scanner.apply(scan), camera, size)
     seen = seen - scanner.translation
     seen = seen[seen[:, 2] > _LEAST_DEPTH_M]
     if len(seen) <= _NEIGHBOURS:
-        return None
+        return None  # fewer points than neighbours are looked for
     focal_px = float(camera.intrinsics[0, 0])
     depth = seen[:, 2]
     xy = focal_px * seen[:, :2] / seen[:, 2:]
@@ -225,7 +245,7 @@ def jumps_of(
     tree = cKDTree(xy, compact_nodes=False, balanced_tree=False)
     distances, neighbours = tree.query(xy, k=_NEIGHBOURS)
     ratios = depth[neighbours] / depth[:, None]
-    weights = np.clip(np.log(ratios) / np.log(_JUMP), 0, 1)
+    weights = np.clip(np.log(ratios) / np.log(_JUMP), 0, 1)  # 0 for a nearer neighbour
     largest = weights.max(axis=1)
     clear = int(np.count_nonzero(largest >= 1))
     if clear < _LEAST_JUMPS:
@@ -233,15 +253,15 @@ def jumps_of(
     is_jump = largest >= _LEAST_WEIGHT
     distances, neighbours = distances[is_jump], neighbours[is_jump]
     weights, largest = weights[is_jump], largest[is_jump]
-    # Its direction is the mean one to the neighbours whose jump is at least half as large; the edge
-    # is before the nearest of them.
+    # The direction of a jump is the mean one to the neighbours whose jump is at least half as large
+    # as the largest. The edge of the surface is on the way to the nearest of these.
     weights[weights < largest[:, None] / 2] = 0
     steps = xy[neighbours] - xy[is_jump][:, None]
     per_px = weights / np.maximum(distances, _LEAST_DISTANCE_PX)  # makes unit vectors of the steps
     directions = (steps * per_px[:, :, None]).sum(axis=1)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), _LEAST_LENGTH)
-    nearest_far = np.where(weights > 0, distances, np.inf).argmin(axis=1)
-    step = steps[np.arange(len(steps)), nearest_far]
+    nearest_of_them = np.where(weights > 0, distances, np.inf).argmin(axis=1)
+    step = steps[np.arange(len(steps)), nearest_of_them]
     # Two points at the depth of the nearer beam: on the edge, and a pixel beyond it.
     between = xy[is_jump] + _TO_THE_FAR_SIDE * step
     on_edge, beyond = (

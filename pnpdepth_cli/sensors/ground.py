@@ -12,7 +12,7 @@ import numpy as np
 
 from pnpdepth_cli.camera import Floats
 
-_FEW = 500  # points below the scanner; fewer show no ground
+_LEAST_BELOW = 500  # points below the scanner; fewer show no ground
 _SAMPLED = 2000  # of these points, on which planes are tried
 _TRIES = 200  # planes through three points that are tried
 _MOST_TILT_DEG = 15.0  # angle between the ground and a level camera
@@ -31,7 +31,7 @@ def height_above_ground(xyz: Floats) -> float | None:
             y down, z ahead.
     """
     below = xyz[xyz[:, 1] > 0]
-    if len(below) < _FEW:
+    if len(below) < _LEAST_BELOW:
         return None
     # Of random planes that are about level, that which most points are on (RANSAC).
     rng = np.random.default_rng(0)
@@ -45,9 +45,9 @@ def height_above_ground(xyz: Floats) -> float | None:
         if length == 0:
             continue  # the three points are on a line
         normal = normal / math.copysign(length, normal[1])  # a unit vector that points down
-        height = float(first @ normal)
+        height = float(first @ normal)  # distance of the plane from the scanner
         if height <= 0 or normal[1] < math.cos(math.radians(_MOST_TILT_DEG)):
-            continue
+            continue  # the plane is above the scanner, or not level
         is_on = np.abs(sample @ normal - height) < _FLAT * height
         count_on = int(np.count_nonzero(is_on))
         if count_on > most_on:

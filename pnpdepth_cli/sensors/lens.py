@@ -17,13 +17,14 @@ from pnpdepth_cli.camera import Camera, Floats
 from pnpdepth_cli.points import Size
 
 Coefficients = tuple[float, ...]
+"""Distortion coefficients of a lens, in OpenCV's order."""
 
 _RADIAL = (0, 1, 4, 5, 6, 7)  # which coefficients of a radial-tangential lens are radial
 
 # Where a lens is looked at for the angle at which its distortion turns back.
 _WIDEST_PLANE = 10.0  # of a radial-tangential lens: tangent of the angle to the axis
 _WIDEST_ANGLE_RAD = 1.569  # of a fisheye
-_SAMPLES = 8192
+_SAMPLES = 8192  # distances from the axis, evenly spaced on the plane, or in angle of a fisheye
 
 # Newton's method for the inverse of a distortion, on the plane z = 1.
 _NEWTON_STEPS = 12
@@ -35,7 +36,8 @@ _SHOWN_ERROR = 1e-6  # largest distance of where the lens shows a direction from
 def pixels_of(camera: Camera, points: NDArray[np.floating]) -> Floats:
     """Returns the (N, 2) pixel coordinates of (N, 3) points in the camera's coordinates, z > 0.
 
-    NaN for a direction beyond the one where the distortion turns back on itself.
+    NaN for a direction that the lens does not show: beyond where its distortion turns back on
+    itself (`largest_radius`).
     """
     plane = points[:, :2] / points[:, 2:3]
     if camera.has_lens:
@@ -48,7 +50,7 @@ def rays_of(camera: Camera, xy: NDArray[np.floating]) -> Floats:
 
     NaN where the lens shows nothing.
     """
-    inverse = np.linalg.inv(camera.intrinsics)  # its last row is 0 0 1, as of the matrix
+    inverse = np.linalg.inv(camera.intrinsics)  # its last row is 0 0 1, like that of the matrix
     plane = np.asarray(xy, np.float64) @ inverse[:2, :2].T + inverse[:2, 2]
     return undistort(plane, camera.lens, camera.distortion) if camera.has_lens else plane
 
@@ -132,7 +134,7 @@ def undistort(shown: Floats, lens: str, coefficients: Coefficients) -> Floats:
     rising = int(np.searchsorted(radius, largest_radius(lens, coefficients), side="right"))
     shown_distance = np.hypot(shown[:, 0], shown[:, 1])
     with np.errstate(all="ignore"):
-        # The start is the inverse of that curve.
+        # The start is the inverse of that curve: the distance that it shows at the point's.
         distance = np.interp(shown_distance, shown_radius[:rising], radius[:rising])
         scale = np.where(shown_distance > 0, distance / shown_distance, 1.0)
         plane = shown * scale[:, None]
@@ -169,13 +171,13 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
     """The step of Newton's method for `undistort`, (N, 2), which is subtracted from directions.
 
     Args:
-        plane: (N, 2) directions so far, on the plane z = 1.
-        shown: (N, 2) where the lens shows the directions that are sought.
+        plane: (N, 2) directions that were reached so far, x / z and y / z.
+        shown: (N, 2) points on the image plane at which the lens shows the directions sought.
         lens: Name of `choices.LENSES`.
         coefficients: Coefficients of the lens.
     """
-    # The derivatives [[a, b], [c, d]] of what is shown, a column for each axis of the plane, by
-    # central differences.
+    # The derivatives [[a, b], [c, d]] of the shown point (a row for its x, a row for its y) by the
+    # direction (a column for its x, a column for its y), by central differences.
     columns = []
     for axis in np.eye(2) * _NEWTON_DIFFERENCE:
         ahead = _distort_anywhere(plane + axis, lens, coefficients)
@@ -183,7 +185,7 @@ def _newton_step(plane: Floats, shown: Floats, lens: str, coefficients: Coeffici
         columns.append((ahead - behind) / (2 * _NEWTON_DIFFERENCE))
     a, c = columns[0].T
     b, d = columns[1].T
-    # Their inverse, [[d, −b], [−c, a]] over the determinant, applied to the error.
+    # Their inverse, [[d, −b], [−c, a]] over the determinant, applied to the error (x, y).
     x, y = (_distort_anywhere(plane, lens, coefficients) - shown).T
     determinant = a * d - b * c
     return np.asarray(np.column_stack([d * x - b * y, a * y - c * x]) / determinant[:, None])
@@ -241,11 +243,12 @@ def _radial_tangential(plane: Floats, coefficients: Coefficients) -> Floats:
             are not given are 0.
     """
     padded = (*coefficients, *[0.0] * 14)[:14]
-    if any(padded[12:]):  # the sensor is tilted; OpenCV takes 6 times as long
+    if any(padded[12:]):  # the sensor is tilted; OpenCV takes 6 times as long as what follows
         points = np.column_stack([plane, np.ones(len(plane))])
         no_motion = np.zeros(3)
         shown, _ = cv2.projectPoints(points, no_motion, no_motion, np.eye(3), np.array(padded))
         return np.asarray(shown[:, 0], np.float64)
+    # OpenCV's formula for a sensor that is not tilted; r2, r4 and r6 are powers of the radius.
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = padded[:12]
     x, y = plane.T
     r2 = x * x + y * y

@@ -40,9 +40,11 @@ class PointCloud(NamedTuple):
     rgb: NDArray[np.uint8] | None  # (N, 3) colours 0…255. None: without colours.
 
     def transform(self, pose: Floats) -> PointCloud:
-        """Returns the cloud in the coordinates that a pose, (3, 4) or (4, 4), leads to.
+        """Returns the cloud in the coordinates that a pose leads to, such as those of the world.
 
-        Such as from a camera to the world, by the camera's pose.
+        Args:
+            pose: (3, 4) or (4, 4) from the cloud's coordinates, such as a camera's pose in the
+                world; its translation is in the unit of the cloud.
         """
         xyz = _apply(self.xyz, pose[:3])
         normals = self.normals @ pose[:3, :3].T
@@ -71,12 +73,12 @@ def cloud_from_depth(
     rays = rays_of_image(camera, (height, width))
     rows = max(1, _STRIP_PIXELS // width)
     for top in range(0, height, rows):
-        # A strip of rows, and one more on each side, as normals take neighbours.
+        # A strip of rows, and one more above and below, as normals take neighbours.
         strip = slice(top, top + rows)
         around = slice(max(0, top - 1), strip.stop + 1)
         points = _points(depth[around], is_kept[around], rays[around])
         normals = _normals(points, is_kept[around])
-        # What of these belongs to the strip.
+        # The rows of the strip among these.
         inner = slice(top - around.start, strip.stop - around.start)
         kept = is_kept[strip]
         colours: NDArray[np.uint8] | None = None
@@ -90,9 +92,9 @@ def cloud_from_depth(
 
 
 def kept_pixels(depth: NDArray[np.float32], keep: Mask | None = None) -> Mask:
-    """Returns (H, W) true for the pixels of which `cloud_from_depth` makes points.
+    """Returns (H, W) true for pixels of known depth that are not beside a jump of depth.
 
-    These have a known depth, and none of them is beside a jump of depth.
+    `cloud_from_depth` makes points of them.
 
     Args:
         depth: (H, W); not finite, or <= 0, is unknown.
@@ -117,7 +119,7 @@ def depth_edges(depth: NDArray[np.float32]) -> Mask:
     makes no jump.
 
     Args:
-        depth: (H, W), 0 = unknown.
+        depth: (H, W) in any unit, 0 = unknown.
     """
     is_known = depth > 0
     inverse = np.where(is_known, 1 / np.where(is_known, depth, 1), np.nan)
@@ -125,7 +127,7 @@ def depth_edges(depth: NDArray[np.float32]) -> Mask:
     for axis in (0, 1):
         along_axis = np.moveaxis(inverse, axis, 0)
         middle = along_axis[1:-1]
-        bend = np.abs(along_axis[2:] - 2 * middle + along_axis[:-2])
+        bend = np.abs(along_axis[2:] - 2 * middle + along_axis[:-2])  # second difference
         is_jump = bend > _EDGE * middle  # false beside unknown pixels, which are NaN
         np.moveaxis(is_edge, axis, 0)[1:-1] |= is_jump  # a view: writes into `is_edge`
     return is_edge
@@ -165,8 +167,8 @@ def _normals(points: Floats, is_known: Mask) -> Floats:
         points: (H, W, 3) points in the camera's coordinates, 0 where unknown.
         is_known: (H, W) true where a point is known.
     """
-    down = _difference(points, is_known, 0)
-    across = _difference(points, is_known, 1)
+    down = _difference(points, is_known, axis=0)
+    across = _difference(points, is_known, axis=1)
     normals = np.cross(down, across)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     normals /= np.where(length > 0, length, 1)
@@ -176,7 +178,9 @@ def _normals(points: Floats, is_known: Mask) -> Floats:
 
 
 def _difference(points: Floats, is_known: Mask, axis: int) -> Floats:
-    """Difference (H, W, 3) of the known neighbours along an axis; 0 where there is none.
+    """Difference (H, W, 3) of each point's two neighbours along an axis, later − earlier.
+
+    The point itself stands for a neighbour that is unknown, so the difference is 0 where both are.
 
     Args:
         points: (H, W, 3) points, 0 where unknown.
@@ -185,12 +189,11 @@ def _difference(points: Floats, is_known: Mask, axis: int) -> Floats:
     """
     points = np.moveaxis(points, axis, 0)
     is_known = np.moveaxis(is_known, axis, 0)
-    # A point without a known neighbour on a side stands for it, so that the difference is smaller.
     before = points.copy()
     after = points.copy()
-    both = is_known[1:] & is_known[:-1]
-    before[1:][both] = points[:-1][both]
-    after[:-1][both] = points[1:][both]
+    are_known = is_known[1:] & is_known[:-1]  # both of two neighbours
+    before[1:][are_known] = points[:-1][are_known]
+    after[:-1][are_known] = points[1:][are_known]
     return np.moveaxis(after - before, 0, axis)
 
 
@@ -204,7 +207,8 @@ def merge_in_voxels(clouds: Iterable[PointCloud], side: float) -> PointCloud:
         side: Side of a cube, in the unit of the clouds.
     """
     cubes = np.zeros((0, 3), np.int64)
-    sums = np.zeros((0, 10))  # of each cube: x y z, red green blue, the normal's, and how many
+    # Of each cube, over its points: x y z, red green blue, x y z of the normals, and their number.
+    sums = np.zeros((0, 10))
     has_colours = True
     for cloud in clouds:
         has_colours &= cloud.rgb is not None
@@ -260,8 +264,8 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
     xy = np.column_stack([columns, rows])
     depth = points[is_known][:, 2].astype(float)
     in_world = _apply(points[is_known], pose)
-    # Depths that agree are added up, this view's own first. A view agrees where what it has comes
-    # back to nearly the same pixel with nearly the same depth.
+    # Depths that agree are added up, those of `here` first. Another view agrees where the point of
+    # its depth map comes back to nearly the same pixel with nearly the same depth.
     total = depth.copy()
     count = np.ones(len(depth))
     for view in others:
@@ -277,7 +281,7 @@ def consistent_depth(here: View, others: Iterable[View], min_views: int) -> NDAr
 
 
 def _project_back(in_world: Floats, here: Floats, other: View) -> tuple[NDArray[np.intp], Floats]:
-    """What another view has at the pixels where it sees some points, in coordinates of one camera.
+    """Points of another view's depth map where it sees given points, in one camera's coordinates.
 
     Args:
         in_world: (N, 3) the points in the world.
@@ -285,8 +289,8 @@ def _project_back(in_world: Floats, here: Floats, other: View) -> tuple[NDArray[
         other: The other view.
 
     Returns:
-        (M,) the numbers of the points where it has depth that lies before the one camera; and
-        (M, 3) the points of its depth map there, in that camera's coordinates.
+        (M,) the numbers of the given points at which the other view has known depth, in front of
+        the one camera; and (M, 3) the points of its depth map there, in that camera's coordinates.
     """
     points, camera, pose = other
     # Where the other view sees the points.
@@ -296,7 +300,7 @@ def _project_back(in_world: Floats, here: Floats, other: View) -> tuple[NDArray[
     size = (points.shape[0], points.shape[1])
     inside = in_frame(xy, size)
     index = index[inside]
-    # What its own depth map has there, back in the coordinates of the pose.
+    # The points of its own depth map there, in the world, and in the coordinates of the one camera.
     met = points.reshape(-1, 3)[pixel_index(xy[inside], size)]
     back = _apply_inverse(_apply(met, pose), here)
     usable = (met[:, 2] > 0) & (back[:, 2] > 0)

@@ -116,8 +116,8 @@ def network_expert(name: str, at: Tensor, weight: float = 1.0) -> NetworkExpert:
         at_validation=at,
         updated_at_validation=at,
         points=points,
-        whole=prediction,
-        kept=prediction,
+        from_all=prediction,
+        from_others=prediction,
     )
 
 

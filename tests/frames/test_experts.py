@@ -14,7 +14,7 @@ from pnpdepth_cli.frames.experts import Experts, NetworkExpert, trust, weighted_
 from pnpdepth_cli.frames.frame import Frame
 from pnpdepth_cli.frames.open_network import MIRRORED_BELOW
 from pnpdepth_cli.frames.refine_frame import Pipeline, refine_frame
-from pnpdepth_cli.frames.strength import Judged, strength_of, unexplained_by
+from pnpdepth_cli.frames.strength import OutlierSearch, strength_of, unexplained_by
 from pnpdepth_cli.frames.validation import MIN_POINTS
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import ClosedSettings
@@ -41,7 +41,9 @@ def test_trust_is_what_lines_through_the_other_points_explain(known: int, noise:
     x = 0.3 * y + noise * 0.3 * rng.normal(size=known)
     predicted = torch.zeros(SIZE, dtype=torch.float64)
     predicted[pixels] = torch.from_numpy(x).exp()
-    one = replace(network_expert("net", torch.ones(60)), whole=SimpleNamespace(aligned=predicted))
+    one = replace(
+        network_expert("net", torch.ones(60)), from_all=SimpleNamespace(aligned=predicted)
+    )
     split = replace(split_of(frame.points.depth), whole=frame, kept=frame)
     press = total = 0.0
     for left_out in range(known):
@@ -76,12 +78,12 @@ def seen_twice(frame: Frame, weight: float = 1.0) -> tuple[NetworkExpert, Networ
             at_validation=at,
             updated_at_validation=at,
             points=frame.points,
-            whole=whole,
-            kept=whole,
+            from_all=whole,
+            from_others=whole,
             frame=frame,
         )
-        experts = Experts(own=expert, alone=None, every=[expert])
-        again = with_mirrored(networks[0], experts, {"compact": weight}).own
+        experts = Experts(first_of_user=expert, without_prior=None, every=[expert])
+        again = with_mirrored(networks[0], experts, {"compact": weight}).first_of_user
     return expert, again
 
 
@@ -89,8 +91,8 @@ def test_few_points_give_the_geometric_mean_of_the_frame_and_the_mirrored_one() 
     frame = frame_in_memory(count=MIRRORED_BELOW - 1)
     once, twice = seen_twice(frame)
     turned, _ = seen_twice(frame.mirrored())
-    left = once.whole.updated.numpy()
-    right = turned.whole.updated.numpy()[:, ::-1]
+    left = once.from_all.updated.numpy()
+    right = turned.from_all.updated.numpy()[:, ::-1]
     assert np.abs(left - right).max() > 1e-3
     np.testing.assert_allclose(twice.dense, np.sqrt(left * right), rtol=1e-4)
 
@@ -109,29 +111,31 @@ def test_the_weighted_mean_is_geometric_and_skips_unknown_depth() -> None:
     assert torch.equal(weighted_mean([(alone, 0.3), (alone + 1, 0.0)]), alone)
 
 
-def judged_with(points: SparsePoints) -> Judged:
+def search_with(points: SparsePoints) -> OutlierSearch:
     """A frame of these points whose outliers were sought beside a constant depth."""
     network = member(Brightness)
     frame = replace(frame_in_memory(), points=points)
     constant = ResidualField(torch.ones(SIZE), points, frame.rgb)
-    return Judged(network, frame, network_expert("net", points.depth).whole, None, constant)
+    return OutlierSearch(
+        network, frame, network_expert("net", points.depth).from_all, None, constant
+    )
 
 
 def test_a_network_is_strong_as_far_as_its_depth_predicts_points_from_each_other() -> None:
     frame = frame_in_memory(100)
     split = replace(split_of(frame.points.depth), whole=frame)
-    judged = judged_with(frame.points)
+    search = search_with(frame.points)
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(SIZE, generator=generator)
     found = [
-        unexplained_by(depth_of_scene() * (error * noise).exp(), split, judged)
+        unexplained_by(depth_of_scene() * (error * noise).exp(), split, search)
         for error in (0.0, 0.002, 0.5)
     ]
     assert found == sorted(found)
     assert [strength_of(found[0]), strength_of(found[-1])] == [1, 0]
     few = replace(split, whole=replace(frame, points=frame.points.select(slice(MIN_POINTS - 1))))
     lines = replace(split, has_scan_lines=True)
-    assert [unexplained_by(depth_of_scene(), points, judged) for points in (few, lines)] == [1, 1]
+    assert [unexplained_by(depth_of_scene(), points, search) for points in (few, lines)] == [1, 1]
 
 
 @pytest.mark.parametrize(("stated", "updates"), [(False, 0), (True, 3)])

@@ -45,9 +45,9 @@ def test_points_in_one_hole_are_one_observation_of_a_gain() -> None:
 @pytest.mark.parametrize("count", [60, 5500])
 def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> None:
     frame = frame_in_memory(count)
-    judged = depth_of_scene()
-    judged[:, 100:] = 0
-    split = split_frame(whole_frame(frame, None), judged, [], seed=0)
+    prediction = depth_of_scene()
+    prediction[:, 100:] = 0
+    split = split_frame(whole_frame(frame, None), prediction, [], seed=0)
     kept, held, whole = (
         {tuple(xy) for xy in points.xy.tolist()}
         for points in (split.kept.points, split.points, frame.points)
@@ -60,17 +60,17 @@ def test_validation_points_are_a_fifth_and_the_others_are_kept(count: int) -> No
 
 
 def test_validation_points_of_a_depth_map_are_under_copies_of_its_holes() -> None:
-    judged = depth_of_scene()
-    known = torch.rand(judged.shape, generator=torch.Generator().manual_seed(0)) > 1e-3
+    prediction = depth_of_scene()
+    known = torch.rand(prediction.shape, generator=torch.Generator().manual_seed(0)) > 1e-3
     holes = torch.nn.functional.max_pool2d((~known)[None].float(), 9, 1, 4)[0] > 0
     row, column = (~holes).nonzero(as_tuple=True)
     points = SparsePoints(
         xy=torch.stack([column, row], dim=1).float(),
-        depth=judged[row, column],
-        size=(judged.shape[0], judged.shape[1]),
+        depth=prediction[row, column],
+        size=(prediction.shape[0], prediction.shape[1]),
     )
     frame = replace(frame_in_memory(), points=points)
-    split = split_frame(whole_frame(frame, None), judged, [], seed=0)
+    split = split_frame(whole_frame(frame, None), prediction, [], seed=0)
     apart, _ = nearest_points(split.kept.points, split.points.xy.double(), 1)
     assert not split.has_scan_lines
     assert float(apart.max()) >= 3

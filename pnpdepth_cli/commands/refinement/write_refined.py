@@ -78,7 +78,7 @@ def write_refined(
             depth_scale=scale if format_of_suffix(outputs["depth"]).integer else None,
             figures=figures,
             seconds=seconds,
-            peak_memory_mb=peak_memory_mb(method.own.network.device),
+            peak_memory_mb=peak_memory_mb(method.first_member.network.device),
         )
         record = replace(record, batch=batch, result=result)
         if "record" in outputs:
