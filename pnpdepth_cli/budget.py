@@ -13,42 +13,51 @@ from pnpdepth_cli.errors import InputError, ModelError
 
 _MOST_PIXELS = 64_000_000
 """Pixels of the largest common cameras."""
-_MOST_FILE_BYTES = 1 << 30
-"""Bytes of a stored file, unless another number of pixels is set."""
+_USUAL_FILE_BYTES = 1 << 30
+"""Bytes that a stored file may have in any case, unless a number of pixels is set."""
 _LEAST_FILE_BYTES = 1 << 20
-"""Bytes that a file may have however few pixels are set."""
+"""Bytes that a file may have, however small the number of pixels is that is set."""
 _FILE_BYTES_PER_PIXEL = 4
+"""Bytes of a stored file for each pixel that an image may have."""
 _DECODED_BYTES_PER_PIXEL = 8
-"""Bytes of four channels of 16 bits."""
+"""Bytes of a decoded pixel: four channels of 16 bits."""
 _BYTES_PER_PIXEL = 64
-"""Memory that reading and drawing takes at most."""
+"""Bytes of memory for a pixel that reading and drawing an image take at most."""
 _MOST_NETWORK_PIXELS = 4096 * 4096
 """The largest input of a published depth network is 1536×1536 (Depth Pro)."""
 _BYTES_PER_NETWORK_PIXEL = 1024
-"""Memory of 64 channels in float32, their gradients, and copies."""
+"""Bytes of memory for a pixel: of 64 channels in float32, their gradients, and copies."""
 _UNBACKED_VALUES = 1 << 25
-"""Values that any file may claim."""
+"""Values that any file may claim to hold, however few bytes it has."""
 _VALUES_PER_BYTE = 1032
-"""The highest ratio of deflate; no codec read here is far above it."""
+"""Values that a byte of a file may claim beyond that: the highest ratio of deflate. No codec read
+here is far above it."""
 
 
 def max_pixels() -> int:
-    """Returns how many pixels an image may have, and rows or elements another array of numbers."""
-    if _chosen:
-        return _chosen
+    """Returns how many pixels an image may have, or elements or rows any other array in a file.
+
+    That is what `set_max_pixels` set, else what the machine's memory allows.
+    """
+    if _chosen_pixels:
+        return _chosen_pixels
     return min(_MOST_PIXELS, _memory_bytes() // _BYTES_PER_PIXEL)
 
 
 def max_network_pixels() -> int:
-    """Returns how many pixels the image may have that a network takes, if its file fixes a size."""
-    if _chosen:
-        return _chosen
+    """Returns how many pixels the input of a network may have whose file fixes the input's size.
+
+    That is what `set_max_pixels` set, else what the machine's memory allows.
+    """
+    if _chosen_pixels:
+        return _chosen_pixels
     return min(_MOST_NETWORK_PIXELS, _memory_bytes() // _BYTES_PER_NETWORK_PIXEL)
 
 
 def max_file_bytes() -> int:
     """Returns how many bytes a file with an image, depth, points or text may have, as stored."""
-    least = _LEAST_FILE_BYTES if _chosen else _MOST_FILE_BYTES
+    # A number of pixels that is set bounds small files, too.
+    least = _LEAST_FILE_BYTES if _chosen_pixels else _USUAL_FILE_BYTES
     return max(least, _FILE_BYTES_PER_PIXEL * max_pixels())
 
 
@@ -63,10 +72,13 @@ def max_decoded_bytes() -> int:
 
 
 def max_values_from(file_bytes: int) -> int:
-    """Returns how many values a file of so many bytes may claim to hold.
+    """Returns how many values a file may claim to hold, as no memory is taken for a false claim.
 
     Any file may claim 2²⁵ values: an image of one colour takes almost no bytes. More values need
-    the bytes that they cannot be compressed below.
+    the bytes that they cannot be compressed below. No file may claim more than `max_pixels`.
+
+    Args:
+        file_bytes: Size of the file, as stored.
     """
     return min(max_pixels(), max(_UNBACKED_VALUES, _VALUES_PER_BYTE * file_bytes))
 
@@ -74,7 +86,7 @@ def max_values_from(file_bytes: int) -> int:
 def check_claim(
     claim: str, size: int, most: int, *, error: type[Exception] = InputError, way_out: str = ""
 ) -> None:
-    """Raises the error if a file claims more than may be taken, or less than nothing.
+    """Raises `error` if a file claims more than may be taken, or a number below 0.
 
     Every reader calls this with what a file claims, before memory is taken for it.
 
@@ -116,22 +128,26 @@ def check_network_file(path: Path, kind: str, most: int | None = None) -> None:
 
 
 def set_max_pixels(max_pixels: int | None) -> None:
-    """Sets the most pixels of an image, and of files in proportion; None restores the default."""
-    global _chosen
-    _chosen = max_pixels
+    """Sets how many pixels an image may have, and the sizes of files in proportion to it.
+
+    Args:
+        max_pixels: Number of pixels. None: the default, by the machine's memory.
+    """
+    global _chosen_pixels
+    _chosen_pixels = max_pixels
 
 
 def max_pixels_given() -> int | None:
     """Returns what `set_max_pixels` was given; None for the default."""
-    return _chosen
+    return _chosen_pixels
 
 
-_chosen: int | None = None  # pixels that `set_max_pixels` was given
+_chosen_pixels: int | None = None  # pixels that `set_max_pixels` was given
 
 
 @functools.cache
 def _memory_bytes() -> int:
-    """The machine's memory."""
+    """The size of the machine's memory in bytes."""
     import psutil  # 20 ms that `--help` does not pay
 
     return int(psutil.virtual_memory().total)

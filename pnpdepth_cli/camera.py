@@ -17,14 +17,14 @@ and tau_y."""
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A camera: pixels = intrinsics · lens(x / z); `sensors.lens` computes them.
+    """A camera: pixel = intrinsics · lens(x / z, y / z), which `sensors.lens` computes.
 
     Camera axes are x right, y down, z forward; whole pixel numbers are pixel centres.
     """
 
     intrinsics: Floats  # (3, 3), last row 0 0 1, in pixels
     lens: str = "radial-tangential"  # one of `choices.LENSES`: what the coefficients are
-    distortion: tuple[float, ...] = ()
+    distortion: tuple[float, ...] = ()  # coefficients of the lens, in OpenCV's order
     size: tuple[int, int] | None = None  # (H, W) of its images. None: not stated.
     source: str = ""  # where it is from, for a person
 
@@ -55,8 +55,8 @@ class Camera:
         """
         # x' = width − 1 − x for (−X, Y, Z): the focal length stays, skew and centre change.
         intrinsics = self.intrinsics.copy()
-        intrinsics[0, 1] = -intrinsics[0, 1]
-        intrinsics[0, 2] = width - 1 - intrinsics[0, 2]
+        intrinsics[0, 1] = -intrinsics[0, 1]  # skew
+        intrinsics[0, 2] = width - 1 - intrinsics[0, 2]  # centre
         # Coefficients of terms that differ between left and right change their sign; a fisheye has
         # none.
         distortion = self.distortion
@@ -79,10 +79,10 @@ class Extrinsics(NamedTuple):
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def __matmul__(self, other: Extrinsics) -> Extrinsics:
-        """Returns the pose beside the camera of a third sensor.
+        """Returns the pose of a third sensor in the camera's coordinates: first `other`, then this.
 
         Args:
-            other: Pose of that sensor beside the scanner.
+            other: Pose of the third sensor in the scanner's coordinates.
         """
         rotation = self.rotation @ other.rotation
         translation = self.rotation @ other.translation + self.translation

@@ -42,8 +42,11 @@ LINEAR = "linear"
 
 GT = "ground_truth"
 HELD_OUT = "held_out"
+"""Points of `--holdout`, which nothing uses."""
 VALIDATION = "validation"
+"""Points that the method itself predicts from the others."""
 USED = "used"
+"""Points that the depth was fitted to."""
 BASES = {
     GT: "against ground truth",
     HELD_OUT: "at held-out points",
@@ -63,12 +66,12 @@ It takes predicted and true depth (N,) float64, all positive, in metres."""
 
 
 def _rms(errors: Tensor) -> Tensor:
-    """The root of the mean square."""
+    """The root of the mean square of errors (N,)."""
     return errors.square().mean().sqrt()
 
 
 def _mean_abs(errors: Tensor) -> Tensor:
-    """The mean of the absolute values."""
+    """The mean absolute value of errors (N,)."""
     return errors.abs().mean()
 
 
@@ -107,13 +110,13 @@ class Measure:
     better: Literal["lower", "higher", "neither"] = "lower"
     decimals: int = 4
     percent: bool = False
-    """True for a fraction of 1 that tables show in per cent."""
+    """Whether values are fractions of 1, which tables show in per cent."""
     shown_unit: str = ""
     """Unit in tables; empty: `unit`."""
     shown_factor: float = 1.0
     """Factor from `unit` to the unit in tables."""
     main: bool = False
-    """True if short tables have it."""
+    """Whether short tables have it."""
     of_pixels: OfPixels | None = field(default=None, compare=False, repr=False)
     """Formula of the scored pixels; NaN without any."""
     formula: Callable[..., float] | None = field(default=None, compare=False, repr=False)
@@ -124,7 +127,7 @@ class Measure:
 
     @property
     def heading(self) -> str:
-        """A title such as `RMSE [m] ↓`."""
+        """A title such as `RMSE [m] ↓`: the unit in tables, and an arrow to what is better."""
         unit = self.shown_unit or self.unit
         arrow = {-1: " ↓", 0: "", 1: " ↑"}[self.sign]
         return f"{self.title} [{unit}]{arrow}" if unit else f"{self.title}{arrow}"
@@ -159,7 +162,7 @@ def frame_means(frames: Iterable[Mapping[str, float | None]]) -> dict[str, float
     Args:
         frames: Values of each frame by their key; None and NaN where a frame has none.
     """
-    sums: dict[str, tuple[float, int]] = {}
+    sums: dict[str, tuple[float, int]] = {}  # sum and number of the values by key
     for values_by_key in frames:
         for key, value in values_by_key.items():
             total, count = sums.get(key, (0.0, 0))
@@ -241,7 +244,15 @@ def by_depth(measures: Sequence[Measure], near_m: float, far_m: float) -> tuple[
 def _within(
     predicted: Tensor, true: Tensor, formula: OfPixels, low_m: float, high_m: float
 ) -> Tensor:
-    """The value of a formula over the pixels whose true depth lies in [low_m, high_m)."""
+    """The value of a formula over the pixels whose true depth lies in [low_m, high_m).
+
+    Args:
+        predicted: (N,) predicted depth, metres.
+        true: (N,) true depth, metres.
+        formula: Formula of pixels, as of a measure.
+        low_m: Least true depth, metres.
+        high_m: True depth from which on pixels are left out, metres.
+    """
     is_inside = (true >= low_m) & (true < high_m)
     return formula(predicted[is_inside], true[is_inside])
 
@@ -255,7 +266,8 @@ They are those of Depth Pro."""
 def _boundary_f1(predicted: Image, truth: Image) -> float:
     """Scale-invariant F1 of the boundaries, 0…1, as Depth Pro's code prints it.
 
-    NaN if no two neighbours have known true depth.
+    F1 is 2 · recall · precision / (recall + precision) of the pixels on a boundary. NaN if no two
+    neighbours have known true depth.
 
     Args:
         predicted: (H, W) depth, 0 where unknown.
@@ -263,8 +275,8 @@ def _boundary_f1(predicted: Image, truth: Image) -> float:
     """
     import numpy as np
 
-    # Precision and recall are means over four directions; F1 is weighted by the ratio. Depth Pro
-    # scores dense ground truth; here pairs with an unknown pixel are left out.
+    # Precision and recall are means over four directions; F1 is a mean over the ratios, weighted by
+    # them. Depth Pro scores dense ground truth; here pairs with an unknown pixel are left out.
     sides = ((0, 1), (0, -1), (1, 0), (-1, 0))
     in_both, in_prediction, in_truth = _boundary_counts(predicted, truth, sides, margin=0)
     recall = (in_both / np.maximum(in_truth, 1)).sum(axis=0) / len(sides)
@@ -275,15 +287,16 @@ def _boundary_f1(predicted: Image, truth: Image) -> float:
 def _boundary_f1_within(predicted: Image, truth: Image, radius: int) -> float:
     """F1 of the boundaries, 0…1, as MoGe's code prints it.
 
-    NaN if no two neighbours have known true depth.
+    F1 is twice the number of pixels on a boundary in both images, over the sum of their numbers in
+    the prediction and in the truth. NaN if no two neighbours have known true depth.
 
     Args:
         predicted: (H, W) depth, 0 where unknown.
         truth: (H, W) ground truth, 0 where unknown.
         radius: Largest distance of a pixel's neighbours, pixels.
     """
-    # All pairs count together, and F1 is weighted by the ratio − 1. A pixel nearer than the radius
-    # to the border counts as a neighbour only.
+    # All pairs count together, and F1 is a mean over the ratios, weighted by ratio − 1. A pixel
+    # nearer to the border of the image than the radius counts as a neighbour only.
     span = range(-radius, radius + 1)
     disc = [(down, right) for down in span for right in span if down**2 + right**2 <= radius**2]
     counts = _boundary_counts(predicted, truth, disc, margin=radius)
@@ -370,7 +383,8 @@ BOUNDARY_F1_1PX, BOUNDARY_F1_2PX, BOUNDARY_F1_3PX = (
 )
 
 
-_SPARSIFICATION_STEPS = 20  # of 5 % of the pixels each
+_SPARSIFICATION_STEPS = 20
+"""Steps in which pixels are removed, 5 % of them in each."""
 
 
 def _within_sigma(predicted: Image, truth: Image, sigma: Image, factor: int) -> float:

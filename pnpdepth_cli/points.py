@@ -76,7 +76,7 @@ class SparsePoints(Generic[A]):
         return replace(self, xy=xy - 0.5, size=(height, width))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> SparsePoints[A]:
-        """Returns the points inside a crop of the frame, in its coordinates, with its size.
+        """Returns the points inside a crop of the frame, in the crop's coordinates, with its size.
 
         The crop is `height` rows from row `top`, and `width` columns from column `left`.
         """
@@ -90,6 +90,7 @@ class SparsePoints(Generic[A]):
         """Returns the points with left and right of the frame exchanged."""
         import torch
 
+        # Columns are 0 … W − 1, so x becomes W − 1 − x.
         x, y = self.xy.unbind(dim=1)
         return replace(self, xy=torch.stack([self.size[1] - 1 - x, y], dim=1))
 
@@ -101,11 +102,15 @@ class SparsePoints(Generic[A]):
         return self if bool(mask.all()) else self.select(mask)
 
     def select(self, mask: Tensor | NDArray[np.bool_] | slice) -> SparsePoints[A]:
-        """Returns the points where mask, (N,) bool of the same library, is true; or a slice."""
+        """Returns some of the points: where a mask is true, or those of a slice or of numbers.
+
+        Args:
+            mask: (N,) bool, or (M,) numbers of points, of the points' library; or a slice.
+        """
         return replace(self, xy=self.xy[mask], depth=self.depth[mask])
 
     def joined(self: SparsePoints[Tensor], others: SparsePoints[Tensor]) -> SparsePoints[Tensor]:
-        """Returns these points and others of the same frame."""
+        """Returns these points followed by others of the same frame."""
         import torch
 
         return replace(
@@ -129,7 +134,8 @@ class SparsePoints(Generic[A]):
         Args:
             depth: (h, w), 0 = unknown, of the same field of view.
         """
-        known_weight = self.sample((depth > 0).float())  # 1 but for rounding where all are known
+        # The interpolation weight of known pixels: 1, but for rounding, where all are known.
+        known_weight = self.sample((depth > 0).float())
         return known_weight > 0.999
 
     def sample(self: SparsePoints[Tensor], dense: Tensor) -> Tensor:
@@ -178,7 +184,8 @@ class SparsePoints(Generic[A]):
         column = self.xy[:, 0].round().clamp(0, width - 1).long()
         row = self.xy[:, 1].round().clamp(0, height - 1).long()
         flat = self.depth.new_full((height * width,), math.inf)
-        flat.scatter_reduce_(0, (row * width + column)[inside], self.depth[inside], "amin")
+        pixel = row * width + column  # row-major
+        flat.scatter_reduce_(0, pixel[inside], self.depth[inside], "amin")
         return flat.masked_fill(flat.isinf(), 0.0).reshape(1, 1, height, width)
 
 
@@ -198,5 +205,7 @@ def in_frame(xy: Any, size: Size, *, closed: bool = False) -> Any:
     x, y = xy[:, 0], xy[:, 1]
     right = size[1] - 0.5
     bottom = size[0] - 0.5
-    before_ends = (x <= right) & (y <= bottom) if closed else (x < right) & (y < bottom)
-    return (x >= -0.5) & (y >= -0.5) & before_ends
+    is_after_begin = (x >= -0.5) & (y >= -0.5)
+    if closed:
+        return is_after_begin & (x <= right) & (y <= bottom)
+    return is_after_begin & (x < right) & (y < bottom)

@@ -33,7 +33,7 @@ from pnpdepth_cli.models.network import Network
 from pnpdepth_cli.points import SparsePoints
 from pnpdepth_cli.settings import Settings
 
-FULL_SCALE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
+WHITE = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 """Value of white by the type of an image's integers."""
 
 Unit = Literal["m", "mm"]
@@ -210,20 +210,22 @@ class Refiner:
                 self._method_for(checked[0]).share_registration(checked)
 
     def _keep_registration(self, method: Method, frame: Frame) -> list[str]:
-        """Decides how images of a frame's size are moved, once `DECIDED_BY` frames of it tell how.
+        """Decides how images of a frame's size are moved, once `DECIDED_BY` such frames tell how.
 
-        From then on, all images of that size are moved to their points alike.
+        From then on all images of that size are moved to their points in one way, which
+        `method.registrations` holds.
 
         Args:
             method: The method, which gets the registration.
             frame: The frame that is refined next.
 
         Returns:
-            A note on the decision; none before it, after it, and where nothing changes by it.
+            A list of one note, which says what is decided now; empty if nothing is decided in this
+            call, or nothing changes by it.
         """
         if self._register != "auto" or frame.size in method.registrations:
             return []  # the user states it, or it is decided already
-        # What this frame tells is added to what those before it told.
+        # What this frame tells is added to what frames of its size told before.
         evidences = self._evidences.setdefault(frame.size, [])
         evidence = frame.evidence_of_registration
         if evidence is not None:
@@ -232,38 +234,40 @@ class Refiner:
             return []
         shared = estimate_registration(self._evidences.pop(frame.size))
         method.registrations[frame.size] = shared
-        # No note where images were never moved, and will not be. `_moved` holds texts.
-        not_moved = str(None)
-        moved_before = self._moved.get(frame.size, set()) - {not_moved}
+        # No note where images of this size were not moved so far, and will not be. In `_moved` the
+        # text of a registration of None, "None", stands for an image that was not moved.
+        moved_before = self._moved.get(frame.size, set()) - {str(None)}
         if shared is None and not moved_before:
             return []
-        how = "are not moved" if shared is None else f"are all moved by {shared}"
+        how = "are not moved"
+        if shared is not None:
+            how = f"are all moved by {shared}"
         return [
             f"registration: from now on images of this size {how}, as {DECIDED_BY} frames show"
             " together; `share_registration` decides it by other frames"
         ]
 
     def _is_moved_otherwise(self, frame: Frame, refined: Refined) -> bool:
-        """Whether images of this size, with this one, were moved to their points in two ways.
+        """Whether images of a frame's size, this one included, were moved in different ways so far.
 
-        How this one was moved is remembered for those after it.
+        How this image was moved to its points is remembered for later calls.
 
         Args:
             frame: The frame, before it was refined.
             refined: The same frame refined, which says how its image was moved.
         """
         if frame.image is None:
-            return False
+            return False  # there is no image to move
         moved = self._moved.setdefault(frame.size, set())
         moved.add(str(refined.registration))
         return len(moved) > 1
 
     def _method_for(self, first: Frame) -> Method:
-        """The method, with its networks cut open for refinement; made by the first call.
+        """The method with its networks, open for refinement. The first call makes it.
 
         Args:
-            first: The frame that is refined. The first one decides the settings that the user left
-                open.
+            first: The frame that is to be refined. That of the first call decides the settings
+                which the user and the networks' definitions leave open; later ones have no effect.
 
         Raises:
             UsageError: The refiner is closed, or another one uses a network.
@@ -298,21 +302,24 @@ class Refiner:
             network: The network, its definition with nothing left open.
             opening: Stack of what is undone when the refiner closes.
         """
-        why = reason_not_to_learn(len(self._adapt), self._adapt[0])
-        weights = "the network's own weights: "
-        if why is None:
+        reason = reason_not_to_learn(len(self._adapt), self._adapt[0])
+        note = f"adapt: the network's own weights: {reason}"
+        if reason is None:
             named_frames = ((f"frame {number}", frame) for number, frame in enumerate(self._adapt))
             learnt = learn(network, named_frames, seed=self._asked.seed)
-            why = str(learnt)
+            note = f"adapt: the network's own weights: {learnt}"
             if learnt.is_better:
-                weights = ""
+                note = f"adapt: {learnt}"
                 opening.enter_context(weights_in_place(network, learnt.weights))
-        return replace(network, notes=(*network.notes, f"adapt: {weights}{why}"))
+        return replace(network, notes=(*network.notes, note))
 
 
 @contextmanager
 def _opened(modules: Sequence[nn.Module]) -> Iterator[None]:
-    """Inside, no other refiner opens these modules: two cuts of one would disturb each other.
+    """Inside, no other refiner can open these modules: two cuts of one would disturb each other.
+
+    Args:
+        modules: The networks' modules.
 
     Raises:
         UsageError: A module is open already, or is among these twice.
@@ -405,13 +412,17 @@ def frame_of_arrays(
     # Image and points, these in pixels of the image.
     rgb = None if image is None else _rgb(image)
     size = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    points, unknown = _points(sparse, size, unit)
-    points = points.resized(*size) if size else points
+    points, unknown_count = _points(sparse, size, unit)
+    if size is not None:  # points of another resolution
+        points = points.resized(*size)
     inside = points.cropped(0, 0, *points.size)
     if not len(inside):
         raise NoPointsError(f"none of the {len(points)} sparse points lies in the image")
     # What is not used, by reason.
-    unused = {"outside the image": len(points) - len(inside), "without a depth above 0": unknown}
+    unused = {
+        "outside the image": len(points) - len(inside),
+        "without a depth above 0": unknown_count,
+    }
     notes = [
         f"sparse: {count:,} points {reason} are not used"
         for reason, count in unused.items()
@@ -438,6 +449,7 @@ def _maps(depth: ArrayLike | Sequence[ArrayLike], size: tuple[int, int]) -> Iter
     Raises:
         InputError: A map has another size, or no finite value.
     """
+    # A list is one map of rows, unless it is empty or its first entry is a map of two axes.
     maps: list[Any] = [depth]
     if isinstance(depth, list | tuple) and (not depth or np.ndim(depth[0]) > 1):
         maps = [*depth]
@@ -476,10 +488,14 @@ def _camera(camera: ArrayLike | Camera, size: tuple[int, int]) -> Camera:
 
 
 def _frame_of_pair(pair: Pair, register: Register) -> Frame:
-    """The frame of a pair (image, sparse); `register` says how the image is to be moved.
+    """The frame of a pair (image, sparse).
+
+    Args:
+        pair: Image and sparse depth, as `Refiner.refine` takes them.
+        register: How the image is to be moved to the points. None: it is not.
 
     Raises:
-        InputError: It is no pair, or cannot be used.
+        InputError: It is no pair, or image or points cannot be used.
     """
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise InputError(f"frames are pairs (image, sparse), not {type(pair).__name__}")
@@ -497,8 +513,10 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
         pixels = pixels[:, :, None].repeat(3, axis=2)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise InputError(f"an image has shape (H, W, 3) or (H, W), not {np.shape(image)}")
-    if pixels.dtype in FULL_SCALE:
-        white = 255.0 if pixels.max() <= 255 else FULL_SCALE[pixels.dtype]
+    if pixels.dtype in WHITE:
+        white = WHITE[pixels.dtype]
+        if pixels.max() <= 255:  # also of uint16 that holds 8 bits
+            white = 255.0
         return (pixels / white).astype(np.float32)
     if pixels.dtype.kind != "f" or not (pixels >= 0).all() or not (pixels <= 1).all():
         raise InputError(
@@ -511,9 +529,10 @@ def _rgb(image: ArrayLike) -> NDArray[np.float32]:
 def _points(
     sparse: ArrayLike | SparsePoints, size: tuple[int, int] | None, unit: Unit | None
 ) -> tuple[SparsePoints, int]:
-    """The points, and how many rows of x, y and depth have no finite depth above 0.
+    """The points, and how many rows of x, y and depth are left out, as they have no depth above 0.
 
-    Points of a map have the map's size, rows the image's.
+    Rows that are not finite are among those left out. The points' frame has the size of the map;
+    of rows, that of the image; of SparsePoints, their own.
 
     Args:
         sparse: Depth map, rows or points, as `Refiner.refine` takes them.
@@ -527,7 +546,7 @@ def _points(
     if isinstance(sparse, SparsePoints):
         return sparse.tensors(), 0
     numbers = _numbers(sparse, "sparse depth")
-    unknown = 0
+    unknown_count = 0
     if numbers.ndim != 2:
         raise InputError(f"sparse depth has shape (H, W) or (N, 3), not {numbers.shape}")
     # Three columns are rows of x, y and depth, unless the image is as narrow as that.
@@ -538,7 +557,7 @@ def _points(
         is_known = np.isfinite(numbers).all(axis=1) & (depth_of_rows > 0)
         xy = numbers[is_known, :2].astype(np.float32)
         depth = depth_of_rows[is_known]
-        unknown = int(np.count_nonzero(~is_known))
+        unknown_count = int(np.count_nonzero(~is_known))
     else:
         # Anything else is a depth map, of which the known pixels are points.
         if size is not None and numbers.shape != size:
@@ -550,4 +569,4 @@ def _points(
         depth = numbers[rows, columns]
     if not len(depth):
         raise NoPointsError("the sparse depth has no value above 0")
-    return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown
+    return SparsePoints(xy=xy, depth=depth, size=size).tensors(), unknown_count

@@ -19,14 +19,16 @@ _MIN_POINTS = 500
 _ACROSS_OVER_ALONG = 1.5
 """Spacing across scan lines over that along them, at least."""
 _ALONG_OVER_NEAREST = 8.0
-"""Spacing along them over that to the nearest point, at most. It is 1.0 to 6.5 of seven scans of
-KITTI and the samples, whole and thinned to 5 %, and 11 to 15 of random points in a wide area."""
+"""Spacing along scan lines over the distance to the nearest point, at most. It is 1.0 to 6.5 of
+seven scans of KITTI and the samples, whole and thinned to 5 %, and 11 to 15 of random points in a
+wide area."""
 _SAMPLED = 2000
-"""Points of which the nearest is looked for."""
+"""Number of points whose nearest other point is looked for."""
 _ALONG = 3.0
-"""Spacings along a line to its next point, at most."""
+"""Distance along a scan line from a point to the next one of it, in spacings along, at most."""
 _ACROSS = 0.35
-"""Spacings across lines to the next point of the same line, at most."""
+"""Distance across scan lines from a point to the next one of its line, in spacings across, at
+most."""
 _LEAST_ACROSS_PX = 1.0
 """Pixels across lines that are allowed in any case: points lie on whole pixels."""
 
@@ -46,17 +48,19 @@ def scan_pattern(xy: ArrayLike, size: tuple[int, int]) -> tuple[float, float] | 
     x, y = np.minimum(pixels, np.array(size)[::-1] - 1).T
     if len(x) < _MIN_POINTS:
         return None
-    # Infinite where most points have no next one.
-    along = _median_gap(x, y)
-    across = _median_gap(y, x)
-    if not _ACROSS_OVER_ALONG * along <= across < np.inf:
-        return None
+    # The spacings are infinite where most points have no next one.
+    along_px = _median_gap(x, y)
+    across_px = _median_gap(y, x)
+    if not _ACROSS_OVER_ALONG * along_px <= across_px < np.inf:
+        return None  # points are not denser along rows
     # The nearest point is one of the same line. Of random points in a wide area it is not.
     step = max(1, len(x) // _SAMPLED)
     points = np.column_stack([x, y]).astype(np.float64)
     to_itself_and_next, _ = cKDTree(points).query(points[::step], k=2)
-    nearest = max(1.0, float(np.median(to_itself_and_next[:, 1])))
-    return (along, across) if along <= _ALONG_OVER_NEAREST * nearest else None
+    nearest_px = max(1.0, float(np.median(to_itself_and_next[:, 1])))
+    if along_px > _ALONG_OVER_NEAREST * nearest_px:
+        return None
+    return along_px, across_px
 
 
 def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.intp] | None:
@@ -78,12 +82,15 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     reach = np.array([_ALONG * along_px, max(_LEAST_ACROSS_PX, _ACROSS * across_px)])
     first, second = cKDTree(xy / reach).query_pairs(1.0, p=np.inf, output_type="ndarray").T
     # The left and the right point of each pair; pairs in one column are no neighbours on a line.
-    left = np.where(xy[first, 0] <= xy[second, 0], first, second)
-    right = first + second - left
+    is_ordered = xy[first, 0] <= xy[second, 0]
+    left = np.where(is_ordered, first, second)
+    right = np.where(is_ordered, second, first)
     offset = np.abs(xy[right] - xy[left])
     is_beside = offset[:, 0] > 0
     left, right, offset = left[is_beside], right[is_beside], offset[is_beside]
-    # Of the pairs of each left point, sorted by distance in units of the reach, the first one.
+    # Of the pairs of each left point the nearest one, by the sum of the distances along and across
+    # in units of the reach. Pairs are sorted by left point, then by that sum; the first pair of a
+    # left point is where the number of the left point rises.
     order = np.lexsort((offset @ (1 / reach), left))
     is_first = np.diff(left[order], prepend=-1) > 0
     nearest = order[is_first]
@@ -92,8 +99,8 @@ def scan_lines(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.in
     count, line = connected_components(links, directed=False)
     if count < MIN_LINES:
         return None
-    # Lines are numbered by their mean row; the inner `argsort` gives the lines in that order, the
-    # outer one the number of each.
+    # Lines are numbered by their mean row: the inner `argsort` gives the lines in that order, the
+    # outer one the place of each line in it.
     mean_row = np.bincount(line, xy[:, 1]) / np.bincount(line)
     number: NDArray[np.intp] = np.argsort(np.argsort(mean_row, kind="stable"))[line]
     return number
@@ -113,7 +120,8 @@ def _median_gap(column: NDArray[np.intp], row: NDArray[np.intp]) -> float:
     pixels = np.sort(row * width + column)
     pixels = pixels[np.diff(pixels, prepend=-1) > 0]  # np.unique takes 100 times as long
     row, column = np.divmod(pixels, width)
-    # In each of three rows, the first pixel after this column is the next in that order.
+    # In each of three rows the next point to the right: the first pixel in that order after the
+    # pixel in this column, if it is still in that row.
     gaps = np.full(len(pixels), np.inf)
     for searched_row in row - 1, row, row + 1:
         after = np.searchsorted(pixels, searched_row * width + column, "right")

@@ -18,7 +18,7 @@ from pnpdepth_cli.errors import UsageError
 LARGEST_SEED = 2**32 - 1
 """numpy takes no larger one."""
 OF_UPDATES = ("layer", "lr", "loss", "update", "schedule", "blur")
-"""The settings that have no effect without updates of z."""
+"""Names of the settings, besides `iterations`, that have no effect if z is not updated."""
 
 
 def option(default: Any, help: str, **details: object) -> Any:
@@ -103,7 +103,11 @@ class Settings:
     )
 
     def __new__(cls, *_: object, **values: object) -> Settings:
-        """Raises UsageError for a name that is no setting, with the likely one."""
+        """Returns the object that `__init__` fills.
+
+        Raises:
+            UsageError: A name is that of no setting; the message has the likely one.
+        """
         settings = [setting.name for setting in fields(cls)]
         for name in values.keys() - {*settings}:
             import difflib
@@ -134,7 +138,7 @@ class Settings:
 
     @property
     def of_updates(self) -> list[str]:
-        """The names of the settings that are given and have no effect without updates of z."""
+        """The names of the settings that are given and have no effect if z is not updated."""
         return [name for name in self.given() if name in ("iterations", *OF_UPDATES)]
 
     @property
@@ -144,15 +148,25 @@ class Settings:
 
     def given(self) -> dict[str, Any]:
         """Returns the values that are not at their defaults, by name."""
-        values = ((setting, getattr(self, setting.name)) for setting in fields(self))
-        return {setting.name: value for setting, value in values if value != setting.default}
+        values: dict[str, Any] = {}
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if value != setting.default:
+                values[setting.name] = value
+        return values
 
     def over(self, others: Settings) -> Settings:
-        """Returns these settings, with the others' values where these are open."""
+        """Returns these settings, with the others' values where these are open.
+
+        A setting is open if it is at its default.
+        """
         return replace(others, **self.given())
 
     def closed(self) -> ClosedSettings:
-        """Returns how z is updated and what follows, with the paper's values where it is open."""
+        """Returns how z is updated and what follows, with the paper's values where these are open.
+
+        Those of `method`, `layer` and `seed` are not among them.
+        """
         names = {setting.name for setting in fields(ClosedSettings)}
         return ClosedSettings(
             **{name: value for name, value in self.given().items() if name in names}

@@ -22,14 +22,15 @@ def spent_on(part: str) -> Iterator[None]:
         part: Name of the part, such as "import".
     """
     seconds = _noted.get()
-    if seconds is None:
+    if seconds is None:  # outside `parts_of`
         yield
         return
     start_s = time.perf_counter()
-    noted_before_s = sum(seconds.values())
+    noted_before_s = sum(seconds.values())  # of parts that ended before this one began
     try:
         yield
     finally:
+        # What inner blocks noted meanwhile is theirs alone.
         on_inner_s = sum(seconds.values()) - noted_before_s
         on_this_s = time.perf_counter() - start_s - on_inner_s
         seconds[part] = seconds.get(part, 0.0) + on_this_s

@@ -38,16 +38,19 @@ _MARGIN_DEG = 0.24
 """Largest distance of the foreground from the middle of the parallax segment: about half the gap
 between scan lines, as foreground is measured only on them."""
 
-_STRETCH = 1.5  # multiple of half the parallax that is added to the margin
+_STRETCH = 1.5  # multiple of half the parallax segment that is added to the margin
 _REACH_DEG = 0.8  # angle to each side in which foreground is searched
 
 MIN_POINTS = 1000
 """Maps with fewer points are not filtered: each point matters."""
 
 _MARGIN_IN_LINES = 0.57
-"""Margin over the spacing of scan lines in a map, chosen on three KITTI frames."""
+"""Margin around a point in which foreground counts, over the spacing of scan lines, where no
+calibration is known; chosen on three KITTI frames."""
 
-_LINE_SPACING_PX = (3.0, 8.0)  # farther apart, lines say little of what is between them
+_LINE_SPACING_PX = (3.0, 8.0)
+"""Spacings of scan lines for which a map is filtered; farther apart, lines say little of what is
+between them."""
 _INTERLEAVED = 0.003  # least fraction of points that lie between points of a nearer surface
 _INTERLEAVED_REACH_PX = 4  # to each side, in which points of a nearer surface are searched
 _INTERLEAVED_HALF_WIDTH_PX = 2  # half the width of that area
@@ -67,6 +70,7 @@ def pixel_index(xy: NDArray[np.floating], size: Size) -> NDArray[np.intp]:
         xy: (N, 2) pixel coordinates inside the image.
         size: (H, W) of the image.
     """
+    # Pixels reach half a pixel to each side of their centres.
     column, row = np.floor(np.asarray(xy, np.float64) + 0.5).astype(np.intp).T
     index: NDArray[np.intp] = row * size[1] + column
     return index
@@ -175,7 +179,7 @@ def project_velodyne(
     if not keep_occluded:
         if has_scanner:
             focal_px = float(camera.intrinsics[0, 0])
-            origin = np.asarray(camera.intrinsics @ scanner.translation)
+            origin = np.asarray(camera.intrinsics @ scanner.translation)  # in pixels times z
             hidden = hidden_points(xy, seen[:, 2], size, focal_px=focal_px, scanner=origin)
         else:
             hidden = hidden_among(xy, seen[:, 2], size)
@@ -211,22 +215,23 @@ def hidden_points(
 ) -> Mask:
     """Returns (N,) true for the points that are occluded by something nearer.
 
-    Where a beam passes the foreground's depth, the camera sees it at another pixel than at its end.
-    A point is hidden if foreground was measured near the middle of the segment between these
-    pixels.
+    The beam that measured a point leads from the scanner to the point. Where it passes the
+    foreground's depth, the camera sees it at another pixel than at its end. A point is hidden if
+    foreground was measured near the middle of the segment between these pixels.
 
     Args:
         xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
         depth: (N,) z in metres.
         size: (H, W) of the image.
         focal_px: Focal length in pixels.
-        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z. All 0: it is
-            at the camera's place, so that there is no parallax.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates: u·z, v·z and z, where u
+            is its column, v its row and z its depth in metres. All 0: it is at the camera's place,
+            so that there is no parallax.
     """
     reach_px = max(1, round(np.radians(_REACH_DEG) * focal_px))
     margin_px = np.radians(_MARGIN_DEG) * focal_px
     # Suspects are points with something nearer within reach.
-    cells = np.floor(xy + 0.5).astype(np.intp)
+    cells = np.floor(xy + 0.5).astype(np.intp)  # the pixels, column and row
     columns, rows = cells.T
     grid = np.full(size, np.inf, np.float32)
     grid[rows, columns] = depth
@@ -234,9 +239,9 @@ def hidden_points(
     nearest = cv2.erode(grid, window)[rows, columns].astype(np.float64)  # the least in the window
     limit = depth * (1 - NEARER)
     suspects = np.flatnonzero(nearest < limit)
-    # Pairs of a suspect and a nearer point, no farther apart than the last test allows: that is
-    # half the segment to its middle, and the distance from there. `segment` leads from the suspect
-    # to where its beam passed the depth of the foreground.
+    # Pairs of a suspect and a neighbour, no farther apart than the last test allows: that is half
+    # the segment, to its middle, and the largest distance from there. `segment` leads from the
+    # suspect to where its beam passed the depth of the foreground.
     segment = _beam_at(nearest[suspects], xy[suspects], depth[suspects], scanner) - xy[suspects]
     half_px = 0.5 * np.hypot(*segment.T)
     farthest_px = half_px + margin_px + _STRETCH * half_px
@@ -249,8 +254,8 @@ def hidden_points(
     suspect = suspect[is_nearer]
     neighbour = neighbour[is_nearer]
     foreground = foreground[is_nearer]
-    # A suspect is hidden if the neighbour is near the middle of its segment: the longer that is,
-    # the farther the neighbour may be.
+    # A suspect is hidden if a nearer neighbour lies near the middle of its segment. The longer the
+    # segment is, the farther from its middle the neighbour may lie.
     segment = _beam_at(foreground, xy[suspect], depth[suspect], scanner) - xy[suspect]
     away_px = np.hypot(*(cells[neighbour] - cells[suspect] - 0.5 * segment).T)
     hides = away_px <= margin_px + _STRETCH * 0.5 * np.hypot(*segment.T)
@@ -260,43 +265,46 @@ def hidden_points(
 
 
 def _beam_at(passed_depth: Floats, xy: Floats, depth: Floats, scanner: Floats) -> Floats:
-    """(M, 2) pixels at which the camera sees a beam where it passes some depth, or its end.
+    """(M, 2) pixel coordinates at which the camera sees each beam pass a depth, or its end.
 
-    It is the end, the pixel of the measured point, where the beam does not pass that depth.
+    A beam leads from the scanner to a measured point, its end. The end stands for beams that do not
+    pass the depth.
 
     Args:
-        passed_depth: (M,) the depth that each beam passes.
+        passed_depth: (M,) the depth that each beam is to pass, metres.
         xy: (M, 2) pixel coordinates of the measured points.
-        depth: (M,) their depths.
-        scanner: (3,) the scanner's origin in homogeneous pixel coordinates, u·z v·z z.
+        depth: (M,) depths of the measured points, metres.
+        scanner: (3,) the scanner's origin in homogeneous pixel coordinates: u·z, v·z and z, of its
+            column u, row v and depth z.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The fraction of the way from scanner to point; the point in homogeneous coordinates is
-        # linear in it.
+        # The fraction of the way from scanner to point at which the depth is passed. u·z and v·z
+        # of the beam are linear in it; divided by the depth they are pixels.
         fraction = (passed_depth - scanner[2]) / (depth - scanner[2])
         is_passed = (fraction > 0) & (fraction < 1)
-        times_depth = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
-        return np.where(is_passed[:, None], times_depth / passed_depth[:, None], xy)
+        xy_times_depth = (1 - fraction)[:, None] * scanner[:2] + (fraction * depth)[:, None] * xy
+        return np.where(is_passed[:, None], xy_times_depth / passed_depth[:, None], xy)
 
 
 def hidden_among(xy: Floats, depth: Floats, size: Size) -> Mask:
     """Returns (N,) true for points of an unknown sensor that something nearer occludes.
 
-    Foreground is looked for within twice the median distance from a point to the nearest other. It
-    was measured with points of other views of ICL-NUIM and 7-Scenes, a quarter of them behind a
-    wall. A fifth or less of those behind others stay, and 1 % (5,000 points) to 11 % (200) of the
-    rest go.
+    Foreground is looked for within twice the median distance from a point to the nearest other. On
+    points of other views of ICL-NUIM and 7-Scenes, a quarter of them behind a wall, a fifth or less
+    of the hidden points is not found. Of the visible ones 1 % (with 5,000 points) to 11 % (with
+    200) are taken for hidden.
 
     Args:
         xy: (N, 2) pixel coordinates inside the image, at most one point per pixel.
-        depth: (N,) z.
+        depth: (N,) z in any unit.
         size: (H, W) of the image.
     """
     if len(xy) < 2:
-        return np.zeros(len(xy), bool)
+        return np.zeros(len(xy), bool)  # nothing is in front of a single point
     to_itself_and_next, _ = cKDTree(xy).query(xy, k=2)
     margin_px = 2 * float(np.median(to_itself_and_next[:, 1]))
-    # No parallax is known. The focal length is the one that gives this margin.
+    # `hidden_points` takes the margin as an angle: the focal length is the one that makes it these
+    # pixels. With the scanner at the camera's place there is no parallax.
     focal_px = margin_px / np.radians(_MARGIN_DEG)
     return hidden_points(xy, depth, size, focal_px=focal_px, scanner=np.zeros(3))
 
@@ -318,9 +326,11 @@ def occluded_in_map(points: Points) -> Mask | None:
     low, high = _LINE_SPACING_PX
     if not low <= across_px <= high:
         return None
+    # Occluded points lie between points of a nearer surface; without such they are removed already.
     if interleaved(as_depth_image(points)).sum() < _INTERLEAVED * len(points):
         return None
-    # No parallax is known; the margin stands for it. The focal length is the one that gives it.
+    # `hidden_points` takes the margin as an angle: the focal length is the one that makes it the
+    # pixels wanted. With the scanner at the camera's place there is no parallax.
     return hidden_points(
         points.xy.astype(np.float64),
         points.depth.astype(np.float64),
@@ -363,7 +373,8 @@ def interleaved(depth: NDArray[np.float32]) -> Mask:
     """
     known_depth = np.where(depth > 0, depth, np.float32(np.inf))
     limit = np.where(depth > 0, depth * np.float32(1 - NEARER), 0)
-    # The nearest point in an area above each pixel, and in the same area turned to the other sides.
+    # Whether a nearer point lies in an area above each pixel, 1 in the window; the same area is
+    # turned to the left, below and to the right. An erosion gives the least depth in it.
     reach = _INTERLEAVED_REACH_PX
     half = _INTERLEAVED_HALF_WIDTH_PX
     above = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)

@@ -25,7 +25,8 @@ Pixels = NDArray[np.intp]
 """(N,) row-major indices of pixels."""
 
 _LEAST_AHEAD = 1e-9
-"""Least z of a beam's unit vector that looks ahead; beams are divided by it."""
+"""Least z, along the camera's axis, of the unit vector of a beam that looks ahead. Depth is divided
+by it."""
 
 FORWARD_LEFT_UP: Floats = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """The rotation from a scanner's coordinates to those of a camera facing the same way."""
@@ -60,8 +61,10 @@ class Lidar:
             std = np.radians(self.angle_noise_deg)
             elevation = elevation + rng.normal(0, std, elevation.shape)
             azimuth = azimuth + rng.normal(0, std, azimuth.shape)
-        x, y = np.cos(elevation) * (np.cos(azimuth), np.sin(azimuth))
-        return np.column_stack([x, y, np.sin(elevation)])
+        x = np.cos(elevation) * np.cos(azimuth)
+        y = np.cos(elevation) * np.sin(azimuth)
+        z = np.sin(elevation)
+        return np.column_stack([x, y, z])
 
 
 def evenly_spaced(top_deg: float, step_deg: float, beams: int) -> tuple[float, ...]:
@@ -167,7 +170,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
         NoPointsError: No beam hits anything that the camera sees.
     """
     size = (depth.shape[0], depth.shape[1])
-    # The beams that look ahead, and what each meets.
+    # The beams (M, 3) that look ahead, in the camera's coordinates, and the depth that each meets.
     rng = np.random.default_rng(seed)
     beams = sensor.directions(rng) @ FORWARD_LEFT_UP.T
     beams = beams[beams[:, 2] > _LEAST_AHEAD]
@@ -177,7 +180,7 @@ def simulate_lidar(depth: NDArray[np.floating], camera: Camera, sensor: Lidar, s
     z = np.asarray(depth, np.float64).ravel()[pixel_index(xy, size)]
     is_met = drops.keep(z > 0, "meets nothing that the camera sees")
     z, beams = z[is_met], beams[is_met]
-    # How far that is, as the scanner measures it: along the beam.
+    # The distance of what it meets, as the scanner measures it: along the beam, with noise.
     distance = z / beams[:, 2]
     in_range = drops.keep(distance <= sensor.max_range, "out of range")
     distance, beams = distance[in_range], beams[in_range]
@@ -225,6 +228,7 @@ def sample_points(
             "the depth map has no pixel with known depth to sample from; give one with depth above"
             " 0"
         )
+    # Points are in the order of the image's rows, whatever the pattern's order.
     chosen = np.sort(_pixels_of_pattern(pattern, known_pixels, size, seed, image))
     if not chosen.size:
         raise NoPointsError(f"pattern {pattern.kind!r} leaves no point; ask for more")
@@ -282,13 +286,29 @@ def _pixels_of_pattern(
 
 
 def _grid(fraction: float, size: Size) -> Pixels:
-    """The pixels at the nodes of a square grid, about this fraction of all of an image (H, W)."""
-    spacing: float = max(1.0, fraction**-0.5)
-    rows, columns = (
-        np.floor((np.arange(max(1, round(side / spacing))) + 0.5) * spacing).clip(max=side - 1)
-        for side in size
-    )
-    nodes: Pixels = (rows[:, None] * size[1] + columns).astype(np.intp).ravel()
+    """The pixels at the nodes of a square grid, about a fraction of all pixels of an image.
+
+    Args:
+        fraction: Fraction of the pixels, above 0.
+        size: (H, W) of the image.
+    """
+    height, width = size
+    spacing_px: float = max(1.0, fraction**-0.5)
+    rows = _nodes(height, spacing_px)
+    columns = _nodes(width, spacing_px)
+    pixels: Pixels = (rows[:, None] * width + columns).astype(np.intp).ravel()
+    return pixels
+
+
+def _nodes(side: int, spacing_px: float) -> Floats:
+    """Whole coordinates of a grid's nodes along one side of an image, at least one.
+
+    Args:
+        side: Number of pixels of the side.
+        spacing_px: Distance of the nodes; the first is half of that from the image's edge.
+    """
+    count = max(1, round(side / spacing_px))
+    nodes: Floats = np.floor((np.arange(count) + 0.5) * spacing_px).clip(max=side - 1)
     return nodes
 
 
@@ -312,8 +332,8 @@ def _corners(image: NDArray[np.float32] | None, wanted: int) -> Pixels:
     if image is None:
         raise UsageError("pattern 'features' needs the image that the depth belongs to; give it")
     grey = cv2.cvtColor(image.clip(0, 1), cv2.COLOR_RGB2GRAY)
-    # ORB's corners of several pyramid levels share pixels; three times as many leave enough when
-    # merged.
+    # ORB's corners of several pyramid levels share pixels: three times as many, and some, leave
+    # enough when each pixel counts once. A low `fastThreshold` finds weak corners, too.
     detector = cv2.ORB_create(nfeatures=3 * wanted + 100, edgeThreshold=4, fastThreshold=5)  # type: ignore[attr-defined]
     corners = detector.detect(np.rint(255 * grey).astype(np.uint8))
     strongest_first = sorted(corners, key=lambda corner: -corner.response)
